@@ -155,7 +155,7 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
     gaps, state.gaps = state.gaps, []
     omega = np.array([_points(*gap) for gap in gaps])
     M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
-    shared = enough(M, structure, max(slack / 5, 1e-4), 1.0)
+    shared = enough(M, structure, _accuracy(slack), 1.0)
     open_gaps = []
     for k, gap in enumerate(gaps):
         if shared.beta[k] >= 1.0:
@@ -165,26 +165,39 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
         proved = proved_intervals(unit, Scalings(*(s[k] for s in shared.scalings)), gap)
         state.gaps += _without(gap, proved)
     if open_gaps:
-        _split_or_raise(N, bound, state, open_gaps, slack)
+        _split_or_raise(N, unit, structure, bound, state, open_gaps, slack)
 
 
-def _split_or_raise(N: StateSpace, bound: Callable[[Array], Array], state: Cover, open_gaps: list[Interval],
-                    slack: float) -> None:
-    """Halve the gaps; where a single frequency in them (or a gap too narrow to halve) needs more, raise the level."""
+def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, bound: Callable[[Array], Array],
+                    state: Cover, open_gaps: list[Interval], slack: float) -> None:
+    """Halve the gaps; where a single frequency in them (or a gap too narrow to halve) needs more, raise the level.
+
+    unit : N scaled so that the level is one.
+    """
     middles = np.array([midpoint(*gap) for gap in open_gaps])
-    needed = bound(N.frequency_response(middles)[:, None])
+    at_one = enough(unit.frequency_response(middles)[:, None], structure, _accuracy(slack), 1.0).beta
+    above = middles[at_one >= 1.0]
+    needed = bound(N.frequency_response(above)[:, None]) if above.size else above
     narrow = [gap for gap in open_gaps if _is_narrow(gap)]
     for (low, high), middle in zip(open_gaps, middles.tolist(), strict=True):
         state.gaps += [(low, high)] if _is_narrow((low, high)) else [(low, middle), (middle, high)]
+    middles = above
     if narrow:
         points = np.array([_points(*gap) for gap in narrow])
         raw = N.frequency_response(points.ravel()).reshape(*points.shape, N.noutputs, N.ninputs)
         shared = bound(raw)
         needed, middles = np.concatenate([needed, shared]), np.concatenate([middles, points[:, 1]])
+    if not needed.size:
+        return
     worst = int(np.argmax(needed))
     if needed[worst] > state.level:
         state.level = float(needed[worst]) * (1 + slack)
         state.raised_at.append(float(middles[worst]))
+
+
+def _accuracy(slack: float) -> float:
+    """Of beta^2 that goes with a slack of beta."""
+    return max(slack / 5, 1e-4)
 
 
 def _is_narrow(gap: Interval) -> bool:

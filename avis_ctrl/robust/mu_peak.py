@@ -30,6 +30,8 @@ from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
+# A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
+TINY = 1e-9
 KNOWN_SLACK = 5e-3
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
@@ -96,7 +98,8 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
 
 
 def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
-                    band: Interval = ALL_FREQUENCIES, slack: float = SLACK) -> MuPeak:
+                    band: Interval = ALL_FREQUENCIES, slack: float = SLACK, robust: MuPeak | None = None,
+                    points: int = 40) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
     Parameters
@@ -104,6 +107,8 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     N : stable system; the first sum(cols) outputs and sum(rows) inputs belong to the blocks, the rest are e and d.
     band : (low, high) in rad/s. The gain is that in the band; robust stability is asked at all frequencies.
     slack : as for mu_peak.
+    robust : `mu_peak` of the blocks' own channels at all frequencies, where it is known; computed otherwise.
+    points : frequencies of the two curves, beside those of the highest gains; fewer take less time.
 
     upper is inf where robust stability is not proved; lower is inf where `delta` (norm at most 1) destabilises.
 
@@ -119,8 +124,13 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
                          f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
     with one_thread():
         part = _prepared(system, structure)
-        found = _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack, system.dt)
-        return _in_rad_s(system, part, found)
+        known = replace(robust, delta=None) if robust is not None else None
+        found = _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack, system.dt, known,
+                                 points)
+        found = _in_rad_s(system, part, found)
+    if robust is not None and robust.lower >= 1.0:
+        return replace(found, omega=robust.omega, delta=robust.delta)
+    return found
 
 
 def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
@@ -192,8 +202,7 @@ class _Scan:
 
     @property
     def level(self) -> float:
-        # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
-        return max(float(np.max(self.bound.beta)) * (1 + self.slack), 1e-9)
+        return max(float(np.max(self.bound.beta)) * (1 + self.slack), TINY)
 
 
 def _tolerance(slack: float) -> float:
@@ -249,39 +258,85 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
     return (best, at, delta) if best > noise else (0.0, at, None)
 
 
-def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float) -> MuPeak:
+def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float,
+                     known: MuPeak | None, points: int) -> MuPeak:
     """worst_case_gain of a continuous system, or of the image of one sampled at dt."""
     accuracy = _tolerance(slack)
     n_z, n_w = structure.n_z, structure.n_w
     n_e = N.noutputs - n_z
     whole = structure.with_performance(N.ninputs - n_w, n_e)
+    if known is not None and known.lower >= 1.0:
+        return _destabilised(N, structure, known, first_frequencies(N, band))
 
     def scaled(system: StateSpace, level: float) -> StateSpace:
         return system.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
 
-    scan = _Scan.of(N, band, lambda M: skewed_upper_bound(M, whole, accuracy), slack)
-    M = N.frequency_response(scan.omega)
+    # Lower bounds are cheap and close: they say where the upper ones are worth computing.
+    reached = _Reached.of(N, structure, band, accuracy)
+    shown = reached.thinned(points)
+    upper = skewed_upper_bound(N.frequency_response(shown.omega)[:, None], whole, accuracy).beta
     done = None
-    if np.all(np.isfinite(scan.bound.beta)) and _robustly_stable(N.select(range(n_z), range(n_w)), structure, band):
-        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, accuracy).beta, scan.level, band,
-                     scan.peak, slack=slack)
+    proved = known is not None and known.guaranteed and known.upper < 1.0
+    if np.all(np.isfinite(upper)) and (proved or _robustly_stable(N.select(range(n_z), range(n_w)), structure, band)):
+        level = max(float(np.max(upper)) * (1 + slack), TINY)
+        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, accuracy).beta, level, band,
+                     shown.omega[[int(np.argmax(upper))]], slack=slack)
     if done is not None and np.isfinite(done.level):
-        lower = worst_gain(M, structure)
-        k = int(np.argmax(lower.gain))
-        return MuPeak(done.level, float(lower.gain[k]), float(scan.omega[k]), lower.delta[k], not done.gaps,
-                      _in_words(done, band, dt), scan.omega, scan.bound.beta, lower.gain)
-    robust = _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
-    words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
-    # Only perturbations that provably keep the loop stable have a gain.
-    radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
-    lower = worst_gain(M * np.r_[np.full(n_z, radius), np.ones(n_e)][:, None], structure)
-    k = int(np.argmax(lower.gain))
-    found = MuPeak(np.inf, float(lower.gain[k]), float(scan.omega[k]), radius * lower.delta[k], True, words, scan.omega,
-                   scan.bound.beta, lower.gain)
+        k = int(np.argmax(reached.gain))
+        return MuPeak(done.level, float(reached.gain[k]), float(reached.omega[k]), reached.delta[k], not done.gaps,
+                      _in_words(done, band, dt), shown.omega, upper, shown.gain)
+    robust = known or _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
     if robust.lower >= 1.0:
-        return replace(found, lower=np.inf, omega=robust.omega, delta=robust.delta,
-                       covers="a perturbation of norm at most 1 makes the loop unstable")
-    return found
+        return _destabilised(N, structure, robust, shown.omega)
+    gain, delta = _gain_of_stable(N.frequency_response(shown.omega), structure, robust)
+    k = int(np.argmax(gain))
+    words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
+    return MuPeak(np.inf, float(gain[k]), float(shown.omega[k]), delta[k], True, words, shown.omega, upper, gain)
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """Worst gains that were reached (n,), by which perturbations (n, n_w, n_z)."""
+
+    omega: Array
+    gain: Array
+    delta: Array
+
+    @staticmethod
+    def of(N: StateSpace, structure: BlockStructure, band: Interval, accuracy: float) -> _Reached:
+        seen: list[_Reached] = []
+
+        def value(omega: Array) -> Array:
+            found = worst_gain(N.frequency_response(omega), structure)
+            seen.append(_Reached(omega, found.gain, found.delta))
+            return found.gain
+        first = first_frequencies(N, band)
+        refine_maxima(value, first, value(first), tolerance=accuracy)
+        omega = np.concatenate([one.omega for one in seen])
+        order = np.argsort(omega)
+        return _Reached(omega[order], np.concatenate([one.gain for one in seen])[order],
+                        np.concatenate([one.delta for one in seen])[order])
+
+    def thinned(self, most: int, highest: int = 4) -> _Reached:
+        """At most so many frequencies, evenly chosen, and those of the highest gains."""
+        even = np.linspace(0, self.omega.size - 1, min(most, self.omega.size)).round().astype(int)
+        kept = np.union1d(even, np.argsort(self.gain)[-highest:])
+        return _Reached(self.omega[kept], self.gain[kept], self.delta[kept])
+
+
+def _destabilised(N: StateSpace, structure: BlockStructure, robust: MuPeak, omega: Array) -> MuPeak:
+    """The result where a perturbation of norm at most 1 makes the loop unstable: no gain is bounded."""
+    gain, _ = _gain_of_stable(N.frequency_response(omega), structure, robust)
+    return MuPeak(np.inf, np.inf, robust.omega, robust.delta, True,
+                  "a perturbation of norm at most 1 makes the loop unstable", omega, np.full(omega.size, np.inf), gain)
+
+
+def _gain_of_stable(M: Array, structure: BlockStructure, robust: MuPeak) -> tuple[Array, Array]:
+    """Gains (n,) and perturbations (n, n_w, n_z) at each frequency, of those that provably keep the loop stable."""
+    radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
+    n_z = structure.n_z
+    found = worst_gain(M * np.r_[np.full(n_z, radius), np.ones(M.shape[1] - n_z)][:, None], structure)
+    return found.gain, radius * found.delta
 
 
 def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -> bool:

@@ -76,29 +76,26 @@ def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -
     if not structure.many:
         return upper_bound(M, structure, tolerance, goal)
     found = upper_bound(M, structure.simplified(), tolerance, goal)
-    _improve(found, np.flatnonzero(found.beta >= goal), M, structure, tolerance, goal)
+    if (left := np.flatnonzero(found.beta >= goal)).size:
+        _replace(found, left, upper_bound(M[left], structure, tolerance, goal))
     return found
 
 
 def highest(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound:
-    """`upper_bound`; of many blocks in full only where that decides on the largest of all."""
+    """`upper_bound`, of many blocks in full only where that decides on the largest of all."""
     if not structure.many:
         return upper_bound(M, structure, tolerance)
     found, full = upper_bound(M, structure.simplified(), tolerance), np.zeros(M.shape[0], bool)
     while not full[np.argmax(found.beta)]:
         left = np.flatnonzero(~full & (found.beta >= WORTH * np.max(found.beta)))
-        _improve(found, left, M, structure, tolerance)
+        _replace(found, left, upper_bound(M[left], structure, tolerance))
         full[left] = True
     return found
 
 
-def _improve(found: UpperBound, which: Array, M: Array, structure: BlockStructure, tolerance: float,
-             goal: float = 0.0) -> None:
-    """Bounds of some matrices replaced by those with full scalings."""
-    if which.size:
-        better = upper_bound(M[which], structure, tolerance, goal)
-        for whole, part in zip((found.beta, *found.scalings), (better.beta, *better.scalings), strict=True):
-            whole[which] = part
+def _replace(found: UpperBound, which: Array, better: UpperBound) -> None:
+    for whole, part in zip((found.beta, *found.scalings), (better.beta, *better.scalings), strict=True):
+        whole[which] = part
 
 
 def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:
