@@ -92,10 +92,6 @@ class Step:
     K: StateSpace
     peak: float
 
-    @property
-    def order(self) -> int:
-        return self.K.nstates
-
 
 @dataclass(frozen=True, eq=False)
 class Task:
