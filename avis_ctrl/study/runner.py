@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,8 +61,12 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     began = time.monotonic()
     progress("model: rig, uncertainty, weights")
     plant = build_plant(design, rig)
-    candidates, failed, synthesis = synthesise(design, plant, rig, progress, stop)
-    compared = compare(design, plant, rig, candidates, failed, progress)
+    # What does not depend on the mu controller is computed beside the D-K iteration.
+    with Workers(beside=True) as workers:
+        others, failed = other_controllers(design, plant, rig, progress)
+        early = begin(design, plant, rig, others, workers)
+        mu, synthesis = synthesise(design, plant, rig, others, progress, stop)
+        compared = compare(design, plant, rig, [mu, *others], failed, progress, early)
     return conclude(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
 
 
@@ -77,25 +81,48 @@ class Compared:
     by_axis: tuple[AxisGain, ...] = ()
 
 
-def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None,
-               stop: Stop = NEVER) -> tuple[list[Candidate], list[FailedController], MuSynthesis]:
-    """The mu controller and, of those it is compared with, nominal H-infinity and classical skyhook; the table without
-    control; the D-K iteration.
+def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
+                      ) -> tuple[list[Candidate], list[FailedController]]:
+    """Those that the design compares with and that do not depend on mu: nominal H-infinity, classical skyhook, none.
 
-    A controller for comparison that cannot be made does not stop the design: it is returned among the failed.
+    One that cannot be made does not stop the design: it is returned among the failed.
     """
+    made: list[Candidate] = []
+    failed: list[FailedController] = []
     with threadpool_limits(1):
-        rivals: list[Candidate] = []
-        failed: list[FailedController] = []
         if "hinf" in design.compare_with:
             progress("H-infinity synthesis of the nominal plant")
             try:
-                rivals.append(nominal_hinf(design, plant, rig))
+                made.append(nominal_hinf(design, plant, rig))
             except ComputationError as error:
                 failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
         if "skyhook_classical" in design.compare_with:
-            rivals.append(classical_skyhook(plant, rig, design))
+            made.append(classical_skyhook(plant, rig, design))
+    return [*made, passive()], failed
 
+
+@dataclass(frozen=True)
+class Early:
+    """Bounds under way by the controllers' names, and the peak that the tuned skyhook among them may have at worst."""
+
+    bounds: Mapping[str, Future]
+    peak_limit: float | None = None
+
+
+def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers) -> Early:
+    """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design asks for."""
+    samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
+    limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
+    jobs = {}
+    if limit is not None:
+        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, limit, samples)
+    return Early(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
+
+
+def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate],
+               progress: Progress = lambda text: None, stop: Stop = NEVER) -> tuple[Candidate, MuSynthesis]:
+    """The mu controller, and the D-K iteration, which starts from the best of the others."""
+    with threadpool_limits(1):
         def shown(row: Any) -> bool:
             """After each iteration; False ends it."""
             if row.kind in STARTS:
@@ -106,9 +133,9 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
                      f"{row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
             return not ends
         with stop as enough:
-            mu, made = mu_optimal(design, plant, rig, shown, rivals)
+            mu, made = mu_optimal(design, plant, rig, shown, others)
         progress(mu.notes[-1])
-        return [mu, *rivals, passive()], failed, made
+        return mu, made
 
 
 def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesis, compared: Compared, seconds: float,
@@ -136,12 +163,15 @@ ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
 
 
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
-            failed: Sequence[FailedController] = (), progress: Progress = lambda text: None) -> Compared:
+            failed: Sequence[FailedController] = (), progress: Progress = lambda text: None,
+            early: Early = Early({})) -> Compared:
     """Bounds of every controller, one loop an axis tuned on mu and a skyhook tuned to the worst-case peak of mu where
     the design compares with them, and the simulation of mu.
 
-    Runs on two processes. The tuning of the skyhook and the simulation wait for the bounds of all the others, because
-    the best of these is delivered as the mu controller.
+    Runs on two processes. The simulation, and the tuning of a skyhook whose peak the design does not limit, wait for
+    the bounds of all the others, because the best of these is delivered as the mu controller.
+
+    early : bounds that were started before.
 
     Raises
     ------
@@ -149,7 +179,8 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     with Workers() as workers:
-        jobs = {workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}
+        jobs = {early.bounds.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name
+                for c in candidates}
         if "loops" in design.compare_with:
             made = next(c.K for c in candidates if c.name == "mu")
             jobs[workers.submit(_own_loops, design, plant, rig, made, samples)] = "loops"
@@ -171,7 +202,9 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         by_axis = workers.submit(_worst_by_axis, design, plant, mu.K, True)
         jobs = {}
         if "skyhook" in design.compare_with:
-            jobs = {workers.submit(_tuned, design, plant, rig, skyhook_limit(design, mu), samples): "skyhook"}
+            limit = skyhook_limit(design, mu)
+            jobs = {early.bounds["skyhook"] if limit == early.peak_limit else
+                    workers.submit(_tuned, design, plant, rig, limit, samples): "skyhook"}
         gather()
         loop = simulation.result()
         proved = by_axis.result()
@@ -231,10 +264,13 @@ def _own_loops(design: Design, plant: DesignPlant, rig: Rig, K: StateSpace, samp
 
 def skyhook_limit(design: Design, mu: ControllerResult) -> float:
     """Worst-case peak that the skyhook may have: what the design asks of its rival, or the rival's own if larger."""
-    asked = [10 ** (one.at_most / 20) for one in design.requirement
-             if one.quantity == "worst_case_peak_transmissibility_dB" and one.at_most is not None]
-    known = [limit for limit in (*asked, mu.worst_peak.upper) if np.isfinite(limit)]
+    known = [limit for limit in (*_asked_peaks(design), mu.worst_peak.upper) if np.isfinite(limit)]
     return max(known, default=10 ** (design.transmissibility.peak_dB / 20))
+
+
+def _asked_peaks(design: Design) -> list[float]:
+    return [10 ** (one.at_most / 20) for one in design.requirement
+            if one.quantity == "worst_case_peak_transmissibility_dB" and one.at_most is not None]
 
 
 def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:

@@ -16,11 +16,15 @@ MOST = 2
 WATCH_S = 1.0
 
 
-def as_worker(parent: int) -> None:
+def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL) -> None:
     """Make this process a worker: Ctrl-C and SIGTERM end it at once and silently (the parent speaks); so does the
-    parent's own death."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)
+    parent's own death.
+
+    on_interrupt : SIG_IGN where Ctrl-C, which reaches all processes, is the parent's to decide on: it may go on with
+        what it has.
+    """
+    signal.signal(signal.SIGINT, on_interrupt)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -44,18 +48,23 @@ def alone() -> Iterator[None]:
 
 
 class Workers:
-    """A pool where there are processors for one, else the same calls one after the other in this process."""
+    """A pool where there are processors for one, else the same calls one after the other in this process.
 
-    def __init__(self, count: int | None = None):
+    beside : this process computes, too, takes one of the processors, and decides on Ctrl-C.
+    """
+
+    def __init__(self, count: int | None = None, beside: bool = False):
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         most = 1 if _alone else MOST
         self._count = min(most, available) if count is None else count
+        self._beside = beside
 
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), as_worker, (os.getpid(),))
-                      if self._count > 1 else None)
+        on_interrupt = signal.SIG_IGN if self._beside else signal.SIG_DFL
+        self._pool = (ProcessPoolExecutor(self._count - self._beside, multiprocessing.get_context(method), as_worker,
+                                          (os.getpid(), on_interrupt)) if self._count > 1 else None)
         self._others = set(multiprocessing.active_children())
         return self
 
