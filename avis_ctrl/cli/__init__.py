@@ -133,8 +133,8 @@ def main() -> None:
         sys.exit(ComputationError.exit_code)
     except typer.Abort as error:
         if isinstance(error.__context__, EOFError):  # a question, and nobody there
-            print("\navis: no answer: the standard input has ended; give what is missing as options (see --help)",
-                  file=sys.stderr)
+            print("\navis: the standard input ended before all values were given; give what is missing as options "
+                  "(see --help)", file=sys.stderr)
             sys.exit(InputError.exit_code)
         code = INTERRUPTED
     except KeyboardInterrupt:

@@ -82,10 +82,10 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     known = list(library().values()) if effects is None else list(effects)
     fits = _fits(prepared, rig, known, progress, each, settings)
     if prepared.clipped is not None and fits.steps:
-        progress("clipped samples: what the model with its effects expects behind the limits")
+        progress("clipped samples: replaced by the prediction of the model with its effects")
         prepared = mended_with(prepared, fits.best.model, progress, each, settings)
         fits = _fits(prepared, rig, known, progress, each, settings)
-    progress("names, and what held-out records say of them")
+    progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
 
@@ -98,7 +98,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     large = of_effect(start.effects[0], tolerances_of(rig), settings)
     priors = re_identified(nominal.rig, settings).followed_by(large)
     base = fit(start, priors, priors.z(start.values), data, first_variances(data, settings), settings)
-    progress("the same with all tolerances")
+    progress("fit with all tolerances")
     tolerances = with_tolerances(nominal, tolerances_of(rig), settings)
     apart = replace(base.model, base=replace(base.model.base, names=tolerances.names),
                     nominal=replace(nominal, names=tolerances.names), corners_differ=True)
@@ -205,7 +205,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
     if verdict == "none":
-        progress("how large an effect would have had to be to be seen")
+        progress("detection limits of the effects")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
     sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused.values(),
@@ -309,17 +309,17 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
              left: Remainder, after: ModelResidual) -> str:
     """The one sentence."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
-    rest = f"noise alone {_percent(after.noise_nrmse)}"
-    beside = f", beside traces of {' and '.join(one.name for one in traces)}" if traces else ""
+    rest = f"the noise alone is estimated at {_percent(after.noise_nrmse)}"
+    also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
     if verdict == "none":
-        return (f"No missing effect shows{beside}: with all tolerances the model leaves {_percent(left.nrmse)} of the "
-                f"held-out records, {rest}.")
+        return (f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
+                f"{_percent(left.nrmse)}; {rest}.{also}")
     if verdict == "unexplained":
-        return (f"Something is missing that the library has no name for{beside}: with all tolerances the model leaves "
-                f"{_percent(left.nrmse)} of the held-out records, {rest}.")
-    names = " and ".join(one.in_words() for one in told)
-    return (f"Missing from the model: {names}{beside}; with that and all tolerances the gap falls from "
-            f"{_percent(before)} to {_percent(left.nrmse)}, {rest}.")
+        return (f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
+                f"error on held-out records is {_percent(left.nrmse)}; {rest}.{also}")
+    count = "one effect" if len(told) == 1 else f"{len(told)} effects"
+    return (f"The model misses {count}: {'; '.join(one.in_words() for one in told)}. With this and all tolerances "
+            f"fitted, the gap falls from {_percent(before)} to {_percent(left.nrmse)}; {rest}.{also}")
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:

@@ -57,7 +57,7 @@ class NamedEffect:
         """With its place, first parameters and probability; how single mounts differ stands in the table alone."""
         first = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")][:3]
         sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in first)
-        ties = (f", or {' or '.join(self.indistinguishable_from)}, which this data cannot tell from it"
+        ties = (f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"
                 if self.indistinguishable_from else "")
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
+from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
 Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
@@ -270,7 +271,7 @@ class StateSpace:
 
     def __repr__(self) -> str:
         clock = f"dt = {self.dt:g} s" if self.dt else "continuous"
-        return (f"StateSpace({self.nstates} states, {clock}, "
+        return (f"StateSpace({count_of(self.nstates, 'state')}, {clock}, "
                 f"{list(self.inputs)} -> {list(self.outputs)})")
 
 

@@ -40,7 +40,7 @@ NORM_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MuSynthesis(Shown):
-    """The best controller of all iterations, and what was measured on it.
+    """The best controller of all iterations, and its closed loop's figures.
 
     mu_upper, mu_lower : bounds of the peak of mu over all frequencies with the blocks as given (real ones real).
     mu_upper_complex : the same upper bound with real blocks taken as complex, as the synthesis did.
@@ -49,8 +49,11 @@ class MuSynthesis(Shown):
     scalings, gamma : measured norm of the scaled loop, no less than complex mu at any frequency. Those of a sampled
         loop are functions of its continuous image's frequency (`lti.bilinear.image_frequency`).
     fastest_pole : largest magnitude [rad/s] of a pole of K (of its continuous image where K is sampled).
+    closed_loop : of the generalized plant with K; `mu_peak(closed_loop, blocks)` has mu over frequency.
     saved_state : JSON-able; `musyn(..., state=saved_state)` goes on from here.
     """
+
+    in_line = ("K", "mu_upper", "mu_lower", "omega_peak", "guaranteed", "status")
 
     K: StateSpace
     mu_upper: float

@@ -34,6 +34,8 @@ class Robustness(Shown):
     mu : the bounds of mu behind it.
     """
 
+    in_line = ("lower", "upper", "omega", "guaranteed", "worst")
+
     lower: float
     upper: float
     omega: float

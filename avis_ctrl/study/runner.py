@@ -88,11 +88,11 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
         def shown(row: Any) -> bool:
             """After each iteration; False ends it."""
             if row.kind in STARTS:
-                progress(f"controller to start from ({row.kind}): peak mu {row.mu_upper:.5g}, order {row.order}")
+                progress(f"initial controller ({row.kind}): peak mu {row.mu_upper:.5g}, order {row.order}")
                 return True
             ends = enough()  # before the line: from when it is seen, Ctrl-C keeps this controller
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
-                     f"{row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+                     f"{row.order}, D-scalings fitted to {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
             return not ends
         with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, rivals)
