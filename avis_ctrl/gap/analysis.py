@@ -325,10 +325,14 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
     """How much remains, where, and at which level."""
     if left.over_noise <= 1.05:
-        return "what remains is the noise"
-    level = {True: ", and grows faster than the drives", False: ", and does not grow faster than the drives",
+        if not remaining:
+            return "the residual is the noise"
+        places = sorted({f"{one.output} from {one.from_Hz:.3g} to {one.to_Hz:.3g} Hz" for one in remaining})
+        return (f"as a whole the residual does not exceed the noise, but it does in {'; '.join(places[:3])}"
+                f"{' and elsewhere' if places[3:] else ''}")
+    level = {True: "; it grows faster than the drives", False: "; it does not grow faster than the drives",
              None: ""}[left.grows_with_level]
     lies = f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz" \
         if remaining else ""
-    return (f"{_percent(left.nrmse)} of the held-out records remains, {left.over_noise:.3g} times the "
-            f"noise{lies}{level}: {_percent(left.share)} of the power that the re-identified model leaves beyond noise")
+    return (f"the residual is {_percent(left.nrmse)} of the held-out records, {left.over_noise:.3g} times the "
+            f"noise{lies}; its power beyond noise is {_percent(left.share)} of that of the re-identified model{level}")

@@ -118,10 +118,10 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
         like = known[key]
         assert like.noise is not None
         made.append(block.with_noise(like.noise, like.dof))
-    dof = f"{made[0].dof:.0f} degrees of freedom a line"
+    dof = f"{made[0].dof:.0f} degrees of freedom per line"
     if kinds:
-        return made, f"noise measured where the drives are silent, at rest or between the harmonics: {dof}"
-    return made, f"noise measured by a local polynomial model of the records: {dof}"
+        return made, f"noise measured where the drives are silent (at rest, or between the harmonics): {dof}"
+    return made, f"noise estimated with a local polynomial model: {dof}; a record at rest gives a better estimate"
 
 
 def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:

@@ -1,4 +1,4 @@
-"""What a named effect does to the controller: yesterday's on the updated model, and a new one.
+"""The influence of a named effect on the controller: the previous one on the updated model, and a new one.
 
 Every figure is computed on a closed loop in state space, as `avis design` computes it: mu and worst-case gains are
 bounds over all frequencies and the design's whole uncertainty, stability is by the eigenvalues. They hold for the
@@ -70,7 +70,7 @@ class DesignEffect:
 
     Attributes
     ----------
-    before : yesterday's controller on the baseline. after : the same controller on the updated model; None where no
+    before : the previous controller on the baseline. after : the same controller on the updated model; None where no
         effect of the model was named. new : a controller designed on the updated model, on it; None where none was
         found.
     K_before, K_new : the controllers.

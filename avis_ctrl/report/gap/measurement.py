@@ -1,4 +1,4 @@
-"""The records that were looked at, and how they were divided."""
+"""The records, and how they were divided."""
 
 from __future__ import annotations
 
@@ -27,5 +27,5 @@ def measurement(found: Found) -> Section:
         f"{len(campaign.y_names)} outputs [{words.unit(campaign.y_unit)}]. Levels are r.m.s. of the drives.{divided}",
         ("record", "excitation", "level", "starts at", "duration", "periods", "floor measured"), rows, "llrrrrc")]
     if in_short(campaign.notes):
-        pieces += [Heading("What the reader says of the file"), Bullets(tuple(in_short(campaign.notes)))]
+        pieces += [Heading("Notes on reading the file"), Bullets(tuple(in_short(campaign.notes)))]
     return Section("Measurement", "measurement", tuple(pieces))
