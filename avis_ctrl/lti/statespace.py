@@ -171,11 +171,12 @@ class StateSpace:
         left = operand(other)
         return NotImplemented if left is None else left @ self
 
-    def __mul__(self, factor: Any) -> StateSpace:
-        """All outputs times a number; systems are multiplied by `@`."""
-        return self.scaled(float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
+    def __mul__(self, other: Any) -> StateSpace:
+        """All outputs times a number; with a system the series connection, as `@`."""
+        return self.scaled(float(other)) if isinstance(other, (int, float, np.number)) else self.__matmul__(other)
 
-    __rmul__ = __mul__
+    def __rmul__(self, other: Any) -> StateSpace:
+        return self.scaled(float(other)) if isinstance(other, (int, float, np.number)) else self.__rmatmul__(other)
 
     def __truediv__(self, factor: Any) -> StateSpace:
         return self.scaled(1 / float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
