@@ -12,7 +12,7 @@ from avis_ctrl.cli.console import Progress, StopRequest
 
 
 def design(
-    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="design file; avis new design writes a first one")],
+    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="design file; avis new design writes one")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
 ) -> None:
     """Design certified controllers for a rig, check them in simulation, and write a report.
