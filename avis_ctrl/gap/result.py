@@ -1,4 +1,4 @@
-"""What `gap` found: verdict, named effects, the ladder of stages, what remains and what to measure next."""
+"""The result of `gap`: verdict, named effects, stages, residual, and what to measure next."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Stage:
-    """One rung of the ladder, on held-out data: r.m.s. of what the model leaves over that of y, and chi-square."""
+    """One stage of the search, on held-out data: r.m.s. of what the model leaves over that of y, and chi-square."""
 
     name: str
     nrmse: float

@@ -372,5 +372,5 @@ def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ..
         raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
     ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
     verdict = "slow enough" if ratio < 0.5 else "too fast: raise backoff or the sample rate, or reduce the controller"
-    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.2g} of half the sample rate: "
+    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.3g} times half the sample rate: "
             f"{verdict}",)

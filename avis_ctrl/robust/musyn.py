@@ -218,11 +218,11 @@ def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state:
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
     notes = [*said]
     if has_real:
-        notes.append(f"real blocks were synthesised for as complex ones: peak mu {complex_upper:.4g} so, "
-                     f"{mu_upper:.4g} with the real blocks real")
+        notes.append(f"the synthesis treats real blocks as complex: peak mu {complex_upper:.4g} with complex "
+                     f"blocks, {mu_upper:.4g} with real ones")
     if sample_rate_Hz is not None:
         ratio = fastest / (np.pi * sample_rate_Hz)
-        notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate")
+        notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
     return MuSynthesis(K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
                        scalings, gamma, closed, fastest, state.history, status, tuple(notes),

@@ -1,4 +1,4 @@
-"""The gap before and after: residual over noise, frequency responses, and the ladder of stages."""
+"""The gap before and after: residual over noise, frequency responses, and the stages."""
 
 from __future__ import annotations
 

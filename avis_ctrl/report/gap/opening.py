@@ -78,7 +78,7 @@ def _group(one: NamedEffect) -> str:
 
 
 def _stage(name: str) -> str:
-    return {"nominal": "with the model as its file has it", "re-identified": "after re-identification",
+    return {"nominal": "with the values of the rig file", "re-identified": "after re-identification",
             "tolerances": "with all tolerances"}.get(name, f"with {wording.titled(name)}")
 
 
