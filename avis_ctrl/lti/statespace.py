@@ -61,7 +61,7 @@ class StateSpace:
     >>> G = ac.StateSpace([[0, 1], [-4, -0.4]], [[0], [1]], [[1, 0]], [[0]], inputs=["force"], outputs=["x"])
     >>> G
     StateSpace(2 states, continuous, ['force'] -> ['x'])
-    >>> (2 * G @ G).nstates, G.is_stable(), G.dcgain()      # @ is the series connection: the right one acts first
+    >>> (2 * G @ G).nstates, G.is_stable(), G.dcgain()      # @ or *: series connection, right-hand system first
     (4, True, array([[0.25]]))
     >>> control.damp(G.to_control(), doprint=False)[1]
     array([0.1, 0.1])

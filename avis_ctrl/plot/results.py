@@ -18,7 +18,7 @@ LIMIT, LOWER = "#b3261e", "#e69f00"
 
 
 def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu"]) -> Any:
-    """Upper and lower bound of mu over frequency [Hz], with the bound of the peak and what it is worth.
+    """Upper and lower bound of mu over frequency [Hz], with the bound of the peak and whether it is proved.
 
     peak : `MuPeak` (of `mu_peak` or `worst_case_gain`), a result of `robust_stability` or `robust_performance`, or a
     design's `Bound`. Returns the axes. Raises InputError for a result without these curves, such as a `MuSynthesis`.

@@ -102,7 +102,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     sample_rate_Hz : the rate at which the controller is to run; its fastest pole is compared with half of it.
     gamma_hint : a gamma expected to be near the optimum; shortens the search.
     far_poles : "kept", or "gain": controller poles far beyond the plant's are replaced by their gain where the measured
-        loop keeps the target of the back-off (said in `notes`). D-K iteration wants the central controller itself.
+        loop keeps the target of the back-off (see `notes`). D-K iteration uses "kept".
 
     Raises
     ------
