@@ -137,7 +137,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
             one = next(effect for effect in fits.best.model.effects if effect.label == label)
             refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
                               "has no name" if one.effect.outside else
-                              f"{one.effect.name} comes nearest, but {why}: not named")
+                              f"{one.effect.name} fits best, but is not named: {why}")
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, kept, {label: rivals[label] for label in kept}, refused)
@@ -147,19 +147,19 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
     """Why an effect that was found is not named; empty where it is."""
     one = next(effect for effect in best.model.effects if effect.label == label)
     if one.effect.outside:
-        return "the library has no name for it"
+        return "it is not in the library"
     if probability < settings.headline:
-        return f"another explanation is as probable ({probability:.2f})"
+        return f"other explanations are as probable (its own probability is {probability:.2f})"
     if reason := forbidden(best, one):
         return reason
     # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
     after, before = (sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
                      for one in (step.fitted, step.before))
     if after <= before:
-        return "held-out records do not bear it out"
+        return "held-out records are not more likely with it"
     for half in halves(best, _judged(one), settings):
         if half.change > settings.law_change:
-            return f"{half.words} puts one of its parameters {100 * half.change:.0f} % elsewhere"
+            return f"{half.words} gives a value of one of its parameters that differs by {100 * half.change:.0f} %"
     return ""
 
 

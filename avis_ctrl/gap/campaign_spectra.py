@@ -146,7 +146,7 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
                                band_Hz)
         return replace(found, kind=block.kind)
     except AvisError as error:
-        raise InputError(f"expected records that tell the noise apart from the response ({error})",
+        raise InputError(f"expected records from which the noise can be estimated ({error})",
                          field=f"record {block.name}") from None
 
 

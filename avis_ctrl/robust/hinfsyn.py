@@ -49,11 +49,11 @@ class Status(Enum):
     OPTIMAL = "the optimum is bracketed and the closed loop was measured below its target"
     REGULARISED = ("the problem is singular: small extra channels were added; the closed loop measured is that "
                    "of the plant without them")
-    BACKED_OFF = ("the closed loop missed its target at the back-off asked for, which was raised: this usually "
+    BACKED_OFF = ("the closed loop missed its target at the requested back-off, which was raised: this usually "
                   "means a badly scaled plant or a nearly singular D12 or D21")
-    WIDE = ("the optimum lies between the bounds, which are further apart than asked for: between them the Riccati "
+    WIDE = ("the optimum lies between the bounds, which are further apart than requested: between them the Riccati "
             "test is undecided")
-    SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
+    SUBOPTIMAL = "a controller at the requested gamma; the optimum was not computed"
 
 
 @dataclass(frozen=True, repr=False)

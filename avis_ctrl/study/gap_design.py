@@ -252,9 +252,8 @@ def _unchecked(not_checked: dict[str, str]) -> list[str]:
     if not not_checked:
         return []
     each = "; ".join(f"{label}: {why}" for label, why in not_checked.items())
-    return [f"NOT checked: no controller here was designed or judged with {', '.join(not_checked)} ({each}). Whether "
-            f"{'it matters' if len(not_checked) == 1 else 'they matter'} to the design is not known from these "
-            "figures; a simulation or a measurement of the closed loop would tell."]
+    return [f"NOT checked: no controller was designed or evaluated with {', '.join(not_checked)} ({each}). Their "
+            "influence on the closed loop is not known from these figures; simulate or measure the closed loop."]
 
 
 def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None,
