@@ -73,12 +73,12 @@ def divide(campaign: Campaign) -> Halves:
     if chosen and len(driven) - len(chosen) >= 2 and all(excites_as_well(left, power[name]) for name in chosen):
         rest = tuple(record.header.name for record in campaign.records if record.header.name not in chosen)
         return Halves(campaign.only(rest), campaign.only(tuple(sorted(chosen))),
-                      f"held out: {', '.join(sorted(chosen))}; another record of the same level is fitted")
+                      f"records {', '.join(sorted(chosen))}; another record of the same level is fitted")
     parts = [_parted(record) for record in driven]
     quiet = tuple(record for record in campaign.records if record not in driven)
     return Halves(replace(campaign, records=(*(first for first, _ in parts), *quiet)),
                   replace(campaign, records=tuple(last for _, last in parts)),
-                  "held out: the last third of every record, because no two records have the same level")
+                  "the last third of every record, because no two records have the same level")
 
 
 def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:

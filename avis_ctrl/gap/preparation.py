@@ -90,7 +90,7 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     base = ResponseModel.of(apart, default_parameters(apart), campaign.y_unit, campaign.y_names, campaign.u_names, True,
                             amplifier_corner_Hz)
     nominal = TableModel(base, nominal=base)
-    progress(f"first fit, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
+    progress(f"first fit, {band[0]:.3g} to {band[1]:.3g} Hz; held out: {halves.how}")
     rough = _rough(nominal, halves, band, settings)
     clipped = campaign if mended and max(mended.clipped.values()) > settings.few_clipped else None
     if clipped is not None:

@@ -192,7 +192,7 @@ class Gap:
     noise_nrmse : what noise alone would leave of the held-out records. next_experiment : None or a sentence.
     baseline, updated : models (updated is the baseline where nothing was named).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
-    held_out : how the records were divided. seed, seconds.
+    held_out : what no fit has seen, and why. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
     detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.

@@ -104,7 +104,7 @@ def _stages(gap: Gap) -> Table:
     if np.isfinite(gap.noise_nrmse):
         rows.append(("noise alone", wording.percent(gap.noise_nrmse), "1", "1"))
     return table("Each model is fitted to the same records; the figures are those of records or periods that no fit "
-                 f"has seen{f' ({gap.held_out})' if gap.held_out else ''}. Error: r.m.s. of the residual "
+                 f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
                  "relative to that of the measured outputs.",
                  ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"), rows)
 

@@ -21,7 +21,7 @@ def measurement(found: Found) -> Section:
                      words.yes(bool(h.floor_names))))
     source = f" ({campaign.source})" if campaign.source else ""
     how = found.gap.held_out.rstrip(".")
-    divided = f" Divided: {how}." if how else ""
+    divided = f" Held out: {how}." if how else ""
     pieces: list[Piece] = [table(
         f"The records{source}, sampled at {words.number(campaign.sample_rate_Hz)} Hz; {len(campaign.u_names)} drives, "
         f"{len(campaign.y_names)} outputs [{words.unit(campaign.y_unit)}]. Levels are r.m.s. of the drives.{divided}",
