@@ -9,14 +9,19 @@ import typer
 
 from avis_ctrl.cli.console import Progress
 
+ORDERS = "orders.png"  # with --order: the orders tried and their mu
+
 
 def export(
     design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
     controller: Annotated[str, typer.Option("--controller", metavar="NAME", help="a controller of the design")] = "mu",
     order: Annotated[int | None, typer.Option("--order", metavar="N", help="export a new controller with at most "
-                                              "N states for the axes of the design, found by descent on mu (about a "
-                                              "minute)")] = None,
+                                              "N states for the axes of the design, found by descent on mu (one or "
+                                              "two minutes)")] = None,
+    mu_at_most: Annotated[float | None, typer.Option("--mu-at-most", metavar="MU", help="with --order: mu that the "
+                                                     "new controller may have, instead of the design's requirement"
+                                                     )] = None,
     formats: Annotated[str, typer.Option("--format", metavar="LIST", help="some of c,mat,json; controller.json and "
                                          "certificate.json are always written")] = "c,mat,json",
     float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
@@ -32,12 +37,17 @@ def export(
 
     from avis_ctrl.errors import InputError
     from avis_ctrl.export.design_folder import open_design
-    from avis_ctrl.export.fewer_states import with_fewer_states
+    from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
     from avis_ctrl.export.package import FILES, check_package, formats_of, make_package
     from avis_ctrl.files import write_together
     from avis_ctrl.study.files import output_folder
 
     console, asked = Console(highlight=False), formats_of(formats)
+    if check and order is not None:
+        raise InputError("--check computes the certificate of the files in DIR again and makes no new controller; "
+                         "expected one of --check and --order", field="--order", value=order)
+    if mu_at_most is not None and not (order is not None and mu_at_most > 0):
+        raise InputError("expected a positive number beside --order", field="--mu-at-most", value=mu_at_most)
     folder = open_design(design_dir)
     if check:
         with Progress(console) as progress:
@@ -47,14 +57,43 @@ def export(
         console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
     K = folder.controller(controller)  # a wrong name is said before anything is created
-    with output_folder(out, FILES) as path, Progress(console) as progress:
+    with output_folder(out, (*FILES, ORDERS)) as path, Progress(console) as progress:
+        pictures, most = dict[str, bytes](), float("inf")
         if order is not None:
+            most = mu_asked(folder.design) if mu_at_most is None else mu_at_most
             progress(f"controller of {order} states: descent on mu from the one with {K.nstates} states")
-            folder, controller = with_fewer_states(folder, controller, order)
-        made = make_package(folder, controller, "float32" if float32 else "float64", asked, progress)
-        files = write_together(path, made.contents, [path / name for name in FILES])
+            folder, controller = with_fewer_states(folder, controller, order, progress)
+            pictures[ORDERS] = _picture(folder.added[controller].orders)
+        made = make_package(folder, controller, "float32" if float32 else "float64", asked, progress, most)
+        files = write_together(path, pictures | made.contents, [path / name for name in (*FILES, ORDERS)])
+    if order is not None:
+        _orders(console, folder.added[controller].orders)
     _summary(console, made)
     console.print(f"{len(files)} files in {path}")
+
+
+def _picture(orders) -> bytes:
+    """Order against mu as a picture (PNG)."""
+    import io
+
+    from matplotlib.figure import Figure
+
+    from avis_ctrl.plot import order
+
+    file, figure = io.BytesIO(), Figure(figsize=(6, 4), layout="constrained")
+    order(list(orders), figure.add_subplot()).set_title("mu at most, with the design's model; the last one is exported")
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
+
+
+def _orders(console, orders) -> None:
+    from rich.table import Table
+
+    table = Table("states", "mu at most, design's model", "", title="order against mu")
+    for k, (states, mu) in enumerate(orders):
+        which = "of the folder" if not k else "exported" if k + 1 == len(orders) else ""
+        table.add_row(str(states), f"{mu:.4g}", which)
+    console.print(table)
 
 
 def _summary(console, made) -> None:
@@ -67,7 +106,7 @@ def _summary(console, made) -> None:
     rows = (("mu, upper bound", found["mu_upper"], ""), ("mu, lower bound", found["mu_lower"], ""),
             ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
             ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
-            ("worst-case gain between samples, too", found["between_samples"]["worst_case_gain_dB"], " dB"),
+            ("worst-case gain, between samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
             ("worst plant simulated with the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
             ("gain at rest, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
             (f"drive {found['at_rest']['drive']}: voltage for offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV",

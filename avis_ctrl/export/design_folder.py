@@ -25,11 +25,23 @@ from avis_ctrl.study.simulation import bare_loop
 
 
 @dataclass(frozen=True, eq=False)
+class Added:
+    """A controller of the logical axes that was made from those of the folder.
+
+    orders : number of states and upper bound of the design's mu (continuous, between all frequencies) of the controller
+    it was made from, of those on the way, and last of its own.
+    """
+
+    K: StateSpace
+    orders: tuple[tuple[int, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class DesignFolder:
     """What a design's folder holds.
 
     result : result.json. plant : the generalized plant of the design, built from its inputs.
-    added : further controllers of the logical axes, by name, that were made from those of the folder.
+    added : further controllers, by name.
     """
 
     path: Path
@@ -37,7 +49,7 @@ class DesignFolder:
     rig: Rig
     result: dict[str, Any]
     plant: DesignPlant
-    added: Mapping[str, StateSpace] = field(default_factory=dict)
+    added: Mapping[str, Added] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -47,7 +59,7 @@ class DesignFolder:
     def controller(self, name: str) -> StateSpace:
         """The continuous controller of the logical axes. Raises InputError with the names that there are."""
         if name in self.added:
-            return self.added[name]
+            return self.added[name].K
         if name not in self.names:
             raise InputError(f"expected one of {', '.join(self.names)}", field="--controller", value=name)
         return self.controller_in(self.path / "controllers" / f"{name}.json")

@@ -4,18 +4,32 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.export.design_folder import DesignFolder
-from avis_ctrl.robust.fixed_order import fixed_order
+from avis_ctrl.export.certificate import Progress
+from avis_ctrl.export.design_folder import Added, DesignFolder
+from avis_ctrl.robust.fixed_order import Task, fixed_order
+from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.roll_off import gain_limit
 
 
-def with_fewer_states(folder: DesignFolder, name: str, order: int) -> tuple[DesignFolder, str]:
+def mu_asked(design: Design) -> float:
+    """What the design's requirements allow mu to be; inf where they do not name it."""
+    return min((one.at_most for one in design.requirement if one.quantity == "mu_upper" and one.at_most is not None),
+               default=np.inf)
+
+
+def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Progress = lambda text: None
+                      ) -> tuple[DesignFolder, str]:
     """The folder with one controller more, of at most `order` states in the logical axes, and that controller's name.
 
-    It is made from the controller `name` by descent on the peak of mu (`fixed_order`). The states that decode the
-    sensors and those of the other axes' loops are not counted.
+    It is made by descent on the peak of mu (`fixed_order`) from the controller `name`, order by order, and from the
+    others of the folder that have no more states. The states that decode the sensors and those of the other axes'
+    loops are not counted.
 
     Raises
     ------
@@ -27,6 +41,11 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int) -> tuple[Desi
         raise InputError(f"expected 1 to {K.nstates - 1}: the controller {name!r} of this design has {K.nstates} "
                          "states", field="--order", value=order)
     with threadpool_limits(1):
-        found, _ = fixed_order(P.P, P.all_blocks.complexified(), K, order)
+        task = Task(P.P, P.all_blocks.complexified(), limit=gain_limit(folder.plant, folder.rig.sample_rate_Hz))
+        found, tried = K, [(K.nstates, mu_peak(P.closed(K), P.all_blocks, slack=SLACK).upper)]
+        for step in fixed_order(task, K, order, [folder.controller(one) for one in folder.names if one != name]):
+            found = step.K
+            tried.append((found.nstates, mu_peak(P.closed(found), P.all_blocks, slack=SLACK).upper))
+            progress(f"{found.nstates} states: mu at most {tried[-1][1]:.4g} with the design's model")
     made = f"{name}_{order}"
-    return replace(folder, added={made: found.renamed(K.inputs, K.outputs)}), made
+    return replace(folder, added={made: Added(found.renamed(K.inputs, K.outputs), tuple(tried))}), made

@@ -17,7 +17,7 @@ from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.certificate import Certificate, Progress, certify
 from avis_ctrl.export.compiled import compiler
-from avis_ctrl.export.design_folder import DesignFolder
+from avis_ctrl.export.design_folder import Added, DesignFolder
 from avis_ctrl.export.protection import protection
 from avis_ctrl.export.replay import Replay, replay_worst_plant
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, parse_controller, read_controller
@@ -53,13 +53,13 @@ def formats_of(text: str) -> tuple[str, ...]:
 
 
 def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "float64", formats: Sequence[str] = FORMATS,
-                 progress: Progress = lambda text: None) -> Package:
+                 progress: Progress = lambda text: None, mu_at_most: float = np.inf) -> Package:
     """Everything that `avis export` writes; controller.json and certificate.json always.
 
     Raises
     ------
     InputError : a name that the folder does not have.
-    ComputationError : a controller that is not stable by itself, or whose loop is not.
+    ComputationError : a controller that is not stable by itself, or whose loop is not, or has a larger mu than allowed.
     """
     text = folder.sampled(name, arithmetic).as_bytes()
     controller = parse_controller(text)  # the numbers as the file has them
@@ -72,6 +72,10 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
         raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
                                "written", measured="; ".join(dict.fromkeys(certificate.reasons)),
                                next_step=f"try {other}, or {further}")
+    if not (mu := certificate.content["mu_upper"]) <= mu_at_most:
+        raise ComputationError(f"mu of the exported controller {name!r} is not proved to be at most {mu_at_most:g}; "
+                               "nothing was written", measured=f"upper bound of mu {mu:.4g}",
+                               next_step=f"ask for a larger --order, or accept it with --mu-at-most {mu + 0.005:.2f}")
     replay = None
     if compiler() is not None:
         progress("worst plant with the compiled code, on the nonlinear table")
@@ -80,7 +84,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
     if name in folder.added:
-        contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name]))
+        contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name].K))
     if "c" in formats:
         files = c_files(controller, guard, _provenance(folder, controller, certificate))
         contents |= {key: value.encode() for key, value in files.items()}
@@ -149,7 +153,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     stored = read_json(out / CERTIFICATE, "avis-certificate")
     controller = read_controller(out / CONTROLLER)
     if (out / CONTINUOUS).exists():
-        folder = replace(folder, added={controller.name: folder.controller_in(out / CONTINUOUS)})
+        folder = replace(folder, added={controller.name: Added(folder.controller_in(out / CONTINUOUS))})
     found, changed = [], stored.get("controller_sha256") != controller.sha256
     if changed:
         found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")

@@ -12,8 +12,8 @@ from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish, log_if_wide, w
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
 # Colours of Okabe and Ito; controllers look as in the report.
-COLOURS = {"passive": "#7a7a7a", "skyhook_classical": "#56b4e9", "skyhook": "#e69f00", "hinf": "#009e73",
-           "mu": "#0072b2"}
+COLOURS = {"passive": "#7a7a7a", "skyhook_classical": "#56b4e9", "skyhook": "#e69f00", "loops": "#d55e00",
+           "hinf": "#009e73", "mu": "#0072b2"}
 LIMIT, LOWER = "#b3261e", "#e69f00"
 
 

@@ -25,6 +25,7 @@ STYLES: dict[str, Style] = {
     "passive": Style("#7a7a7a", "dot", 1.8),
     "skyhook_classical": Style("#56b4e9", "dashdot"),
     "skyhook": Style("#e69f00", "dash", 2.0),
+    "loops": Style("#d55e00", "dash"),
     "hinf": Style("#009e73", "dashdot", 1.8),
     "mu": Style("#0072b2", "solid", 2.4),
     "limit": Style("#b3261e", "dash", 1.4),

@@ -10,13 +10,17 @@ log-sum-exp that is sharpened from stage to stage, and lowered by BFGS with a we
 smoothness (Lewis and Overton, Mathematical Programming 141, 2013; Burke, Henrion, Lewis and Overton, HIFOO, 2006). A
 step that makes the loop unstable is refused. What the result is worth between the frequencies is for `mu_peak` to say.
 
-It starts from the full controller, shortened mode by mode, each time by the one that mu misses least.
+It starts from the full controller and goes down order by order: first descent, then without the mode missed least.
+Few states do not roll off by themselves: the descent makes a direct term of what the full controller does with fast
+modes. A limit of the controller's gain at high frequency is therefore part of what is lowered: its largest singular
+value over the limit is one more figure beside mu, with the slope u v^H for its singular vectors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as la
@@ -49,6 +53,7 @@ class FixedOrderSettings:
     negligible : weight in the smoothed maximum, relative to the largest, below which a frequency is left out: less than
         rounding errors change.
     first : frequencies of the largest balanced norms, whose mu tells which others count.
+    passing : number of the first stages that a controller gets which is only a step to one of lower order.
     same_pole : relative distance up to which two computations of a pole are one.
     """
 
@@ -56,8 +61,8 @@ class FixedOrderSettings:
     unneeded: float = 1e-6
     free: float = 0.01
     costly: float = 0.02
-    iterations: int = 150
-    stall: float = 5e-4
+    iterations: int = 300
+    stall: float = 1e-4
     accuracy: float = 1e-4
     armijo: float = 1e-4
     wolfe: float = 0.5
@@ -65,37 +70,109 @@ class FixedOrderSettings:
     narrow: float = 0.2
     negligible: float = 1e-13
     first: int = 3
+    passing: int = 2
     same_pole: float = 1e-9
 
 
 SETTINGS = FixedOrderSettings()
 
 
-def fixed_order(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool = False,
-                settings: FixedOrderSettings = SETTINGS) -> tuple[StateSpace, float]:
-    """A controller of at most an order with small peak complex mu, and that peak on its last frequency grid.
+@dataclass(frozen=True, eq=False)
+class GainLimit:
+    """Largest gain of a controller [of K], (n,), at frequencies omega (n,) [rad/s]; it counts as mu does."""
 
-    P continuous, u and y last; `structure` complex, performance last; K a controller that stabilises P. A decentralised
-    one moves u_k by y_k alone. ComputationError where no shortened controller, or not the diagonal part of K,
-    stabilises P.
+    omega: Array
+    most: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A controller on the way down, and the peak of complex mu and of its gain over the limit on its grid."""
+
+    K: StateSpace
+    peak: float
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is lowered. P continuous, u and y last; `structure` complex, performance last; a decentralised controller
+    moves u_k by y_k alone."""
+
+    P: StateSpace
+    structure: BlockStructure
+    decentralised: bool = False
+    limit: GainLimit | None = None
+    settings: FixedOrderSettings = SETTINGS
+
+    def peak(self, K: StateSpace, omega: Array) -> float:
+        """On a grid; inf where the loop is unstable."""
+        closed = lft_lower(self.P, K)
+        if not closed.is_stable():
+            return np.inf
+        M = closed.frequency_response(omega)[:, None]
+        beta = upper_bound(M, self.structure, 10 * self.settings.accuracy).beta
+        return max(float(np.max(beta)), self.gain(K))
+
+    def gain(self, K: StateSpace) -> float:
+        """Largest gain of K over its limit."""
+        if self.limit is None:
+            return 0.0
+        return float(np.max(np.exp(_gain(K, self.limit.omega)[0]) / self.limit.most))
+
+    def descended(self, K: StateSpace, stages: Sequence[float]) -> Step:
+        """The best controller after each of some stages of descent from K, K among them."""
+        closed = lft_lower(self.P, K)
+        omega, beta = self.with_peaks(closed, frequency_grid(closed))
+        best = Step(K, max(float(np.max(beta)), self.gain(K)))
+        for sharpness in stages:
+            form = Entries.of(K, self.decentralised)
+            K = form.controller(_bfgs(Objective(self, form, omega, sharpness).value, form.start, self.settings))
+            closed = lft_lower(self.P, K)
+            omega, beta = self.with_peaks(closed, merged(omega, frequency_grid(closed)))
+            if (peak := max(float(np.max(beta)), self.gain(K))) < best.peak:
+                best = Step(K, peak)
+        return best
+
+    def with_peaks(self, closed: StateSpace, omega: Array) -> tuple[Array, Array]:
+        """The grid with the local maxima of mu found between its points, and mu on it."""
+        def value(at: Array) -> Array:
+            return upper_bound(closed.frequency_response(at)[:, None], self.structure, self.settings.accuracy).beta
+        return refine_maxima(value, omega, value(omega), tolerance=1e-3, worth=0.95)
+
+
+def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpace] = ()) -> Iterator[Step]:
+    """Controllers of falling order with small peaks, as they are found; the last one has at most `order` states.
+
+    K stabilises the plant; it is shortened while that is free, then mode by mode with descent where a mode is missed.
+    `others` are further controllers to start from, used where they have at most `order` states. ComputationError where
+    no shortened controller, or not the diagonal part of K, stabilises the plant.
     """
-    if decentralised:
+    if task.decentralised:
         K = _diagonal_part(K)
-        if not lft_lower(P, K).is_stable():
+        if not lft_lower(task.P, K).is_stable():
             raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
                                    cause="the axes are too strongly coupled for loops of their own",
                                    next_step="choose other coordinates for u and y")
-    K = _shortened(P, structure, K, order, decentralised, settings)
-    closed = lft_lower(P, K)
-    omega, beta = _with_peaks(closed, structure, frequency_grid(closed), settings)
-    best, best_mu = K, float(np.max(beta))
-    for sharpness in settings.sharpness:
-        K = _improved(P, structure, K, omega, sharpness, decentralised, settings)
-        closed = lft_lower(P, K)
-        omega, beta = _with_peaks(closed, structure, merged(omega, frequency_grid(closed)), settings)
-        if float(np.max(beta)) < best_mu:
-            best, best_mu = K, float(np.max(beta))
-    return best, best_mu
+    settings = task.settings
+    passing = settings.sharpness[:settings.passing]
+    if K.nstates > order:
+        omega = frequency_grid(lft_lower(task.P, K))
+        K = reduce_controller(task.P, K, lambda one: task.peak(one, omega), settings.free, range(order, K.nstates)).K
+    while K.nstates > order:
+        shorter, peak = _shorter(task, K, order)
+        if not peak <= (1 + settings.costly) * task.peak(K, frequency_grid(lft_lower(task.P, K))):
+            yield (step := task.descended(K, passing))
+            shorter, peak = _shorter(task, step.K, order)
+        if not np.isfinite(peak):
+            raise ComputationError(f"no controller of order {order} to start from",
+                                   measured=f"at order {K.nstates} every mode is needed for stability",
+                                   cause="the plant needs more states to be stabilised",
+                                   next_step="ask for a higher order")
+        K = shorter
+    # The start that the first stage brings lowest goes on.
+    starts = [K, *(one for one in others if one.nstates <= order and lft_lower(task.P, one).is_stable())]
+    best = min((task.descended(one, settings.sharpness[:1]) for one in starts), key=lambda one: one.peak)
+    yield task.descended(best.K, settings.sharpness[1:])
 
 
 def _diagonal_part(K: StateSpace) -> StateSpace:
@@ -107,46 +184,14 @@ def _diagonal_part(K: StateSpace) -> StateSpace:
     return append(*parts)
 
 
-def _improved(P: StateSpace, structure: BlockStructure, K: StateSpace, omega: Array, sharpness: float,
-              decentralised: bool, settings: FixedOrderSettings) -> StateSpace:
-    """K after one stage of descent on the frequencies omega."""
-    form = Entries.of(K, decentralised)
-    problem = Objective(P, structure, form, omega, sharpness, settings.accuracy, settings)
-    return form.controller(_bfgs(problem.value, form.start, settings))
-
-
-def _shortened(P: StateSpace, structure: BlockStructure, K: StateSpace, order: int, decentralised: bool,
-               settings: FixedOrderSettings) -> StateSpace:
-    """K without all but `order` states: truncated while that is free, then mode by mode."""
-    omega = frequency_grid(lft_lower(P, K))
-
-    def peak(one: StateSpace) -> float:
-        closed = lft_lower(P, one)
-        if not closed.is_stable():
-            return np.inf
-        M = closed.frequency_response(omega)[:, None]
-        return float(np.max(upper_bound(M, structure, 10 * settings.accuracy).beta))
-    if K.nstates > order:
-        K = reduce_controller(P, K, peak, settings.free, range(order, K.nstates)).K
-    now, improved = peak(K), False
-    while K.nstates > order:
-        fewer = [*_without_one_mode(K), *_truncated(K)]
-        # One state less than asked where only a pair of poles can go.
-        fewer = [one for one in fewer if one.nstates >= order] or fewer
-        peaks = [peak(one) for one in fewer]
-        least = int(np.argmin(peaks))
-        if peaks[least] > (1 + settings.costly) * now and not improved:
-            K = _improved(P, structure, K, omega, settings.sharpness[0], decentralised, settings)
-            improved = True
-            now = peak(K)
-            continue
-        if not np.isfinite(peaks[least]):
-            raise ComputationError(f"no controller of order {order} to start from",
-                                   measured=f"at order {K.nstates} every mode is needed for stability",
-                                   cause="the plant needs more states to be stabilised",
-                                   next_step="ask for a higher order")
-        K, now, improved = fewer[least], peaks[least], False
-    return K
+def _shorter(task: Task, K: StateSpace, order: int) -> tuple[StateSpace, float]:
+    """K without the mode missed least, and its peak then; one state less than asked where only a pair can go."""
+    omega = frequency_grid(lft_lower(task.P, K))
+    fewer = [*_without_one_mode(K), *_truncated(K)]
+    fewer = [one for one in fewer if one.nstates >= order] or fewer
+    peaks = [task.peak(one, omega) for one in fewer]
+    least = int(np.argmin(peaks))
+    return fewer[least], peaks[least]
 
 
 def _truncated(K: StateSpace) -> list[StateSpace]:
@@ -170,14 +215,6 @@ def _without_one_mode(K: StateSpace) -> list[StateSpace]:
             if abs(pole) > 0:
                 fewer.append(replace(kept, D=kept.D + gone.dcgain()))
     return fewer
-
-
-def _with_peaks(closed: StateSpace, structure: BlockStructure, omega: Array,
-                settings: FixedOrderSettings) -> tuple[Array, Array]:
-    """The grid with the local maxima of mu found between its points, and mu on it."""
-    def value(at: Array) -> Array:
-        return upper_bound(closed.frequency_response(at)[:, None], structure, settings.accuracy).beta
-    return refine_maxima(value, omega, value(omega), tolerance=1e-3, worth=0.95)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,32 +295,30 @@ def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The smoothed maximum of log mu over a frequency grid as a function of the entries of K, with its slope."""
+    """The smoothed maximum of log mu over a frequency grid, and of the gain over its limit, as a function of the
+    entries of K, with its slope."""
 
-    P: StateSpace
-    structure: BlockStructure
+    task: Task
     form: Entries
     omega: Array
     sharpness: float
-    accuracy: float
-    settings: FixedOrderSettings = SETTINGS
 
     def value(self, x: Array) -> tuple[float, Array]:
         """log of the smoothed peak and its slope; inf where the loop is unstable."""
-        K = self.form.controller(x)
+        K, P, settings = self.form.controller(x), self.task.P, self.task.settings
         try:
-            closed = lft_lower(self.P, K)
+            closed = lft_lower(P, K)
         except ComputationError:
             return np.inf, np.zeros(x.size)
         if not closed.is_stable():
             return np.inf, np.zeros(x.size)
         # Narrow modes move from step to step; on the grid alone descent would hide their peaks between its points.
-        narrow = resonances(closed.poles(), damping=self.settings.narrow)
+        narrow = resonances(closed.poles(), damping=settings.narrow)
         omega = np.concatenate([self.omega, narrow])
         n_u, n_y = K.noutputs, K.ninputs
-        p = np.concatenate([self.response, self.P.frequency_response(narrow)])
+        p = np.concatenate([self.response, P.frequency_response(narrow)])
         z, w = p.shape[1] - n_y, p.shape[2] - n_u
-        phi = np.linalg.inv(1j * omega[:, None, None] * np.eye(K.nstates) - K.A)
+        phi = _resolvent(K, omega)
         k = K.C @ phi @ K.B + K.D
         # With E = inv(I - P22 K): dM = P12 (I + K E P22) dK E P21.
         E = np.linalg.inv(np.eye(n_y) - p[:, z:, w:] @ k)
@@ -292,12 +327,16 @@ class Objective:
         L = p[:, :z, w:] @ (np.eye(n_u) + k @ E @ p[:, z:, w:])
         near, bound = self._highest(M)
         M, L, R, phi = M[near], L[near], R[near], phi[near]
-        lam = bound.beta ** 2 * (1 + self.accuracy)
+        lam = bound.beta ** 2 * (1 + settings.accuracy)
         dual = np.linalg.inv(residual(M[:, None], bound.scalings, lam, np.ones(w, bool))[:, 0])
         dual /= np.trace(bound.scalings.X_w @ dual, axis1=1, axis2=2).real[:, None, None]
         # d log beta = d lambda / (2 lambda) = Re tr(G dK).
         G = R @ dual @ dagger(M) @ bound.scalings.X_z @ L / lam[:, None, None]
         logs = np.log(bound.beta)
+        if self.task.limit is not None:
+            high, slopes = _gain(K, self.task.limit.omega)
+            logs = np.concatenate([logs, high - np.log(self.task.limit.most)])
+            G, phi = np.concatenate([G, slopes]), np.concatenate([phi, _resolvent(K, self.task.limit.omega)])
         top = float(np.max(logs))
         weight = np.exp(self.sharpness * (logs - top))
         total = top + float(np.log(np.sum(weight))) / self.sharpness
@@ -316,23 +355,37 @@ class Objective:
         """Indices of the frequencies that count in the smoothed maximum, and the bounds of mu there.
 
         M (n_omega, n_z, n_w). The norm after Osborne's scaling is cheap and no less than the bound: where it is small,
-        the frequency does not count.
+        the frequency does not count. The highest norms come first: their mu tells which of the others count.
         """
-        d_z, d_w = expand(self.structure, block_balance(M[:, None], self.structure))
+        structure, settings = self.task.structure, self.task.settings
+        d_z, d_w = expand(structure, block_balance(M[:, None], structure))
         size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
-        first = np.argsort(size)[-self.settings.first:]
-        top = float(np.max(upper_bound(M[first][:, None], self.structure, self.accuracy).beta))
-        near = np.flatnonzero(size >= top * self.settings.negligible ** (1 / self.sharpness))
-        return near, upper_bound(M[near][:, None], self.structure, self.accuracy)
+        falling = np.argsort(-size)
+        first = upper_bound(M[falling[:settings.first]][:, None], structure, settings.accuracy)
+        least = float(np.max(first.beta)) * settings.negligible ** (1 / self.sharpness)
+        further = falling[settings.first:]
+        further = further[size[further] >= least]
+        if not further.size:
+            return falling[:settings.first], first
+        rest = upper_bound(M[further][:, None], structure, settings.accuracy)
+        return np.concatenate([falling[:settings.first], further]), UpperBound.joined([first, rest])
 
-    @property
+    @cached_property
     def response(self) -> Array:
         """P at the frequencies (n_omega, n_out, n_in)."""
-        found = self.__dict__.get("_response")
-        if found is None:
-            found = self.P.frequency_response(self.omega)
-            object.__setattr__(self, "_response", found)
-        return found
+        return self.task.P.frequency_response(self.omega)
+
+
+def _resolvent(K: StateSpace, omega: Array) -> Array:
+    """inv(j omega I - A), (n_omega, n, n)."""
+    return np.linalg.inv(1j * omega[:, None, None] * np.eye(K.nstates) - K.A)
+
+
+def _gain(K: StateSpace, omega: Array) -> tuple[Array, Array]:
+    """log of the largest singular value of K at frequencies, and G with its change Re tr(G dK), (n, n_y, n_u)."""
+    U, s, Vh = np.linalg.svd(K.frequency_response(omega))
+    s = np.maximum(s, np.finfo(float).tiny)
+    return np.log(s[:, 0]), dagger(U[:, :, :1] @ Vh[:, :1]) / s[:, :1, None]
 
 
 def _bfgs(value: Callable[[Array], tuple[float, Array]], x: Array, settings: FixedOrderSettings) -> Array:

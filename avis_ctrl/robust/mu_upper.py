@@ -6,6 +6,7 @@ an upper bound however far the optimisation got.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,13 @@ class UpperBound(NamedTuple):
 
     beta: Array
     scalings: Scalings
+
+    @staticmethod
+    def joined(parts: Sequence[UpperBound]) -> UpperBound:
+        """One batch of several."""
+        return UpperBound(np.concatenate([part.beta for part in parts]),
+                          Scalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts),
+                                                                        strict=True))))
 
 
 def block_balance(M: Array, structure: BlockStructure, sweeps: int = 20) -> Array:
@@ -63,10 +71,8 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
     if _is_diagonal(structure):
         return _upper_chunk(M, structure, tolerance, goals)
     n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
-    parts = [_upper_chunk(M[k:k + n_chunk], structure, tolerance, goals[k:k + n_chunk])
-             for k in range(0, M.shape[0], n_chunk)]
-    return UpperBound(np.concatenate([p.beta for p in parts]),
-                      Scalings(*(np.concatenate(s) for s in zip(*(p.scalings for p in parts), strict=True))))
+    return UpperBound.joined([_upper_chunk(M[k:k + n_chunk], structure, tolerance, goals[k:k + n_chunk])
+                              for k in range(0, M.shape[0], n_chunk)])
 
 
 def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:

@@ -23,7 +23,7 @@ from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import continuous_image, sampled_image
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.dstep import PointwiseScalings, tightened
-from avis_ctrl.robust.fixed_order import fixed_order
+from avis_ctrl.robust.fixed_order import Task, fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
 from avis_ctrl.robust.mu_peak import mu_peak
@@ -147,7 +147,9 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         assert current.best is not None
         best, notes = current.best, tuple[str, ...]()
         if apart or (order is not None and best.K.nstates > order):
-            K, peak = fixed_order(problem.P, complexified, best.K, best.K.nstates if order is None else order, apart)
+            task = Task(problem.P, complexified, decentralised=apart)
+            *_, short = fixed_order(task, best.K, best.K.nstates if order is None else order)
+            K, peak = short.K, short.peak
             notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
                      f"instead of {best.mu:.4g}",)
             best = Loop(K, best.scalings, np.nan, peak)

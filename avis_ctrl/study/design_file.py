@@ -40,7 +40,7 @@ NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
 Percent = Annotated[float, Field(gt=0, lt=100)]
 Decibel = Annotated[float, Field(ge=-200, le=200)]
 Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
-Rival = Literal["hinf", "skyhook_classical", "skyhook"]
+Rival = Literal["hinf", "skyhook_classical", "skyhook", "loops"]
 
 
 class LoopSection(Section):

@@ -14,6 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
@@ -24,6 +25,7 @@ from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passi
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.limits import best_found
+from avis_ctrl.study.loops import LOOPS_TITLE, tuned_loops
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.random_plants import random_perturbations
@@ -120,13 +122,13 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesi
                         compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed)
 
 
-ORDER = ("passive", "skyhook_classical", "skyhook", "hinf", "mu")
+ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
 
 
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None) -> Compared:
-    """Bounds of every controller, a skyhook tuned to the worst-case peak of mu where the design compares with one, and
-    the simulation of mu.
+    """Bounds of every controller, one loop an axis tuned on mu and a skyhook tuned to the worst-case peak of mu where
+    the design compares with them, and the simulation of mu.
 
     Runs on two processes. The tuning of the skyhook and the simulation wait for the bounds of all the others, because
     the best of these is delivered as the mu controller.
@@ -138,6 +140,9 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     with Workers() as workers:
         jobs = {workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}
+        if "loops" in design.compare_with:
+            made = next(c.K for c in candidates if c.name == "mu")
+            jobs[workers.submit(_own_loops, design, plant, rig, made, samples)] = "loops"
         progress("bounds of every controller over the whole uncertainty set, closed loop of the nonlinear rig")
         found: dict[str, ControllerResult | FailedController] = {}
 
@@ -188,6 +193,16 @@ def _tuned(design: Design, plant: DesignPlant, rig: Rig, peak_limit: float, samp
             candidate = tuned_skyhook(plant, rig, design, peak_limit)
         except ComputationError as error:
             return FailedController("skyhook", "skyhook, tuned", "skyhook", str(error))
+        return _measured(design, plant, candidate, samples)
+
+
+def _own_loops(design: Design, plant: DesignPlant, rig: Rig, K: StateSpace, samples: np.ndarray
+               ) -> ControllerResult | FailedController:
+    with threadpool_limits(1):
+        try:
+            candidate = tuned_loops(plant, rig, design, K)
+        except ComputationError as error:
+            return FailedController("loops", LOOPS_TITLE, "skyhook", str(error))
         return _measured(design, plant, candidate, samples)
 
 

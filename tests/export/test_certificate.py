@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,14 @@ from avis_ctrl.export.c_source import Provenance, c_files
 from avis_ctrl.export.certificate import certify, shipped_loop
 from avis_ctrl.export.compiled import CompiledController
 from avis_ctrl.export.design_folder import open_design
-from avis_ctrl.export.fewer_states import with_fewer_states
+from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
 from avis_ctrl.export.package import CERTIFICATE, CONTINUOUS, CONTROLLER, check_package, make_package
 from avis_ctrl.export.protection import Processor, protection
 from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import parse_controller
+from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 from avis_ctrl.simulation import simulate
 from avis_ctrl.simulation.discrete import spectral_radius
@@ -216,14 +219,43 @@ def test_only_what_was_changed_is_named(shipped, package, tmp_path):
     assert found[0].startswith("mu_upper: 0.7")
 
 
+def test_a_mu_above_the_requirement_is_refused(shipped, package, monkeypatch):
+    monkeypatch.setattr("avis_ctrl.export.package.certify", lambda *arguments: package.certificate)
+    asked = mu_asked(shipped.design)
+    assert asked == 1.0  # designs/avis_z_phix.toml
+    with pytest.raises(ComputationError, match=r"at most 0\.5; nothing was written"):
+        make_package(shipped, "mu", "float32", mu_at_most=0.5 * asked)
+
+
 @pytest.mark.slow
-def test_eight_states_by_descent_on_mu_are_certified(shipped, package, tmp_path):
-    """Truncation to ten states takes mu beyond 1.7; asked is 15 % more than the full controller's."""
-    folder, name = with_fewer_states(shipped, "mu", 8)
-    made = make_package(folder, name)
-    assert folder.controller(name).nstates <= 8
+def test_six_states_by_descent_on_mu_are_certified(shipped, package, tmp_path, rng):
+    """Truncation to ten states takes mu beyond 1.7; asked is 15 % more than the full controller's, and below 1."""
+    folder, name = with_fewer_states(shipped, "mu", 6)
+    made = make_package(folder, name, mu_at_most=1.0)
+    K = folder.controller(name)
+    assert K.nstates <= 6
     assert made.controller.system.nstates < package.controller.system.nstates
     assert made.certificate.content["mu_upper"] < 1.15 * package.certificate.content["mu_upper"]
+    # The loop formed anew: the peak of mu without sampling, as the picture of the orders has it.
+    orders, P = folder.added[name].orders, shipped.plant.synthesis
+    peak = mu_peak(lft_lower(P.P, K), P.all_blocks)
+    assert orders[-1][0] == K.nstates and peak.guaranteed
+    assert peak.lower <= orders[-1][1] <= 1.01 * peak.upper
+    assert orders[0][0] == 12 and all(more > fewer for (more, _), (fewer, _) in pairwise(orders))
+    # The loop gain of the nominal table on a dense grid, hold and all images left out.
+    omega = np.geomspace(np.pi * shipped.rig.sample_rate_Hz, 1e6, 2000)
+    table = P.P.select(P.y, P.u).frequency_response(omega)
+    assert np.max(np.linalg.norm(table @ K.frequency_response(omega), 2, (1, 2))) < 0.5
+    # Transmissibility of sampled plants, from the numbers in the file; the worst one comes near the bound.
+    found, omega = made.certificate.content, 2 * np.pi * np.geomspace(0.03, 120.0, 60)
+    numbers, worst = json.loads(made.contents[CONTROLLER]), made.certificate.worst
+    sigma = sampled_transmissibility(folder, numbers, [worst.delta, *vertices(folder, 40, rng)],
+                                     np.append(omega, worst.omega))
+    low, high = folder.design.transmissibility.band_Hz
+    band = np.flatnonzero((omega >= 2 * np.pi * low) & (omega <= 2 * np.pi * high))
+    assert 0.97 * ratio(found["worst_case_peak_transmissibility_dB"]) < np.max(sigma)
+    assert np.max(sigma) <= ratio(found["worst_case_peak_transmissibility_dB"])
+    assert np.max(sigma[:, band]) <= ratio(found["worst_case_band_transmissibility_dB"])
     # By another route: H-infinity norm of the nominal loop by SLICOT; without uncertainty mu is at most this much.
     nominal = shipped.plant.synthesis.nominal().closed(folder.controller(name))
     assert hinf_norm_slicot(nominal) <= made.certificate.content["mu_upper"]

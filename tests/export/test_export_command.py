@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import control
+import matplotlib.image
 import numpy as np
 import pytest
 import scipy.io
@@ -51,6 +53,24 @@ def test_files_follow_the_contract(out):
         assert np.array_equal(matrix, matrix.astype(np.float32).astype(float))
     vectors = np.loadtxt(out / "test_vectors.csv", delimiter=",", skiprows=1)
     assert vectors.shape == (2000, len(controller["inputs"]) + len(controller["outputs"]))
+
+
+@pytest.mark.slow
+def test_fewer_states_than_the_design_allows_mu_for(skyhook_dir, tmp_path):
+    """A skyhook's loops with three of their four states: refused without a file, and exported once it is accepted."""
+    asked = "export", skyhook_dir, "--controller", "skyhook_classical", "--order", "3", "--out", tmp_path / "new"
+    done = avis(*asked)
+    assert done.returncode == 3 and "not proved to be at most 1; nothing was written" in done.stderr
+    assert not (tmp_path / "new").exists()
+    accepted = re.search(r"accept it with (--mu-at-most) ([0-9.]+)", done.stderr)
+    done = avis(*asked, *accepted.groups())
+    assert done.returncode == 0, done.stderr
+    assert {one.name for one in (tmp_path / "new").iterdir()} == {*FILES, "orders.png"}
+    certificate = json.loads((tmp_path / "new" / "certificate.json").read_text())
+    assert 1 < certificate["mu_upper"] <= float(accepted[2]) and certificate["stable"]
+    picture = matplotlib.image.imread(tmp_path / "new" / "orders.png")
+    assert picture.shape[:2] == (600, 900) and np.ptp(picture) > 0.9
+    assert "order against mu" in done.stdout and "exported" in done.stdout
 
 
 def test_mat_file_and_python_control_have_the_same_numbers(out):
@@ -108,6 +128,8 @@ def test_header_says_where_it_comes_from(out):
     (("DESIGN", "--controller", "skyhook_classical", "--out", "FILE"), "--out"),
     (("DESIGN", "--controller", "skyhook_classical", "--out", "/proc/nothing"), "--out"),
     (("DESIGN", "--controller", "skyhook_classical", "--order", "4", "--out", "OUT"), "expected 1 to 3"),
+    (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "beside --order"),
+    (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "one of --check and --order"),
     (("EMPTY", "--out", "OUT"), "result.json"),
     (("DESIGN", "--out", "OUT", "--check"), "certificate.json")])
 def test_wrong_input_is_one_line_and_writes_nothing(skyhook_dir, tmp_path, arguments, words):

@@ -1,12 +1,15 @@
 """mu synthesis at a fixed order: slopes by differences, bounds by AB13MD, against truncation of the full controller."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, balanced_truncation, discretise, lft_lower
-from avis_ctrl.robust.fixed_order import Entries, Objective, fixed_order
+from avis_ctrl.robust.fixed_order import SETTINGS, Entries, GainLimit, Objective, Task, fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import musyn
 from avis_ctrl.robust.reduction import split_stable
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
@@ -34,16 +37,18 @@ def full():
     return P, UNCERTAIN_DRIVE, musyn(P, UNCERTAIN_DRIVE, 1, 1, max_iterations=4)
 
 
-@pytest.mark.parametrize("states", [3, 4])
-def test_slope_is_that_of_differences(full, states):
-    """In random directions, for a controller with real and complex poles."""
+@pytest.mark.parametrize(("states", "most"), [(3, None), (4, None), (4, [30.0, 3.0])])
+def test_slope_is_that_of_differences(full, states, most):
+    """In random directions, for a controller with real and complex poles; with a limit that its gain exceeds, too."""
     P, _, made = full
     stable, unstable = split_stable(made.K)
     K = balanced_truncation(stable, states - unstable.nstates) + unstable
     form = Entries.of(K)
     omega = frequency_grid(lft_lower(P, K))
     assert np.allclose(form.controller(form.start).frequency_response(omega), K.frequency_response(omega), rtol=1e-6)
-    problem = Objective(P, ONE_DRIVE, form, omega, 20.0, 1e-5)
+    limit = GainLimit(np.array([200.0, 1000.0]), np.array(most)) if most else None
+    task = Task(P, ONE_DRIVE, limit=limit, settings=replace(SETTINGS, accuracy=1e-5))
+    problem = Objective(task, form, omega, 20.0)
     _, slope = problem.value(form.start)
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -56,7 +61,8 @@ def test_slope_is_that_of_differences(full, states):
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(full, order):
     P, _, made = full
-    K, on_grid = fixed_order(P, ONE_DRIVE, made.K, order)
+    *_, step = fixed_order(Task(P, ONE_DRIVE), made.K, order)
+    K, on_grid = step.K, step.peak
     assert K.nstates <= order
     reached = peak_by_slicot(lft_lower(P, K))
     assert reached == pytest.approx(on_grid, rel=0.01)
@@ -64,6 +70,42 @@ def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(fu
     truncated = balanced_truncation(stable, order - unstable.nstates) + unstable
     assert reached <= peak_by_slicot(lft_lower(P, truncated)) * (1 + 1e-6)
     assert reached <= 1.03 * made.mu_upper_complex
+
+
+def test_a_gain_above_its_limit_is_lowered(full):
+    """Without a limit the controller of two states has a direct term; gains on a dense grid beyond the limit's two."""
+    P, _, made = full
+    *_, free = fixed_order(Task(P, ONE_DRIVE), made.K, 2)
+    dense = np.geomspace(1e3, 1e5, 300)
+    gain = np.max(np.linalg.norm(free.K.frequency_response(dense), 2, (1, 2)))
+    limit = GainLimit(np.array([1e3, 1e5]), np.full(2, 0.5 * gain))
+    *_, bound = fixed_order(Task(P, ONE_DRIVE, limit=limit), made.K, 2)
+    assert np.max(np.linalg.norm(bound.K.frequency_response(dense), 2, (1, 2))) <= 0.5 * gain * bound.peak * (1 + 1e-3)
+    assert peak_by_slicot(lft_lower(P, bound.K)) <= bound.peak * 1.01
+
+
+def test_no_frequency_is_bounded_twice_in_a_step(full, monkeypatch):
+    P, _, made = full
+    form, seen = Entries.of(made.K), []
+
+    def counted(M, *arguments):
+        seen.append(M)
+        return upper_bound(M, *arguments)
+    monkeypatch.setattr("avis_ctrl.robust.fixed_order.upper_bound", counted)
+    value, _ = Objective(Task(P, ONE_DRIVE), form, frequency_grid(lft_lower(P, made.K)), 20.0).value(form.start)
+    every = np.concatenate(seen)
+    assert len(every) > SETTINGS.first and len(np.unique(every.reshape(len(every), -1), axis=0)) == len(every)
+    assert np.exp(value) >= made.mu_upper_complex * 0.98
+
+
+def test_starts_of_fewer_states_are_tried(full):
+    """Descent that is cut short does not reach the best of three states; it does if it may start from that."""
+    P, _, made = full
+    *_, best = fixed_order(Task(P, ONE_DRIVE), made.K, 3)
+    hasty = Task(P, ONE_DRIVE, settings=replace(SETTINGS, iterations=2))
+    *_, alone = fixed_order(hasty, made.K, 3)
+    *_, found = fixed_order(hasty, made.K, 3, [best.K])
+    assert found.peak <= best.peak * (1 + 1e-6) < alone.peak
 
 
 def test_the_result_is_that_of_the_short_controller(full):

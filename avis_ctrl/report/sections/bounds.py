@@ -77,7 +77,7 @@ def _stability(result: DesignResult) -> Table:
 
 def _worst(result: DesignResult) -> Table:
     rows = []
-    for name in ("mu", "skyhook", "hinf"):
+    for name in ("mu", "skyhook", "loops", "hinf"):
         c = next((one for one in result.controllers if one.name == name), None)
         if c is None:
             continue

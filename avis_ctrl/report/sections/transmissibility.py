@@ -77,8 +77,8 @@ def _nominal(result: DesignResult) -> Figure:
 
 
 def _with_bounds(result: DesignResult) -> list[ControllerResult]:
-    """mu and the tuned skyhook; this one may have been left out, or have failed."""
-    return [c for name in ("mu", "skyhook") for c in result.controllers if c.name == name]
+    """mu, and of its tuned rivals those that were asked for and made."""
+    return [c for name in ("mu", "skyhook", "loops") for c in result.controllers if c.name == name]
 
 
 def _uncertain(result: DesignResult) -> Figure:

@@ -1,0 +1,54 @@
+"""One loop an axis, tuned on mu: what decentralised control reaches on the same plant and weights.
+
+A skyhook has a form that was not chosen for these weights. The advantage of a controller that sees all axes is honest
+only against loops that each see their own axis alone and are otherwise as free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.robust.fixed_order import Task, fixed_order
+from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.design_result import Candidate
+from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.roll_off import gain_limit
+from avis_ctrl.study.skyhooks import classical_loops
+
+LOOPS_TITLE = "one loop per axis, tuned on mu"
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """states : of the loops per axis. A skyhook has two, its corners; one more lets the damping pole be complex."""
+
+    states: int = 3
+
+
+def tuned_loops(plant: DesignPlant, rig: Rig, design: Design, K: StateSpace, settings: LoopSettings = LoopSettings()
+                ) -> Candidate:
+    """Loops found by descent on the peak of mu from the diagonal part of the controller K, or from the classical
+    skyhook: the force on an axis depends on the seen velocity of that axis alone.
+
+    The states go to the axes that need them, `settings.states` to each on average.
+
+    Raises
+    ------
+    ComputationError : no start stabilises the nominal plant, or a table without a bounded gain.
+    """
+    P, skyhook = plant.synthesis, classical_loops(plant, rig, design).controller()
+    task = Task(P.P, P.all_blocks.complexified(), decentralised=True, limit=gain_limit(plant, rig.sample_rate_Hz))
+    order = settings.states * len(plant.axes)
+    try:
+        *_, found = fixed_order(task, K, order, [skyhook])
+    except ComputationError:  # the axes of K need one another
+        *_, found = fixed_order(task, skyhook, order)
+    K = found.K.renamed(K.inputs, K.outputs)
+    moved = [np.count_nonzero(np.any(K.C[[k]], axis=0)) for k in range(K.noutputs)]
+    states = ", ".join(f"{axis} {n}" for axis, n in zip(plant.axes, moved, strict=True))
+    return Candidate("loops", LOOPS_TITLE, "skyhook", K, (f"states of each axis's loop: {states}",))

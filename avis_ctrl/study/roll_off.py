@@ -1,0 +1,43 @@
+"""What a controller's gain may be from half the sample rate on, for the proof of stability of the code that runs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.robust.fixed_order import GainLimit
+from avis_ctrl.robust.mu_upper import skewed_upper_bound
+from avis_ctrl.study.plant import DesignPlant
+
+
+@dataclass(frozen=True)
+class RollOffSettings:
+    """beyond, points : the limit is computed at so many frequencies from half the sample rate to this multiple of it;
+    the table's gain falls smoothly there. held : gain of the hold at half the sample rate."""
+
+    beyond: float = 30.0
+    points: int = 10
+    held: float = 2 / np.pi
+
+
+def gain_limit(plant: DesignPlant, sample_rate_Hz: float, settings: RollOffSettings = RollOffSettings()) -> GainLimit:
+    """Largest gains [N s/m] with which the loop gain of the certificate stays below one.
+
+    The sampled controller is taken as the continuous one and an error of any phase: that one's gain, and `held` times
+    it, which is what the hold leaves of it. At half the sample rate the image falls onto itself and counts once more.
+
+    Raises
+    ------
+    ComputationError : a table without a bounded gain over the uncertainty set.
+    """
+    blocks, P, u, y = plant.full.blocks, plant.full.P, plant.full.u, plant.full.y
+    omega = np.geomspace(1.0, settings.beyond, settings.points) * np.pi * sample_rate_Hz
+    table = P.select([*P.outputs[:blocks.n_z], *y], [*P.inputs[:blocks.n_w], *u]).frequency_response(omega)
+    gain = skewed_upper_bound(table[:, None], blocks.with_performance(len(u), len(y))).beta
+    if not np.all(np.isfinite(gain)):
+        raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
+                               next_step="design with smaller uncertainty")
+    images = np.where(np.arange(omega.size) == 0, 2.0, 1.0)
+    return GainLimit(omega, 1 / ((2 + settings.held) * images * gain))
