@@ -18,7 +18,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
-from avis_ctrl.robust.musyn_state import STARTS
+from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
@@ -59,6 +59,11 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     return conclude(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
 
 
+# Controllers from which the D-K iteration starts, by their kind in its history.
+INITIAL = {HINF: "H-infinity, uncertainty as performance", NOMINAL: "H-infinity, nominal plant",
+           GIVEN: "from the comparison"}
+
+
 @dataclass(frozen=True, eq=False)
 class Compared:
     """Controllers in the report's order, those that failed with their reasons, and the loop of all axes."""
@@ -89,8 +94,8 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, progress: Progress 
 
         def shown(row: Any) -> bool:
             """After each iteration; False ends it."""
-            if row.kind in STARTS:
-                progress(f"initial controller ({row.kind}): peak mu {row.mu_upper:.5g}, order {row.order}")
+            if row.kind in INITIAL:
+                progress(f"initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, order {row.order}")
                 return True
             ends = enough()  # before the line: from when it is seen, Ctrl-C keeps this controller
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
