@@ -8,7 +8,7 @@ rig                 a table: "avis", "halcyonics", "halcyonics_loaded" or a rig 
 campaign            measured records or responses from a file (HDF5, .mat, UFF 58, CSV)
 simulate_campaign   records of the simulated nonlinear table
 identify            the table's parameters and their uncertainty from a campaign
-gap                 the physical effect that a table's model misses
+gap                 the physical effects that a table's model misses
 design              certified controllers of a table, compared, simulated, with a report
 single_axis         a small model of one axis: seismometer, decay, drive, oscillator
 
@@ -17,7 +17,7 @@ Linear systems and robust control of any plant:
 StateSpace          a linear system with named signals
 tf                  a system from the coefficients of a transfer function
 ss                  a system from A, B, C, D, whose entries may be uncertain
-connect             systems connected through signals of one name
+connect             systems connected through signals of the same name
 real                an uncertain real parameter
 complex_disk        an uncertain complex number
 dynamics            unknown stable dynamics of bounded size
@@ -26,21 +26,21 @@ RealScalar          block of a real parameter, repeated or not
 ComplexScalar       block of a complex number, repeated or not
 ComplexFull         block of a full complex matrix
 BlockStructure      the blocks of a structured perturbation
-uncertainty_weight  a filter that covers what responses differ by
+uncertainty_weight  a filter that covers the differences between responses
 hinfsyn             H-infinity controller
 mixed_sensitivity   H-infinity controller for weights on S, KS and T
 musyn               mu controller (D-K iteration)
 mu                  bounds of the structured singular value of matrices
 mu_peak             its peak over frequency, proved between the points
 worst_case_gain     the largest gain over all perturbations
-robust_stability    the part of the uncertainty up to which a loop is stable
+robust_stability    the size of the uncertainty up to which a loop is stable
 robust_performance  the same with a bound on its gain
-disk_margin         gain and phase margins of all channels at once
+disk_margin         gain and phase margins of all channels at the same time
 plot                bode, sigma, mu, transmissibility, dk_history, order, vc_curves
 InputError          what a wrong input raises: one line
 ComputationError    what a computation that fails raises: one line
 
-Names are loaded on first use, so that `import avis_ctrl` and `avis --help` answer at once.
+Names are loaded on first use, so that `import avis_ctrl` and `avis --help` take little time.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from enum import Enum
 from html import escape
-from typing import Any
+from typing import Any, ClassVar
 
 LONGEST = 60
 
@@ -30,6 +30,11 @@ def in_short(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST - 3]}..."
 
 
+def count_of(number: int, noun: str) -> str:
+    """"1 state", "2 states"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), title: str = "") -> str:
     """A plain HTML table; everything is escaped."""
     def line(cells: Sequence[str], tag: str) -> str:
@@ -39,10 +44,16 @@ def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), title: s
 
 
 class Shown:
-    """Gives a dataclass (with repr=False) a short repr, and a table in notebooks."""
+    """Gives a dataclass (with repr=False) a short repr, and a table in notebooks.
+
+    in_line : the fields in the repr; empty for all of them.
+    """
+
+    in_line: ClassVar[tuple[str, ...]] = ()
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(f'{name}={text}' for name, text in self._facts())})"
+        facts = [f"{name}={text}" for name, text in self._facts() if name in self.in_line or not self.in_line]
+        return f"{type(self).__name__}({', '.join(facts)})"
 
     def _repr_html_(self) -> str:
         return html_table(self._facts(), title=type(self).__name__)

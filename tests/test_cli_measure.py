@@ -132,7 +132,7 @@ def test_help_says_the_layouts_of_files(command):
     done = avis(command, "--help")
     words = " ".join(done.stdout.split())
     assert done.returncode == 0
-    for said in ("struct array `records`", "u, y and t or sample_rate_Hz (or fs) are required", "y_names=Sy1+Sz1",
+    for said in ("struct array records", "u, y and t or sample_rate_Hz (or fs) are required", "y_names=Sy1+Sz1",
                  "--period", "--excitation", "--sample-rate", "--unit-y"):
         assert said in words, said
 

@@ -66,7 +66,7 @@ def test_a_design_for_this_rig(tmp_path):
     assert design.transmissibility.band_Hz == [2.0, 20.0] and design.transmissibility.band_dB == -9.0
     assert design.uncertainty.parameters_percent["mass"] == 5.0
     limit = {one.quantity: one.at_most for one in design.requirement}
-    assert limit["worst_case_band_transmissibility_dB"] == -8.0
+    assert limit["worst_case_band_transmissibility_dB"] == -9.0
     lines = path.read_text().splitlines()
     for section in ("[uncertainty.parameters_percent]", "[transmissibility]", "[synthesis]"):
         assert lines[lines.index(section) - 1].startswith("# ")
@@ -76,6 +76,7 @@ def test_a_design_for_this_rig(tmp_path):
     (("rig", "OUT", "--mounts", "5"), "mounts = 5: expected 3 or 4"),
     (("rig", "OUT", "--mass", "-3"), "mass_kg = -3.0: expected a finite number, greater than zero"),
     (("rig", "OUT", "--size", "1, 2"), "--size = '1, 2': expected 3 numbers"),
+    (("rig", "OUT", "--size", "1500, 1000, 500"), "expected three positive lengths in metres"),
     (("rig", "OUT", "--name", 'a"b'), "expected a name without quotes"),
     (("rig", "OUT", "--geophone", "RESP.absent"), "RESP.absent"),
     (("rig", "OLD"), "this file exists"),
@@ -118,6 +119,11 @@ def test_the_help_has_units():
 def test_values_that_no_table_has_write_nothing(tmp_path):
     done = avis("new", "rig", str(tmp_path / "mine.toml"), "--vertical", "2e5")
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and not (tmp_path / "mine.toml").exists()
+
+
+def test_unusual_values_are_pointed_out(tmp_path):
+    done = avis("new", "rig", str(tmp_path / "mine.toml"), "--damping", "2")
+    assert done.returncode == 0 and "unusual for a table: damping ratio" in done.stderr
 
 
 def test_the_shell_completes_commands_and_options():

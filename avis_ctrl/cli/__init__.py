@@ -29,7 +29,8 @@ LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 AGAIN_S = 3.0  # time to clean up after an interrupt that was heard
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False,
+# Markdown: paragraphs of the help are wrapped to the terminal.
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="markdown",
                   help="Workbench for active vibration isolation tables.")
 
 
@@ -133,8 +134,8 @@ def main() -> None:
         sys.exit(ComputationError.exit_code)
     except typer.Abort as error:
         if isinstance(error.__context__, EOFError):  # a question, and nobody there
-            print("\navis: no answer: the standard input has ended; give what is missing as options (see --help)",
-                  file=sys.stderr)
+            print("\navis: the standard input ended before all values were given; give what is missing as options "
+                  "(see --help)", file=sys.stderr)
             sys.exit(InputError.exit_code)
         code = INTERRUPTED
     except KeyboardInterrupt:

@@ -12,7 +12,7 @@ def compare(
     first: Annotated[Path, typer.Argument(metavar="DESIGN_A", help="output folder of avis design")],
     second: Annotated[Path, typer.Argument(metavar="DESIGN_B", help="another one")],
 ) -> None:
-    """Show side by side what two designs requested differently and what came of it."""
+    """Compare two designs side by side: what they requested, and their results."""
     from rich.console import Console
     from rich.table import Table
 

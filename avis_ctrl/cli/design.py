@@ -12,15 +12,16 @@ from avis_ctrl.cli.console import Progress, StopRequest
 
 
 def design(
-    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="design file; start from designs/*.toml")],
+    file: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="design file; avis new design writes one")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for controllers and report")],
 ) -> None:
     """Design certified controllers for a rig, check them in simulation, and write a report.
 
     Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (the controller for the processor,
     sensor volts to drive volts, all axes), study.json (the inputs, for avis export), plant.json and result.json into
-    DIR. Ctrl-C during the D-K iteration continues with the best controller so far, a second Ctrl-C ends the command.
-    Exit code 3 if the closed loop is unstable for any simulated plant; the first sentence names the cause.
+    DIR. Ctrl-C during the D-K iteration continues with the best controller so far; a second Ctrl-C ends the command.
+
+    The exit code is 3 if the closed loop is unstable for any simulated plant; the first sentence names the cause.
     """
     from rich.console import Console
 

@@ -102,16 +102,16 @@ def _summary(console, made) -> None:
     from rich.table import Table
 
     found = made.certificate.content
-    table = Table("of the emitted numbers", "", title="certificate")
+    table = Table("computed from the exported numbers", "", title="certificate")
     rows = (("mu, upper bound", found["mu_upper"], ""), ("mu, lower bound", found["mu_lower"], ""),
             ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
             ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
-            ("the same at all times, between the samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
-            ("worst plant replayed through the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
+            ("worst-case gain, between samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
+            ("worst plant simulated with the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
             ("gain at rest, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
-            (f"drive {found['at_rest']['drive']}: voltage that offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV "
-             "cost", found["at_rest"]["drive_V"], " V"),
-            ("the same, of its limit", found["at_rest"]["percent_of_limit"], " %"),
+            (f"drive {found['at_rest']['drive']}: voltage for offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV",
+             found["at_rest"]["drive_V"], " V"),
+            ("the same, relative to its limit", found["at_rest"]["percent_of_limit"], " %"),
             ("payload velocity by rounding, bound", found["rounding_noise_m_per_s"], " m/s"),
             ("time of one step on this machine", found["step_time_us"], " us"))
     for name, value, unit in rows:

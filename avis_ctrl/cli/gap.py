@@ -33,10 +33,11 @@ def gap(
                                                      "default design for z and phi_x")] = None,
     effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="Python file with effects of "
                                                  "your own, run before the search (docs/own_effect.md)")] = None,
-    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate says stop")] = False,
-    seed: Annotated[int, typer.Option("--seed")] = 1,
+    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate "
+                                                         "has the result stop")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
-    """Find where model and measurement disagree, and name the physical effect that the model lacks.
+    """Find where model and measurement disagree, and name the physical effects that the model misses.
 
     Writes gap.json, gap.html, gap.pdf and the models baseline and updated (.json, .toml) into DIR. Then `avis predict
     DIR OTHER --out PRED.h5` predicts another campaign with both models.

@@ -15,7 +15,7 @@ from avis_ctrl.errors import InputError
 def gap_axis(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="drive, oscillator, seismometer or levels")],
     path: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one "
-                                         "CSV per frequency; for levels a folder of u_*mV*.npy and y_*mV*.npy")],
+                                         "CSV per frequency; for levels a folder of `u_*mV*.npy` and `y_*mV*.npy`")],
     columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="drive: force, position, "
                                                 "reference; oscillator: u, y; seismometer: drive, coil and/or "
                                                 "displacement; each also t; by name, or in CSV by number from 1; "
@@ -38,7 +38,7 @@ def gap_axis(
                                              "that avis predict reads")] = None,
     seed: Annotated[int, typer.Option("--seed", hidden=True, help="has no influence any more")] = 1,
 ) -> None:
-    """Name the effect that a model of one axis lacks, with its size, its probability, and the gap before and after.
+    """Find the effects that a model of one axis misses, with size, probability, and the gap before and after.
 
     For example: avis gap-axis drive drive.mat --columns force=vir,position=qm,reference=qg,t=t --scale force=35.15
     """

@@ -44,8 +44,9 @@ def identify(
     design: Annotated[Path | None, typer.Option("--design", metavar="DESIGN.toml", help="design file whose rig and "
                                                 "uncertainty are replaced by the identified ones; by default a design "
                                                 "for z and phi_x with the weights of the shipped examples")] = None,
-    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate says stop")] = False,
-    seed: Annotated[int, typer.Option("--seed")] = 1,
+    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate "
+                                                         "has the result stop")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
     """Identify a rig and its uncertainty from measurements, and write a report.
 

@@ -32,7 +32,7 @@ def excite(
                                        "excited)")] = "full",
     scheme: Annotated[str, typer.Option("--scheme", help="orthogonal (one record per drive, all drives on all lines) "
                                         "or zippered (one record, each drive has its own lines)")] = "orthogonal",
-    seed: Annotated[int, typer.Option("--seed")] = 1,
+    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
     """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
     from rich.console import Console

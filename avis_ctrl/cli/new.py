@@ -1,4 +1,4 @@
-"""`avis new`: asks a few questions and writes a commented rig file or design file. Each answer is checked at once."""
+"""`avis new`: asks a few questions and writes a commented rig file or design file. Each value is checked at once."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def rig(
     sample_rate_Hz: Annotated[float, _asked("--sample-rate", "Sample rate of the controller [Hz]", _check_rig)
                               ] = 1000.0,
 ) -> None:
-    """A table from its mass, size and natural frequencies."""
+    """Write a rig file for a table of given mass, size and natural frequencies."""
     from avis_ctrl.files import write_whole
     from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
@@ -80,9 +80,9 @@ def rig(
         "geophone": geophone, "sample_rate_Hz": sample_rate_Hz})))
     modes = rig_of(text).equations_of_motion().natural_frequencies().frequencies_Hz
     write_whole(out, text.encode())
-    print(f"{out}: modes at {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz (horizontal ones rock: the mounts stand "
-          f"below the centre of mass); next: replace the lines marked \"assumed\", then avis new design DESIGN.toml "
-          f"--rig {out}")
+    print(f"{out}: natural frequencies {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz. The mounts stand below the "
+          "centre of mass, so horizontal motion is coupled with rocking.\n"
+          f"Next: replace the values marked \"assumed\" in the file, then run avis new design DESIGN.toml --rig {out}")
 
 
 def _check_design(ctx: typer.Context, name: str, value: Any) -> None:
@@ -133,7 +133,7 @@ def design(
     stiffness_percent: Annotated[float, _asked("--stiffness", "Stiffness known to within [%]", _check_design)] = 15.0,
     damping_percent: Annotated[float, _asked("--damping", "Damping known to within [%]", _check_design)] = 30.0,
 ) -> None:
-    """A design for a rig from its bounds and uncertainty."""
+    """Write a design file for a rig from bounds on the transmissibility and the uncertainty of its parameters."""
     from avis_ctrl.files import write_whole
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.design_file import read_study
@@ -144,7 +144,8 @@ def design(
     made = new_design(NewDesign(**_design_fields({key: ctx.params[key] for key in DESIGN})), load_rig(rig), named)
     write_whole(out, design_text(made).encode())
     read_study(out)
-    print(f"{out}: next: avis design {out} --out {out.with_suffix('')}")
+    print(f"{out}: written. Next: replace the values marked \"Assumed\", then run avis design {out} --out "
+          f"{out.with_suffix('')}")
 
 
 def _is_file(rig: str) -> bool:

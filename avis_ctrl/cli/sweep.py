@@ -10,8 +10,9 @@ import typer
 
 
 def sweep(
-    points: Annotated[Path, typer.Argument(metavar="POINTS.toml", help="a base and what varies (docs/sweep.md)")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the table, the picture and the points")],
+    points: Annotated[Path, typer.Argument(metavar="POINTS.toml",
+                                                help="a base and the keys that vary (docs/sweep.md)")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for table, picture and points")],
     scheduler: Annotated[str | None, typer.Option("--scheduler", metavar="ADDRESS", help="a dask scheduler of a "
                                                   "cluster, such as tcp://HOST:8786")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, metavar="N", help="start a dask scheduler with N "
@@ -19,10 +20,11 @@ def sweep(
     jobs: Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes without dask; by default "
                                              "one for each processor")] = None,
 ) -> None:
-    """Compute many points, each kept in a file of its own, and write a table and their Pareto front.
+    """Compute many designs (points), and write a table and their Pareto front.
 
     Writes points/HASH.json as each point is finished, then sweep.csv, pareto.png, sweep.html and sweep.json into DIR.
-    After a kill at any moment the same command goes on where it was. A point that fails is a row that says why.
+    If the command is interrupted, the same command continues with the missing points. A point that fails has the reason
+    in its row.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

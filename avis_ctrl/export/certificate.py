@@ -81,7 +81,7 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
         loop = shipped_loop(folder, controller)
         progress("stability of all axes and rounding noise")
         noise = rounding_noise(controller, loop)
-        progress("bounds over the whole uncertainty set, from the emitted numbers")
+        progress("bounds over the whole uncertainty set, from the exported numbers")
         found = bounds(axes)
         worst = worst_transmissibility(axes, found)
         lower = mu_lower(axes, found)

@@ -78,7 +78,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
                                next_step=f"ask for a larger --order, or accept it with --mu-at-most {mu + 0.005:.2f}")
     replay = None
     if compiler() is not None:
-        progress("replay of the worst plant through the compiled code, on the nonlinear table")
+        progress("worst plant with the compiled code, on the nonlinear table")
         replay = replay_worst_plant(folder, certificate, controller, plain)
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")

@@ -1,7 +1,8 @@
 """The gap between a table's model and its measurement: the engine of `avis gap`.
 
-As a name of the interface the package can be called: `avis_ctrl.gap(campaign, rig)` is
-`avis_ctrl.interface.workflow.gap`.
+The package can also be called: `avis_ctrl.gap(campaign, rig)` searches for the effects that the model of a table
+misses, as `avis gap` does. Its parameters are those of `avis_ctrl.interface.workflow.gap`: see the help of this
+function, or docs/reference/workflow.md.
 """
 
 import importlib

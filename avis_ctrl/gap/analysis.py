@@ -82,10 +82,10 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     known = list(library().values()) if effects is None else list(effects)
     fits = _fits(prepared, rig, known, progress, each, settings)
     if prepared.clipped is not None and fits.steps:
-        progress("clipped samples: what the model with its effects expects behind the limits")
+        progress("clipped samples: replaced by the prediction of the model with its effects")
         prepared = mended_with(prepared, fits.best.model, progress, each, settings)
         fits = _fits(prepared, rig, known, progress, each, settings)
-    progress("names, and what held-out records say of them")
+    progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
 
@@ -98,7 +98,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     large = of_effect(start.effects[0], tolerances_of(rig), settings)
     priors = re_identified(nominal.rig, settings).followed_by(large)
     base = fit(start, priors, priors.z(start.values), data, first_variances(data, settings), settings)
-    progress("the same with all tolerances")
+    progress("fit with all tolerances")
     tolerances = with_tolerances(nominal, tolerances_of(rig), settings)
     apart = replace(base.model, base=replace(base.model.base, names=tolerances.names),
                     nominal=replace(nominal, names=tolerances.names), corners_differ=True)
@@ -137,7 +137,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
             one = next(effect for effect in fits.best.model.effects if effect.label == label)
             refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
                               "has no name" if one.effect.outside else
-                              f"{one.effect.name} comes nearest, but {why}: not named")
+                              f"{one.effect.name} fits best, but is not named: {why}")
             best = without_effect(best, label, data, settings) or best
     kept = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, kept, {label: rivals[label] for label in kept}, refused)
@@ -147,19 +147,19 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
     """Why an effect that was found is not named; empty where it is."""
     one = next(effect for effect in best.model.effects if effect.label == label)
     if one.effect.outside:
-        return "the library has no name for it"
+        return "it is not in the library"
     if probability < settings.headline:
-        return f"another explanation is as probable ({probability:.2f})"
+        return f"other explanations are as probable (its own probability is {probability:.2f})"
     if reason := forbidden(best, one):
         return reason
     # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
     after, before = (sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
                      for one in (step.fitted, step.before))
     if after <= before:
-        return "held-out records do not bear it out"
+        return "held-out records are not more likely with it"
     for half in halves(best, _judged(one), settings):
         if half.change > settings.law_change:
-            return f"{half.words} puts one of its parameters {100 * half.change:.0f} % elsewhere"
+            return f"{half.words} gives a value of one of its parameters that differs by {100 * half.change:.0f} %"
     return ""
 
 
@@ -205,7 +205,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
     if verdict == "none":
-        progress("how large an effect would have had to be to be seen")
+        progress("detection limits of the effects")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
     sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused.values(),
@@ -309,26 +309,30 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
              left: Remainder, after: ModelResidual) -> str:
     """The one sentence."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
-    rest = f"noise alone {_percent(after.noise_nrmse)}"
-    beside = f", beside traces of {' and '.join(one.name for one in traces)}" if traces else ""
+    rest = f"the noise alone is estimated at {_percent(after.noise_nrmse)}"
+    also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
     if verdict == "none":
-        return (f"No missing effect shows{beside}: with all tolerances the model leaves {_percent(left.nrmse)} of the "
-                f"held-out records, {rest}.")
+        return (f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
+                f"{_percent(left.nrmse)}; {rest}.{also}")
     if verdict == "unexplained":
-        return (f"Something is missing that the library has no name for{beside}: with all tolerances the model leaves "
-                f"{_percent(left.nrmse)} of the held-out records, {rest}.")
-    names = " and ".join(one.in_words() for one in told)
-    return (f"Missing from the model: {names}{beside}; with that and all tolerances the gap falls from "
-            f"{_percent(before)} to {_percent(left.nrmse)}, {rest}.")
+        return (f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
+                f"error on held-out records is {_percent(left.nrmse)}; {rest}.{also}")
+    count = "one effect" if len(told) == 1 else f"{len(told)} effects"
+    return (f"The model misses {count}: {'; '.join(one.in_words() for one in told)}. With this and all tolerances "
+            f"fitted, the gap falls from {_percent(before)} to {_percent(left.nrmse)}; {rest}.{also}")
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
     """How much remains, where, and at which level."""
     if left.over_noise <= 1.05:
-        return "what remains is the noise"
-    level = {True: ", and grows faster than the drives", False: ", and does not grow faster than the drives",
+        if not remaining:
+            return "the residual is the noise"
+        places = sorted({f"{one.output} from {one.from_Hz:.3g} to {one.to_Hz:.3g} Hz" for one in remaining})
+        return (f"as a whole the residual does not exceed the noise, but it does in {'; '.join(places[:3])}"
+                f"{' and elsewhere' if places[3:] else ''}")
+    level = {True: "; it grows faster than the drives", False: "; it does not grow faster than the drives",
              None: ""}[left.grows_with_level]
     lies = f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz" \
         if remaining else ""
-    return (f"{_percent(left.nrmse)} of the held-out records remains, {left.over_noise:.3g} times the "
-            f"noise{lies}{level}: {_percent(left.share)} of the power that the re-identified model leaves beyond noise")
+    return (f"the residual is {_percent(left.nrmse)} of the held-out records, {left.over_noise:.3g} times the "
+            f"noise{lies}; its power beyond noise is {_percent(left.share)} of that of the re-identified model{level}")

@@ -73,12 +73,12 @@ def divide(campaign: Campaign) -> Halves:
     if chosen and len(driven) - len(chosen) >= 2 and all(excites_as_well(left, power[name]) for name in chosen):
         rest = tuple(record.header.name for record in campaign.records if record.header.name not in chosen)
         return Halves(campaign.only(rest), campaign.only(tuple(sorted(chosen))),
-                      f"records {', '.join(sorted(chosen))} held out, each beside a fitted one of its level")
+                      f"records {', '.join(sorted(chosen))}; another record of the same level is fitted")
     parts = [_parted(record) for record in driven]
     quiet = tuple(record for record in campaign.records if record not in driven)
     return Halves(replace(campaign, records=(*(first for first, _ in parts), *quiet)),
                   replace(campaign, records=tuple(last for _, last in parts)),
-                  "the last third of every record held out, for no two records are alike")
+                  "the last third of every record, because no two records have the same level")
 
 
 def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:
@@ -118,10 +118,10 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
         like = known[key]
         assert like.noise is not None
         made.append(block.with_noise(like.noise, like.dof))
-    dof = f"{made[0].dof:.0f} degrees of freedom a line"
+    dof = f"{made[0].dof:.0f} degrees of freedom per line"
     if kinds:
-        return made, f"noise measured where the drives are silent, at rest or between the harmonics: {dof}"
-    return made, f"noise measured by a local polynomial model of the records: {dof}"
+        return made, f"noise measured where the drives are silent (at rest, or between the harmonics): {dof}"
+    return made, f"noise estimated with a local polynomial model: {dof}; a record at rest gives a better estimate"
 
 
 def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
@@ -146,7 +146,7 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
                                band_Hz)
         return replace(found, kind=block.kind)
     except AvisError as error:
-        raise InputError(f"expected records that tell the noise apart from the response ({error})",
+        raise InputError(f"expected records from which the noise can be estimated ({error})",
                          field=f"record {block.name}") from None
 
 

@@ -201,7 +201,7 @@ def effect_at(model: TableModel, name: str, place: str | None, field: str) -> tu
     """
     known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if name not in known:
-        raise InputError(f"expected one of {', '.join(known)}; an effect of your own by --effects FILE.py",
+        raise InputError(f"expected one of {', '.join(library())}; load an effect of your own with --effects FILE.py",
                          field=f"{field}.name", value=name)
     places = known[name].places(model)
     if place is None and len(places) == 1:

@@ -44,7 +44,7 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     if True in bent:
         why = ("only one of them depends on amplitude" if bent == {True, False} else
                "they depend on amplitude in different ways")
-        return f"To tell {name} from {other}, record the same signals at half and at twice the level: {why}."
+        return f"To distinguish {name} from {other}, record the same signals at half and at twice the level: {why}."
     frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), SETTINGS.points)
     difference = _difference(a, b, frequency)
     k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
@@ -54,8 +54,8 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     finer = _difference(a, b, frequency)[:, i, j]
     low, high = _about(finer, int(np.argmax(finer)))
     band = f"{frequency[low]:.3g} to {frequency[high]:.3g} Hz"
-    return (f"To tell {name} from {other}, drive {a.actuators[j]} from {band} and look at {a.sensors.names[i]}: there "
-            f"their predictions differ most, by {finer.max():.2g} {a.sensors.unit}/V.")
+    return (f"To distinguish {name} from {other}, drive {a.actuators[j]} from {band} and measure {a.sensors.names[i]}: "
+            f"there their predictions differ most, by {finer.max():.2g} {a.sensors.unit}/V.")
 
 
 def _bent_beside(model: TableModel, other: TableModel) -> bool:
@@ -81,20 +81,19 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     where = _where(places)
     growth = grows(records)
     if growth is None:
-        return (f"{where and f'What remains lies to {where}. '}Repeat the records at half and at twice the level, and "
-                "one record at rest with the floor measured: what keeps its size relative to the drive is linear, what "
-                "grows faster is not, what stays is noise or comes through the floor.")
+        return (f"{where}Repeat the records at half and at twice the level, and "
+                "one record at rest with the floor measured: a residual in proportion to the drive is linear, one that "
+                "grows faster is not, and one that stays the same is noise or comes through the floor.")
     power, std = growth
-    told = (f"What remains{where and f', to {where},'} grows as the level of the drive to the power {power:.2f} +- "
-            f"{std:.2g}")
+    told = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
     if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
-        return (f"{told}: it hardly depends on the drives. Take a record at rest with the floor measured, and look for "
-                "other sources.")
+        return (f"{told}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
+                "search for other sources.")
     if abs(power - 1) <= max(SETTINGS.within, 2 * std):
-        return (f"{told}: it is linear. Drive one actuator at a time: by which drives and at which sensors it appears "
-                "shows where it acts.")
-    law = ("more slowly than the drive, as friction, play or a limit would have it" if power < 1 else
-           "faster than the drive, as stiffening, a limit or clipping would have it")
+        return (f"{told}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
+                "where it acts.")
+    law = ("it grows more slowly than the drive, as with friction or backlash" if power < 1 else
+           "it grows faster than the drive, as with stiffening or saturation")
     return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
             "lines in between, over the level, shows its law.")
 
@@ -132,7 +131,7 @@ def grows_faster(records: Sequence[RecordGap]) -> bool | None:
 
 
 def _where(places: Sequence[Where]) -> str:
-    """Output and band that hold most of the gap, in words; empty where none stands out."""
+    """A sentence on the output and band with most of the residual; empty without places."""
     if not places:
         return ""
     outputs = {one.output for one in places}
@@ -140,5 +139,5 @@ def _where(places: Sequence[Where]) -> str:
     band = [one for one in places if one.output == most]
     held = sum(one.share for one in band)
     band = [one for one in band if one.share > SETTINGS.part * held]
-    return (f"{sum(one.share for one in band):.0%} at {most} from {min(one.from_Hz for one in band):.3g} to "
-            f"{max(one.to_Hz for one in band):.3g} Hz")
+    return (f"{100 * sum(one.share for one in band):.0f} % of the residual is at {most} from "
+            f"{min(one.from_Hz for one in band):.3g} to {max(one.to_Hz for one in band):.3g} Hz. ")

@@ -77,7 +77,7 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     ------
     InputError : a band in which nothing is excited, too few lines, records that drive nothing or tell no noise.
     """
-    progress("converters, and what is held out")
+    progress("converters; choice of the held-out records")
     converter = converter_faults(campaign, rig)
     mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
     campaign = mended.campaign if mended else campaign
@@ -90,11 +90,11 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     base = ResponseModel.of(apart, default_parameters(apart), campaign.y_unit, campaign.y_names, campaign.u_names, True,
                             amplifier_corner_Hz)
     nominal = TableModel(base, nominal=base)
-    progress(f"first fit, {band[0]:.3g} to {band[1]:.3g} Hz; {halves.how}")
+    progress(f"first fit, {band[0]:.3g} to {band[1]:.3g} Hz; held out: {halves.how}")
     rough = _rough(nominal, halves, band, settings)
     clipped = campaign if mended and max(mended.clipped.values()) > settings.few_clipped else None
     if clipped is not None:
-        progress("clipped samples: what the model expects behind the limits")
+        progress("clipped samples: replaced by the prediction of the model")
         for _ in range(settings.repairs):
             campaign = repair(clipped, rig, predicted(clipped, rough, each), converter).campaign
             halves = divide(campaign)
@@ -134,14 +134,14 @@ def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: Table
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(left)
     if hum is not None:
-        progress(f"hum of {hum.frequency_Hz.value:.5g} Hz taken out")
+        progress(f"hum of {hum.frequency_Hz.value:.5g} Hz removed")
         campaign = without_hum(campaign, hum, left)
         halves = divide(campaign)
         rough = _rough(rough, halves, band, settings)
         left = left_by(campaign, rough, each)
     fitted = _masked(blocks_of(halves.fitted, rough, band), halves.fitted, hum)
     held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
-    progress("noise, and the motion of the table in every record")
+    progress("noise; motion of the table in every record")
     (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, left, rough, band)
     parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
     motion = with_large_motion(motion_of(parts, rough, campaign, each), rough)

@@ -1,4 +1,4 @@
-"""What `gap` found: verdict, named effects, the ladder of stages, what remains and what to measure next."""
+"""The result of `gap`: verdict, named effects, stages, residual, and what to measure next."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class NamedEffect:
         """With its place, first parameters and probability; how single mounts differ stands in the table alone."""
         first = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")][:3]
         sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in first)
-        ties = (f", or {' or '.join(self.indistinguishable_from)}, which this data cannot tell from it"
+        ties = (f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"
                 if self.indistinguishable_from else "")
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 
@@ -78,7 +78,7 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Stage:
-    """One rung of the ladder, on held-out data: r.m.s. of what the model leaves over that of y, and chi-square."""
+    """One stage of the search, on held-out data: r.m.s. of what the model leaves over that of y, and chi-square."""
 
     name: str
     nrmse: float
@@ -192,7 +192,7 @@ class Gap:
     noise_nrmse : what noise alone would leave of the held-out records. next_experiment : None or a sentence.
     baseline, updated : models (updated is the baseline where nothing was named).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
-    held_out : how the records were divided. seed, seconds.
+    held_out : what no fit has seen, and why. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
     detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
     shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.

@@ -160,19 +160,19 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
         while len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
-            progress(f"effects that may be missing, step {len(steps) + 1}")
+            progress(f"search for effect {len(steps) + 1}")
             step = _step(now, data, effects, settings, each)
             if step is None:
                 return
             if steps:  # residual and Jacobian of the last fit alone are of use
                 steps[-1] = replace(steps[-1], fitted=steps[-1].fitted.bare())
             steps.append(step)
-            progress(f"step {len(steps)}: {', '.join(step.fitted.labels)}")
+            progress(f"  best model: {', '.join(step.fitted.labels)}")
             if enough(step):
                 return
     more(effects, enough)
     for _ in range(settings.revisions):
-        progress("what was found, compared again beside what was found after it")
+        progress("comparison of each effect with its rivals, given the effects found later")
         if not _revised(steps, data, settings):
             break
         more(effects, enough)

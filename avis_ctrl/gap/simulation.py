@@ -154,8 +154,8 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
         if not np.isfinite(defect):
             break
         correction = correction + left
-    raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not settle",
-                           measured=f"the equation of motion leaves {defect:.2g} of the deflection after "
-                                    f"{SETTINGS.most_passes} passes at most, deflection {size:.3g} m r.m.s.",
+    raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not converge",
+                           measured=f"residual of the equation of motion {defect:.2g} of the deflection after "
+                                    f"at most {SETTINGS.most_passes} passes, deflection {size:.3g} m r.m.s.",
                            cause="rotations that are not small, or a force that depends on what comes later",
                            next_step="a lower level, or leave the effect out of the simulation")

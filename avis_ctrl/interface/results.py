@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,9 @@ from avis_ctrl.study.identification_output import identified_toml, require_reada
 from avis_ctrl.study.output import FILES, FOLDERS, write_study
 from avis_ctrl.study.verdict import all_axes, first_sentence
 from avis_ctrl.summary import html_table
+
+# Columns to which sentences of a summary are wrapped.
+WIDTH = 100
 
 
 class DesignStudy:
@@ -65,14 +69,14 @@ class DesignStudy:
 
     def summary(self) -> str:
         """The verdict in words, and one line for each requirement."""
-        lines = [first_sentence(self.result)]
+        lines = [fill(first_sentence(self.result), WIDTH)]
         if self.result.stable:
-            lines.append(all_axes(self.result))
+            lines.append(fill(all_axes(self.result), WIDTH))
         rows = self._rows()
         widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
         lines += ["  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
                   for name, limit, value, met in rows]
-        return "\n".join([*lines, *self.result.notes])
+        return "\n".join([*lines, *(fill(note, WIDTH) for note in self.result.notes)])
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         rows = []
@@ -149,9 +153,10 @@ class IdentificationStudy:
     def summary(self) -> str:
         """The identified values, the verdict on held-out records, what the data do not determine."""
         verdict, *more = self.found.validation.sentences
-        return "\n".join([f"{verdict[:1].upper()}{verdict[1:]}.",
+        rest = (*self.found.campaign_fit.notes, *more, *self.found.identifiability.sentences)
+        return "\n".join([fill(f"{verdict[:1].upper()}{verdict[1:]}.", WIDTH),
                           *(f"  {name:20s} {value:>26s} {unit}" for name, value, unit in self._rows()),
-                          *self.found.campaign_fit.notes, *more, *self.found.identifiability.sentences])
+                          *(fill(sentence, WIDTH) for sentence in rest)])
 
     def plot_values(self, ax: Any = None) -> Any:
         """Identified over starting value of each parameter, with its standard deviation."""
@@ -234,7 +239,8 @@ class GapStudy:
 
     def summary(self) -> str:
         """The verdict and the sentences of the report."""
-        return "\n".join([f"{self.verdict}: {self.gap.sentences[0]}", *self.gap.sentences[1:]])
+        first, *more = self.gap.sentences
+        return "\n".join(fill(sentence, WIDTH) for sentence in (f"{self.verdict}: {first}", *more))
 
     def _rows(self) -> list[tuple[str, str]]:
         rows = [(stage.name, f"{100 * stage.nrmse:.3g} %") for stage in self.gap.stages]

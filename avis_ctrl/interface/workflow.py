@@ -31,7 +31,7 @@ Progress = Callable[[str], Any]
 
 
 def rig(source: str | Path = "avis", loaded: bool = False) -> Rig:
-    """A table: a shipped one ("avis", "halcyonics", "halcyonics_loaded") or that of a rig file (docs/rig_file.md).
+    """A table: a built-in one ("avis", "halcyonics", "halcyonics_loaded") or that of a rig file (docs/rig_file.md).
 
     loaded : with the load of the file's [load] section. Raises InputError: one line that names file, field and value.
 
@@ -72,7 +72,7 @@ def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | N
     """A campaign of the nonlinear table, to rehearse an identification; as `avis simulate-campaign`.
 
     plan : file or keys of docs/campaign_plan.md; by default multisines at three levels, noise, rest, a shaken floor.
-        Its `effect` sections add what the rig file does not contain.
+        Its `effect` sections add effects that the rig file does not contain.
     Raises InputError for a plan that is wrong.
 
     Examples
@@ -102,7 +102,7 @@ def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | s
     Raises
     ------
     InputError : records that are not of this table, a gate that says stop, options that do not fit.
-    ComputationError : a fit that does not come to an end.
+    ComputationError : a fit that does not converge.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def design(source: Design | IdentificationStudy | Rig | str | Path, *, progress:
 
     Parameters
     ----------
-    source : a design file; a table (`rig`, or the name of a shipped one); an identification.
+    source : a design file; a table (`rig`, or the name of a built-in one); an identification.
     sections : keep, transmissibility, control_effort, uncertainty, ... with the keys of docs/design_file.md; in place
         of those of a design file or, of an identification, of the design that it proposes.
     progress : called with a line of text at each step, such as `print`.

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
+from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
 Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
@@ -60,7 +61,7 @@ class StateSpace:
     >>> G = ac.StateSpace([[0, 1], [-4, -0.4]], [[0], [1]], [[1, 0]], [[0]], inputs=["force"], outputs=["x"])
     >>> G
     StateSpace(2 states, continuous, ['force'] -> ['x'])
-    >>> (2 * G @ G).nstates, G.is_stable(), G.dcgain()      # @ is the series connection: the right one acts first
+    >>> (2 * G @ G).nstates, G.is_stable(), G.dcgain()      # @ or *: series connection, right-hand system first
     (4, True, array([[0.25]]))
     >>> control.damp(G.to_control(), doprint=False)[1]
     array([0.1, 0.1])
@@ -170,11 +171,12 @@ class StateSpace:
         left = operand(other)
         return NotImplemented if left is None else left @ self
 
-    def __mul__(self, factor: Any) -> StateSpace:
-        """All outputs times a number; systems are multiplied by `@`."""
-        return self.scaled(float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
+    def __mul__(self, other: Any) -> StateSpace:
+        """All outputs times a number; with a system the series connection, as `@`."""
+        return self.scaled(float(other)) if isinstance(other, (int, float, np.number)) else self.__matmul__(other)
 
-    __rmul__ = __mul__
+    def __rmul__(self, other: Any) -> StateSpace:
+        return self.scaled(float(other)) if isinstance(other, (int, float, np.number)) else self.__rmatmul__(other)
 
     def __truediv__(self, factor: Any) -> StateSpace:
         return self.scaled(1 / float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
@@ -270,7 +272,7 @@ class StateSpace:
 
     def __repr__(self) -> str:
         clock = f"dt = {self.dt:g} s" if self.dt else "continuous"
-        return (f"StateSpace({self.nstates} states, {clock}, "
+        return (f"StateSpace({count_of(self.nstates, 'state')}, {clock}, "
                 f"{list(self.inputs)} -> {list(self.outputs)})")
 
 

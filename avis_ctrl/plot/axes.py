@@ -48,6 +48,18 @@ def decibels(size: np.ndarray) -> np.ndarray:
     return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
 
 
+def log_if_wide(ax: Any, values: np.ndarray) -> None:
+    """A logarithmic y axis, with plain numbers at 1, 2 and 5 of each decade, where values span more than a decade."""
+    if values.max() <= 10 * values.min():
+        return
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+
+
 def whole_numbers(ax: Any) -> None:
     """Ticks of the x axis at whole numbers only."""
     from matplotlib.ticker import MaxNLocator

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish, whole_numbers
+from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish, log_if_wide, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
 # Colours of Okabe and Ito; controllers look as in the report.
@@ -18,10 +18,15 @@ LIMIT, LOWER = "#b3261e", "#e69f00"
 
 
 def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu"]) -> Any:
-    """Upper and lower bound of mu over frequency [Hz], with the bound of the peak and what it is worth.
+    """Upper and lower bound of mu over frequency [Hz], with the bound of the peak and whether it is proved.
 
-    peak : `MuPeak` (of `mu_peak` or `worst_case_gain`) or a design's `Bound`. Returns the axes.
+    peak : `MuPeak` (of `mu_peak` or `worst_case_gain`), a result of `robust_stability` or `robust_performance`, or a
+    design's `Bound`. Returns the axes. Raises InputError for a result without these curves, such as a `MuSynthesis`.
     """
+    peak = getattr(peak, "mu", peak)
+    if not hasattr(peak, "upper_curve"):
+        raise InputError("expected bounds of mu over frequency; for the result of a synthesis use "
+                         "mu_peak(result.closed_loop, result.blocks)", field="peak", value=type(peak).__name__)
     ax = axes_of(ax)
     f = np.asarray(peak.frequencies) / HERTZ
     shown = f > 0
@@ -80,8 +85,7 @@ def dk_history(history: Any, ax: Any = None) -> Any:
     ax.plot(steps, [row.mu_upper for row in rows], "o-", color=COLOURS["mu"], markersize=4,
             label="peak mu on the grid")
     values = np.array([[row.gamma, row.mu_upper] for row in rows])
-    if values.max() > 10 * values.min():
-        ax.set_yscale("log")
+    log_if_wide(ax, values)
     ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
     whole_numbers(ax)
     return finish(ax, "iteration", "gamma, mu", log=False)
@@ -96,8 +100,7 @@ def order(history: Any, ax: Any = None) -> Any:
     ax.plot(states, values, "o", color=COLOURS["mu"], markersize=4, label="controllers")
     ax.step(states, np.minimum.accumulate(values), where="post", color=COLOURS["mu"], linewidth=1,
             label="least mu up to this order")
-    if values.max() > 10 * values.min():
-        ax.set_yscale("log")
+    log_if_wide(ax, values)
     ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
     whole_numbers(ax)
     return finish(ax, "states of the controller", "peak mu", log=False)

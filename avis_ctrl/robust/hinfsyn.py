@@ -49,11 +49,11 @@ class Status(Enum):
     OPTIMAL = "the optimum is bracketed and the closed loop was measured below its target"
     REGULARISED = ("the problem is singular: small extra channels were added; the closed loop measured is that "
                    "of the plant without them")
-    BACKED_OFF = ("the closed loop missed its target at the back-off asked for, which was raised: this usually "
+    BACKED_OFF = ("the closed loop missed its target at the requested back-off, which was raised: this usually "
                   "means a badly scaled plant or a nearly singular D12 or D21")
-    WIDE = ("the optimum lies between the bounds, which are further apart than asked for: between them the Riccati "
+    WIDE = ("the optimum lies between the bounds, which are further apart than requested: between them the Riccati "
             "test is undecided")
-    SUBOPTIMAL = "a controller at the gamma asked for; the optimum was not sought"
+    SUBOPTIMAL = "a controller at the requested gamma; the optimum was not computed"
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,7 +102,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     sample_rate_Hz : the rate at which the controller is to run; its fastest pole is compared with half of it.
     gamma_hint : a gamma expected to be near the optimum; shortens the search.
     far_poles : "kept", or "gain": controller poles far beyond the plant's are replaced by their gain where the measured
-        loop keeps the target of the back-off (said in `notes`). D-K iteration wants the central controller itself.
+        loop keeps the target of the back-off (see `notes`). D-K iteration uses "kept".
 
     Raises
     ------
@@ -372,5 +372,5 @@ def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ..
         raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
     ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
     verdict = "slow enough" if ratio < 0.5 else "too fast: raise backoff or the sample rate, or reduce the controller"
-    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.2g} of half the sample rate: "
+    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.3g} times half the sample rate: "
             f"{verdict}",)

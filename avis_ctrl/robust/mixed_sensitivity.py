@@ -42,8 +42,8 @@ def mixed_sensitivity(G: Any, W_S: Any = None, W_KS: Any = None, W_T: Any = None
 
     Parameters
     ----------
-    G : plant (ours or python-control's), continuous or sampled. W_S, W_KS, W_T : weights (systems, filters, numbers):
-        of one channel for all alike, or of as many inputs as they have signals to weigh; None leaves the term out.
+    G : plant (ours or python-control's), continuous or sampled. W_S, W_KS, W_T : weights (systems, filters, numbers),
+        with one channel for all signals, or with as many inputs as there are signals; None omits the term.
     options : of `hinfsyn`.
 
     Raises

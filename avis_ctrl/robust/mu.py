@@ -88,9 +88,9 @@ def mu_upper(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: floa
 def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e-5) -> MuBounds:
     """Bounds of the structured singular value with the scalings and the perturbation that prove them.
 
-    The lower bound is local: the search may miss the least perturbation, what it returns is verified (with M balanced,
-    smallest singular value of I - M delta below 1e-9 and an eigenvalue of M delta within 1e-6 of 1). Up to three full
-    complex blocks the two meet.
+    The lower bound comes from a local search, which can miss the smallest perturbation. The perturbation is verified:
+    with M balanced, the smallest singular value of I - M delta is below 1e-9, and an eigenvalue of M delta is within
+    1e-6 of 1. For up to three full complex blocks the upper bound is mu.
 
     Parameters
     ----------

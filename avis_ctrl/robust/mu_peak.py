@@ -68,14 +68,14 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     N : stable system (avis_ctrl or python-control) with sum(cols) outputs z and sum(rows) inputs w.
     band : (low, high) in rad/s; the Nyquist frequency replaces infinity for sampled systems.
     known_upper : a bound that the caller has proved for the whole band, such as the measured norm of the loop scaled
-        by a realised D(s); where it is within 0.5 % of the peak found, it is taken for the upper bound as it is.
-    slack : share by which the level to be proved lies above the highest value found; a larger one needs fewer
-        intervals. Where mu is flat over frequency the proof takes more than this share (see `mu_cover`).
+        by a realised D(s); if it is within 0.5 % of the peak found, it is used as the upper bound.
+    slack : fraction by which the level to be proved lies above the highest value found; a larger one needs fewer
+        intervals. Where mu is flat over frequency, a larger fraction is needed (see `mu_cover`).
 
     Raises
     ------
     InputError : blocks that do not fit N, an empty band, a slack outside 1e-5 to 0.1.
-    ComputationError : N has a pole that is not stable (named): mu says nothing about such a loop.
+    ComputationError : N has a pole that is not stable (named): mu is not defined for such a loop.
 
     Examples
     --------

@@ -40,7 +40,7 @@ NORM_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MuSynthesis(Shown):
-    """The best controller of all iterations, and what was measured on it.
+    """The best controller of all iterations, and its closed loop's figures.
 
     mu_upper, mu_lower : bounds of the peak of mu over all frequencies with the blocks as given (real ones real).
     mu_upper_complex : the same upper bound with real blocks taken as complex, as the synthesis did.
@@ -49,8 +49,11 @@ class MuSynthesis(Shown):
     scalings, gamma : measured norm of the scaled loop, no less than complex mu at any frequency. Those of a sampled
         loop are functions of its continuous image's frequency (`lti.bilinear.image_frequency`).
     fastest_pole : largest magnitude [rad/s] of a pole of K (of its continuous image where K is sampled).
+    closed_loop : of the generalized plant with K; `mu_peak(closed_loop, blocks)` has mu over frequency.
     saved_state : JSON-able; `musyn(..., state=saved_state)` goes on from here.
     """
+
+    in_line = ("K", "mu_upper", "mu_lower", "omega_peak", "guaranteed", "status")
 
     K: StateSpace
     mu_upper: float
@@ -76,32 +79,34 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
           starts: Sequence[StateSpace] = (), state: dict[str, Any] | None = None,
           sample_rate_Hz: float | None = None, order: int | None = None,
           structure: Literal["full", "decentralised"] = "full") -> MuSynthesis:
-    """Controller u = K y of least peak mu.
+    """Controller u = K y that minimises the peak of mu, by D-K iteration.
 
     Parameters
     ----------
-    P : StateSpace (ours or python-control's), inputs (w_delta, w, u), outputs (z_delta, z, y). Where it is sampled, K
-        is made for its continuous image (`lti.bilinear`) and is sampled at the same rate; every figure is measured
-        on the sampled loop.
+    P : StateSpace (ours or python-control's), inputs (w_delta, w, u), outputs (z_delta, z, y). If it is sampled,
+        K is designed for its continuous image (`lti.bilinear`) and has the same sample rate; every figure is computed
+        from the sampled loop.
     blocks : uncertainty in the order of w_delta; the rest of w and z is the performance block.
     nmeas, ncon : number of measurements y and controls u.
     callback : called with each `Iteration`; returning False or "stop" ends the iteration.
-    target : stop once the scaled loop is measured below this (mu is then below it at every frequency).
-    max_iterations : most K-steps, including the first H-infinity controller. There is no time limit: the same call
-        gives the same controller on any machine, and more iterations, or a lower target, continue where fewer ended.
-    backoff : relative distance from the H-infinity optimum at which each controller is taken. mu ends about as much
-        above what the scalings allow; the nearer the optimum, the faster the controller's poles.
-    polish : go on with descent on gamma where D-K iteration stalls (and orders that grow where that pays), and with
-        D-K iteration after that, until a whole round gains nothing.
-    max_added_states : most states that all scalings together may add to the plant.
-    starts : controllers u = K y known already. The iteration starts from the best of them and of the H-infinity
-        controller of P; the result is never worse (in complex mu on the grid) than any that stabilises P.
-    state : `saved_state` of an earlier result, to go on from. Of another plant with the same y and u (a changed weight,
-        more uncertainty), its controllers are started from, as if given in `starts`.
-    order : most states of the controller: the one of full order is shortened, then improved by descent on mu over its
-        entries (`fixed_order`); mu is what that controller has. `saved_state` is that of the full order.
-    structure : "decentralised": u_k is moved by y_k alone, K is of the given order (by default that of the full one).
-    sample_rate_Hz : the controller's fastest pole is compared with half of it, in `notes`.
+    target : stop as soon as the norm of the scaled loop is below this value (so is mu, at every frequency).
+    max_iterations : largest number of K-steps, including the first H-infinity controller. There is no time limit, so
+        the same call gives the same controller on any machine. A call with more iterations, or with a lower target,
+        repeats the steps of one with fewer and continues.
+    backoff : relative distance of each controller from the H-infinity optimum. It raises mu by about the same fraction;
+        a smaller value gives faster controller poles.
+    polish : where D-K iteration stalls, continue with descent on gamma (and scalings of higher order where they lower
+        it), then with D-K iteration again, until a whole round no longer improves the result.
+    max_added_states : largest number of states that all scalings together may add to the plant.
+    starts : known controllers u = K y. The iteration starts from the best of them and of the H-infinity controller of
+        P; the result is never worse (in complex mu on the grid) than any of them that stabilises P.
+    state : `saved_state` of an earlier result, to continue from. If it belongs to another plant with the same y and u
+        (a changed weight, more uncertainty), its controllers are used as `starts`.
+    order : largest number of states of the controller. The order of the full controller is reduced; the result is
+        improved by descent on mu over its entries (`fixed_order`), and all figures are those of this controller.
+        `saved_state` is that of the full order.
+    structure : "decentralised": u_k depends on y_k only; K has the given order (by default that of the full one).
+    sample_rate_Hz : `notes` compare the controller's fastest pole with half of this rate.
 
     Raises
     ------
@@ -218,11 +223,11 @@ def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state:
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
     notes = [*said]
     if has_real:
-        notes.append(f"real blocks were synthesised for as complex ones: peak mu {complex_upper:.4g} so, "
-                     f"{mu_upper:.4g} with the real blocks real")
+        notes.append(f"the synthesis treats real blocks as complex: peak mu {complex_upper:.4g} with complex "
+                     f"blocks, {mu_upper:.4g} with real ones")
     if sample_rate_Hz is not None:
         ratio = fastest / (np.pi * sample_rate_Hz)
-        notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate")
+        notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
     return MuSynthesis(K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
                        scalings, gamma, closed, fastest, state.history, status, tuple(notes),

@@ -21,8 +21,6 @@ DONE = "done"
 GIVEN = "given"
 NOMINAL = "nominal"
 HINF = "H-infinity"
-# Kinds of the controllers that the iteration starts from.
-STARTS = (HINF, NOMINAL, GIVEN)
 
 
 @dataclass(frozen=True)

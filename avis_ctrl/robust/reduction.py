@@ -176,7 +176,7 @@ def discretise_controller(K: StateSpace, sample_rate_Hz: float,
     largest = float(np.max(np.abs(continuous))) or 1.0
     error = float(np.max(np.abs(continuous - discrete))) / largest
     ratio = fastest / nyquist
-    verdict = "slow enough" if ratio < 0.5 else "too fast for this rate: the sampled controller is another one"
-    note = (f"fastest pole {fastest:.4g} rad/s is {ratio:.2g} of half the sample rate ({nyquist:.4g} rad/s), "
+    verdict = "slow enough" if ratio < 0.5 else "too fast for this rate: the sampled controller differs from it"
+    note = (f"fastest pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate ({nyquist:.4g} rad/s), "
             f"{verdict}; response error up to a quarter of the rate {100 * error:.2g} %")
     return SampledController(sampled, fastest, float(nyquist), ratio, error, note)

@@ -25,7 +25,7 @@ from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robustness(Shown):
-    """How much of the declared uncertainty a loop bears; 1 is all of it.
+    """Size of the uncertainty that a loop tolerates, relative to the declared one.
 
     lower : the property holds for all uncertainty below `lower` times the declared one (if `guaranteed` at every
         frequency, otherwise at those computed). upper : a perturbation of this size breaks it, `delta`, at `omega`
@@ -33,6 +33,8 @@ class Robustness(Shown):
     worst : `delta` by name: values of real parameters, normalised matrices of others.
     mu : the bounds of mu behind it.
     """
+
+    in_line = ("lower", "upper", "omega", "guaranteed", "worst")
 
     lower: float
     upper: float
@@ -52,7 +54,7 @@ class Robustness(Shown):
 
 def robust_stability(system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
                      ) -> Robustness:
-    """The part of the declared uncertainty up to which a loop is stable.
+    """Size of the uncertainty, relative to the declared one, up to which a loop is stable.
 
     Parameters
     ----------
@@ -79,9 +81,9 @@ def robust_stability(system: Any, blocks: BlockStructure | Sequence[Block] | Non
 
 def robust_performance(system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
                        ) -> Robustness:
-    """The part of the declared uncertainty, and inverse of the gain, up to which gain from d to e stays below 1/it.
+    """Largest a for which the gain from d to e is at most 1/a with a times the declared uncertainty.
 
-    With `lower` = a the loop is stable and its gain at most 1/a for all uncertainty of a times the declared one.
+    With `lower` = a this is proved: the loop is stable and its gain at most 1/a for all uncertainty of this size.
     Arguments and errors as for `robust_stability`; the system needs inputs d and outputs e beyond the uncertainty.
 
     Examples
@@ -105,12 +107,12 @@ def worst_case_gain(system: Any, blocks: BlockStructure | Sequence[Block] | None
     """Largest gain from d to e over the declared uncertainty; `avis_ctrl.robust.mu_peak.worst_case_gain`.
 
     system, blocks : as for `robust_stability`. band : (low, high) in rad/s. slack : as for `mu_peak`.
-    `upper` is proved, `lower` is reached by `delta`; infinite where a perturbation destabilises. Raises as
+    `upper` is proved, `lower` is attained by `delta`; infinite where a perturbation destabilises the loop. Raises as
     `robust_performance`, and InputError for an empty band.
 
     Examples
     --------
-    The peak of 1/(s^2 + c s + k) is about 1/(c sqrt(k)), so the worst case has the least c and k:
+    The peak of 1/(s^2 + c s + k) is about 1/(c sqrt(k)), so the worst case has the smallest c and k:
 
     >>> k, c = ac.real("k", 4.0, percent=20), ac.real("c", 0.4, percent=20)
     >>> found = ac.worst_case_gain(ac.ss([[0, 1], [-k, -c]], [[0], [1]], [[1, 0]]))

@@ -101,8 +101,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     """
     options, began = options or GapOptions(), time.monotonic()
     if not isinstance(measured, Campaign):
-        raise InputError("expected records in time; from frequency responses alone no fault of a signal can be told "
-                         "from one of the table", field="measurement")
+        raise InputError("expected records in time: frequency responses do not distinguish faults of a signal from "
+                         "those of the table", field="measurement")
     named = in_words_of(rig, measured)
     assert isinstance(named, Campaign)  # as it was
     measured = named

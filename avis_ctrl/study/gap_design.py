@@ -1,4 +1,4 @@
-"""What a named effect does to the controller: yesterday's on the updated model, and a new one.
+"""The influence of a named effect on the controller: the previous one on the updated model, and a new one.
 
 Every figure is computed on a closed loop in state space, as `avis design` computes it: mu and worst-case gains are
 bounds over all frequencies and the design's whole uncertainty, stability is by the eigenvalues. They hold for the
@@ -70,7 +70,7 @@ class DesignEffect:
 
     Attributes
     ----------
-    before : yesterday's controller on the baseline. after : the same controller on the updated model; None where no
+    before : the previous controller on the baseline. after : the same controller on the updated model; None where no
         effect of the model was named. new : a controller designed on the updated model, on it; None where none was
         found.
     K_before, K_new : the controllers.
@@ -252,9 +252,8 @@ def _unchecked(not_checked: dict[str, str]) -> list[str]:
     if not not_checked:
         return []
     each = "; ".join(f"{label}: {why}" for label, why in not_checked.items())
-    return [f"NOT checked: no controller here was designed or judged with {', '.join(not_checked)} ({each}). Whether "
-            f"{'it matters' if len(not_checked) == 1 else 'they matter'} to the design is not known from these "
-            "figures; a simulation or a measurement of the closed loop would tell."]
+    return [f"NOT checked: no controller was designed or evaluated with {', '.join(not_checked)} ({each}). Their "
+            "influence on the closed loop is not known from these figures; simulate or measure the closed loop."]
 
 
 def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None,

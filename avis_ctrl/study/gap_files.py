@@ -78,12 +78,13 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
                 sigma = float(np.sqrt(max(covariance[k, k], 0.0)))
                 comments[name] = f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
     header = [f"{rig.name}, {what} by avis gap", *(["standard deviations (1 sigma) beside the values: of the fit, "
-                                                     "conditional on what it took as known"] if comments else [])]
-    header += [f"not in this file, for a rig file has no place for it: {one.effect.title} ({one.effect.name}, "
+                                                     "with all values that are not fitted taken as "
+                                                     "exact"] if comments else [])]
+    header += [f"not in this file, because a rig file cannot describe it: {one.effect.title} ({one.effect.name}, "
                f"{one.place}: " + ", ".join(_as_reported(model, one)) + ")" for one in left]
     if any(one.effect.name == "stiffness_drift" for one in left):
-        header.append("stiffness in this file is that in the middle of its drift; the change is told over that "
-                      "at its begin")
+        header.append("the stiffness in this file is that in the middle of its drift; the change is relative to "
+                      "that at the beginning")
     return rig_toml(rig, comments, "\n".join(header))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +12,14 @@ import numpy as np
 from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
-from avis_ctrl.rigs.plausibility import plausible
+from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.identification_design import default_design, design_toml
+
+# Positions of a rig file are at most 100 m from the centre; a longer payload is one in millimetres.
+LONGEST_SIDE_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -55,12 +59,13 @@ def rig_text(new: NewRig) -> str:
         that cannot be read or contradicts itself.
     """
     if new.mounts not in (3, 4):
-        raise InputError("expected 3 or 4; write more into the file afterwards", field="mounts", value=new.mounts)
+        raise InputError("expected 3 or 4; add further mounts to the file afterwards", field="mounts", value=new.mounts)
     for field in ("mass_kg", "vertical_Hz", "horizontal_Hz", "damping", "constant_N_per_V", "limit_V",
                   "sample_rate_Hz"):
         require_positive(getattr(new, field), field)
-    if len(new.size_m) != 3 or not all(np.isfinite(side) and side > 0 for side in new.size_m):
-        raise InputError("expected three positive lengths", field="size_m", value=new.size_m)
+    if len(new.size_m) != 3 or not all(0 < side <= LONGEST_SIDE_M for side in new.size_m):
+        raise InputError(f"expected three positive lengths in metres, at most {LONGEST_SIDE_M:g}", field="size_m",
+                         value=new.size_m)
     if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):
         raise InputError("expected a name without quotes", field="name", value=new.name)
     x, y, z = new.size_m
@@ -97,9 +102,10 @@ def rig_text(new: NewRig) -> str:
 
 
 def rig_of(text: str) -> Rig:
-    """The table of a rig file's text. Raises InputError for values that no table has."""
+    """The table of a rig file's text. Warns of unusual values; raises InputError for values that no table has."""
     content = tomllib.loads(text)
-    plausible(content, rig_from)
+    if unusual := plausible(content, rig_from):
+        warnings.warn(UnusualRig(unusual), stacklevel=2)
     return rig_from(content)
 
 
@@ -167,8 +173,7 @@ def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
     shape["rig"] = rig_name
     shape["keep"] = list(new.keep) or shape["keep"]
     shape["transmissibility"] |= {"band_Hz": list(new.band_Hz), "band_dB": new.band_dB, "peak_dB": new.peak_dB}
-    limits = {"worst_case_peak_transmissibility_dB": new.peak_dB + 0.5,
-              "worst_case_band_transmissibility_dB": new.band_dB + 1.0}
+    limits = {"worst_case_peak_transmissibility_dB": new.peak_dB, "worst_case_band_transmissibility_dB": new.band_dB}
     for one in shape["requirement"]:
         if one["quantity"] in limits:
             one["at_most"] = limits[one["quantity"]]
@@ -177,21 +182,23 @@ def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
 
 # What stands above a section of a new design file.
 _REMARKS = {
-    "[loop]": "Corner of the current amplifiers: replace it by yours.",
-    "[uncertainty.parameters_percent]": "By how much the rig file's values may be wrong; the bounds hold for all such "
-                                        "plants. After avis identify use its uncertainty.json instead.",
-    "[uncertainty.actuator_chains]": "Neglected dynamics of each drive: 100 % at the crossover frequency.",
-    "[transmissibility]": "The bound on floor to payload: peak_dB anywhere, band_dB inside band_Hz.",
-    "[control_effort]": "Voltages: drives are at their limit for a floor that moves this fast, up to this bandwidth.",
-    "[synthesis]": "The D-K iteration ends at target_mu or after so many steps.",
-    "[simulation]": "The check on the nonlinear table: random plants of the set, simulated for so long.",
-    "[[requirement]]": "What the report judges; a quantity with at_most or at_least. All of them: docs/design_file.md.",
+    "[loop]": "Assumed: corner of the current amplifiers.",
+    "[uncertainty.parameters_percent]": "Half-width of each parameter's range; the bounds hold for all such plants.\n"
+                                        "# After avis identify, use its uncertainty.json instead.",
+    "[uncertainty.actuator_chains]": "Assumed: neglected dynamics of each drive, 100 % at the crossover frequency.",
+    "[transmissibility]": "Upper bounds from floor to payload: peak_dB at every frequency, band_dB inside band_Hz.",
+    "[control_effort]": "Assumed: floor velocity at which the drives may reach their voltage limit.\n"
+                        "# The controller rolls off above bandwidth_Hz.",
+    "[synthesis]": "The D-K iteration ends as soon as mu is below target_mu, or after max_iterations.",
+    "[simulation]": "Check on the nonlinear table: duration of each run, and number of random plants of the set.",
+    "[[requirement]]": "Rows of the verdict. All quantities: docs/design_file.md.",
 }
 
 
 def design_text(design: Design) -> str:
     """The design file, with a remark above each section."""
-    lines, told = ["# A first design file; docs/design_file.md explains every key."], set()
+    lines, told = ["# A first design file: change what is marked \"Assumed\" to suit your table. docs/design_file.md "
+                   "explains every key."], set()
     for line in design_toml(design).splitlines():
         if line in _REMARKS and line not in told:
             lines.append(f"# {_REMARKS[line]}")

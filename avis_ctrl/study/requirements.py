@@ -46,7 +46,7 @@ def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percen
         row("motion agrees with the linear prediction", sum(p.agrees for p in check.plants),
             f"in third octaves; probability {check.false_alarm:g} that noise alone makes at least one plant fail"),
         *(() if rest is None else (Requirement(
-            "drive voltage that the electronics' offset costs at rest, of its limit", offset_percent, rest.percent, "%",
+            "drive voltage for the electronics' offset, relative to its limit", offset_percent, rest.percent, "%",
             rest.percent <= offset_percent, "at most", rest.words()),)))
 
 

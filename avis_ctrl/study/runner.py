@@ -18,7 +18,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import MuSynthesis
-from avis_ctrl.robust.musyn_state import STARTS
+from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
 from avis_ctrl.study.analysis import analyse, worst_by_axis
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
@@ -68,6 +68,11 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
         mu, synthesis = synthesise(design, plant, rig, others, progress, stop)
         compared = compare(design, plant, rig, [mu, *others], failed, progress, early)
     return conclude(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
+
+
+# Controllers from which the D-K iteration starts, by their kind in its history.
+INITIAL = {HINF: "H-infinity, uncertainty as performance", NOMINAL: "H-infinity, nominal plant",
+           GIVEN: "from the comparison"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +130,12 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
     with threadpool_limits(1):
         def shown(row: Any) -> bool:
             """After each iteration; False ends it."""
-            if row.kind in STARTS:
-                progress(f"controller to start from ({row.kind}): peak mu {row.mu_upper:.5g}, order {row.order}")
+            if row.kind in INITIAL:
+                progress(f"initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, order {row.order}")
                 return True
             ends = enough()  # before the line: from when it is seen, Ctrl-C keeps this controller
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
-                     f"{row.order}, D-fit {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+                     f"{row.order}, D-scalings fitted to {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
             return not ends
         with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, others)

@@ -21,7 +21,7 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
 from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
 from avis_ctrl.lti.statespace import StateSpace, positions
-from avis_ctrl.summary import html_table
+from avis_ctrl.summary import count_of, html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
 from avis_ctrl.uncertainty.lft_reduction import reduce_copies
@@ -316,10 +316,12 @@ class UncertainSystem:
         what = "; ".join(f"{text}, {count}" for text, count in self._rows()) or "nothing uncertain"
         if not self.nstates:
             return f"UncertainSystem({'number' if self.shape == (1, 1) else f'matrix {self.shape}'}: {what})"
-        return f"UncertainSystem({self.nstates} states, {list(self.inputs)} -> {list(self.outputs)}: {what})"
+        size = f"{count_of(self.nstates, 'state')}, {list(self.inputs)} -> {list(self.outputs)}"
+        return f"UncertainSystem({size}: {what})"
 
     def _repr_html_(self) -> str:
-        size = f"{self.nstates} states, {list(self.inputs)} -> {list(self.outputs)}" if self.nstates else self.shape
+        size = (f"{count_of(self.nstates, 'state')}, {list(self.inputs)} -> {list(self.outputs)}" if self.nstates
+                else self.shape)
         return html_table(self._rows(), ("uncertain", "copies"), f"uncertain system, {size}")
 
 

@@ -105,7 +105,7 @@ def test_two_effects_are_named_both():
 def test_nothing_is_named_where_nothing_is_missing(seed, noise):
     gap = searched(lambda y, v: 0.0, seed, n=16_384, noise=noise)
     assert gap.verdict == "none" and not gap.effects and gap.where
-    assert gap.sentences[0].startswith("Nothing is missing")
+    assert gap.sentences[0].startswith("No missing effect was found")
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_false_alarms_are_few():
 def test_outside_the_library_nothing_is_named(extra):
     gap = searched(extra, 3)
     assert gap.verdict == "unexplained" and not gap.effects
-    assert gap.where and "unexplained" in gap.sentences[0]
+    assert gap.where and "no effect of the library explains it" in gap.sentences[0]
     assert any("another function of the position" in s for s in gap.sentences)
 
 

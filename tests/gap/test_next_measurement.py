@@ -46,7 +46,7 @@ def test_what_tells_nothing_of_growth(some):
     assert grows(some) is None
     assert "half and at twice the level" in of_unexplained((), some)
     place = Where(3.0, 4.0, "", "Sz2", 0.5)
-    assert of_unexplained((place,), some).startswith("What remains lies to 50% at Sz2 from 3 to 4 Hz. Repeat")
+    assert of_unexplained((place,), some).startswith("50 % of the residual is at Sz2 from 3 to 4 Hz. Repeat")
 
 
 @pytest.mark.parametrize(("power", "said"), [(1.0, "it is linear"), (0.0, "hardly depends on the drives"),
@@ -59,7 +59,8 @@ def test_the_channel_and_band_that_hold_most_are_named():
     places = (Where(3.0, 4.2, "Az1", "Sz2", 0.5), Where(4.2, 6.0, "Az1", "Sz2", 0.2),
               Where(40.0, 56.0, "", "Sz2", 0.01), Where(10.0, 14.0, "", "Sx2", 0.29))
     text = of_unexplained(places, records(1.0, 1e3))
-    assert "What remains, to 70% at Sz2 from 3 to 6 Hz, grows" in text and "one actuator at a time" in text
+    assert text.startswith("70 % of the residual is at Sz2 from 3 to 6 Hz. The residual grows")
+    assert "one actuator at a time" in text
 
 
 def test_records_of_another_noise_do_not_bend_the_power():
@@ -97,7 +98,7 @@ def test_predictions_differ_most_where_it_is_said(frequency, damping):
     text = between("sensor_gain", "attached_oscillator", a, b)
     low, high = (float(word) for word in (text.split(" from ")[2].split(" to ")[0],
                                           text.split(" from ")[2].split(" to ")[1].split()[0]))
-    assert f"drive {a.actuators[j]} " in text and f"look at {a.sensors.names[i]}:" in text
+    assert f"drive {a.actuators[j]} " in text and f"measure {a.sensors.names[i]}:" in text
     assert low <= f[k] * 1.005 and f[k] <= high * 1.005 and low < high
     assert float(text.split(" by ")[1].split()[0]) == pytest.approx(D.max(), rel=0.03)
     band = (f > 1.01 * low) & (f < 0.99 * high)

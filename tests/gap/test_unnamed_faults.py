@@ -86,7 +86,7 @@ def test_crosstalk_is_no_misalignment():
     step = searched(truth, "sensor_misalignment", "sensor_gain")[0]
     one = step.fitted.model.effects[-1]
     assert one.effect.outside
-    assert one.effect.said(one.place, one.by_name) == "a share of Sz3's signal in Sz1"
+    assert one.effect.said(one.place, one.by_name) == "a fraction of Sz3's signal in Sz1"
     assert one.values[0] == pytest.approx(0.03, abs=4 * np.sqrt(step.fitted.covariance_of(one.names)[0, 0]))
 
 

@@ -69,6 +69,7 @@ def test_algebra_is_that_of_the_transfer_matrices(seed, n):
     L, R = rng.standard_normal((4, 2)), rng.standard_normal((3, 1))
     for s in (0.3j, 7.0 + 1j):
         np.testing.assert_allclose((G @ H)(s), G(s) @ H(s), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose((G * H)(s), G(s) @ H(s), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose((G - E)(s), G(s) - E(s), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(G.scaled(L, R)(s), L @ G(s) @ R, rtol=1e-9, atol=1e-9)
         T = rng.standard_normal((n, n)) + 3 * np.eye(n)

@@ -10,11 +10,13 @@ from matplotlib import pyplot as plt
 
 from avis_ctrl import plot
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti import tf
+from avis_ctrl.lti import StateSpace, tf
 from avis_ctrl.lti.interchange import plot_frequencies
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
-from avis_ctrl.robust.mu_peak import MuPeak
+from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
+from avis_ctrl.robust.musyn import musyn
 from avis_ctrl.robust.musyn_state import Iteration
+from avis_ctrl.uncertainty.blocks import ComplexScalar
 from avis_ctrl.uncertainty.uncertain_models import real
 
 matplotlib.use("Agg")
@@ -138,3 +140,15 @@ def test_what_is_no_system_is_refused():
         plot.bode("G")
     with pytest.raises(InputError, match="frequencies of the frequency response"):
         plot.sigma(control.frd(LAG, OMEGA), np.array([3.3]))
+
+
+def test_mu_of_a_synthesis_names_the_call_that_has_the_curves():
+    # A lag with uncertain gain and a disturbance; its output and half the effort are to be small, y has noise.
+    P = StateSpace([[-1.0]], [[0.3, 1.0, 0.0, 1.0]], [[0.0], [1.0], [0.0], [1.0]],
+                   [[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0.5], [0, 0, 0.1, 0]])
+    found = musyn(P, [ComplexScalar(1, "gain")], 1, 1, max_iterations=2, polish=False)
+    with pytest.raises(InputError, match=r"mu_peak\(result.closed_loop, result.blocks\)"):
+        plot.mu(found)
+    curves = mu_peak(found.closed_loop, found.blocks)
+    assert curves.upper == pytest.approx(found.mu_upper, rel=0.01)
+    assert curve(plot.mu(curves))[1].max() <= curves.upper

@@ -106,7 +106,7 @@ def explained(campaign: Campaign) -> Gap:
                ("The centre of mass is not where the model has it: com offset at the payload, (20.1 ± 0.2) mm along x "
                 "and (−11.9 ± 0.2) mm along y; probability above 99.9 %.",
                 "The held-out records confirm it at both levels."),
-               "records 04, 05 held out, each beside a fitted one of its level", 1, 41.5,
+               "records 04, 05; another record of the same level is fitted", 1, 41.5,
                np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None,
                shares=shares(), records=by_record(), left=Remainder(0.0104, 1.03, 0.004, False))
 

@@ -118,7 +118,7 @@ def test_the_first_page_is_read_alone(fabricated: DesignResult, html: bytes, pdf
     """Task, verdicts, certificate and one figure, and nothing else; the second section begins on the second page."""
     pages = pdf_text(pdf, tmp_path).split("\f")
     first = " ".join(pages[0].split())
-    for shown in ("1 Summary", "Asked was one controller for z and phi_x (edge)", "mass ± 10 %", "Table 1", "NOT MET",
+    for shown in ("1 Summary", "Task: one controller for z and phi_x (edge)", "mass ± 10 %", "Table 1", "NOT MET",
                   "the peak of mu is between", "Figure 1"):
         assert shown in first, shown
     assert "2 Controllers compared" not in first and "2 Controllers compared" in " ".join(pages[1].split())

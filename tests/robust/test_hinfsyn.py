@@ -333,7 +333,7 @@ class TestUse:
         P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
         result = hinfsyn(P, 1, 1, sample_rate_Hz=10.0)
         assert result.fastest_pole == pytest.approx(np.max(np.abs(result.K.poles())))
-        share = float(re.search(r"is (\S+) of half the sample rate: too fast", result.notes[-1])[1])
+        share = float(re.search(r"is (\S+) times half the sample rate: too fast", result.notes[-1])[1])
         assert share == pytest.approx(result.fastest_pole / (2 * np.pi * 10.0 / 2), rel=0.05)
         assert "slow enough" in hinfsyn(P, 1, 1, sample_rate_Hz=20 * result.fastest_pole).notes[-1]
 

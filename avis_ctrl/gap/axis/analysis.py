@@ -87,7 +87,8 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
         if better is not None:
             best, variable = better
             wrong = [one for one in names if one.effect.variable == variable]
-            refused += [replace(one, refused=f"another function of the {variable} leaves far less") for one in wrong]
+            refused += [replace(one, refused=f"another function of the {variable} gives a much smaller "
+                                             "residual") for one in wrong]
         else:
             wrong = [worst] if worst else []
             refused += wrong
@@ -317,7 +318,7 @@ def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[
         lines = lines[lines > 0]
         series.append(Series(name, lines, np.array([np.sqrt(np.mean(left[np.round(f, 9) == one])) for one in lines]),
                              "points" if len(lines) < 40 else "line"))
-    return ladder, Picture("What each model leaves on held-out data", "frequency [Hz]", "r.m.s. on a line, relative",
+    return ladder, Picture("Residual of each model on held-out data", "frequency [Hz]", "r.m.s. on a line, relative",
                            tuple(series), (), "log", "log")
 
 
@@ -329,13 +330,14 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
                stages: Sequence[AxisStage], names: Sequence[Name], refused: Sequence[Name], unknown: str) -> list[str]:
     first, last = percent(stages[0].nrmse), percent(stages[-1].nrmse)
     if verdict == "none":
-        said = [f"Nothing is missing that these data can show: the model leaves {last} of held-out data."]
+        said = [f"No missing effect was found: the error on held-out data is {last}."]
     elif verdict == "unexplained":
-        said = [f"The base model leaves {first} of held-out data, more than noise, and no effect of the library "
-                "accounts for it: unexplained."]
+        said = [f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
+                "library explains it."]
     else:
-        said = [f"The model lacks {'; and '.join(one.in_words() for one in told)}; with that the gap on held-out data "
-                f"falls from {first} to {last}{', and more is missing' * (verdict != 'explained')}."]
+        count = "one effect" if len(told) == 1 else f"{len(told)} effects"
+        said = [f"The model misses {count}: {'; '.join(one.in_words() for one in told)}. With this the gap on held-out "
+                f"data falls from {first} to {last}.{' A part is not explained.' * (verdict != 'explained')}"]
     if traces:
         said.append("Traces, below 1 % of the gap: " + "; ".join(
             f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})"
@@ -347,15 +349,15 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
             said.append("The delay is negative: the motion comes before the force, so that the force was logged late, "
                         "or the motion early.")
         if one.rivals and one.effect.separated_by:
-            said.append(f"{one.effect.name}: these data cannot tell it from "
-                        f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}; what would: "
+            said.append(f"{one.effect.name}: these data cannot distinguish it from "
+                        f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
                         f"{one.effect.separated_by}.")
     if stages[-1].chi2_per_dof is None:
-        said.append("Nothing in these data repeats, so that the noise is not measured.")
+        said.append("Nothing in these data repeats, so the noise cannot be estimated.")
     else:
-        said.append(f"What remains of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
+        said.append(f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
                     "noise.")
     if unknown:
-        said.append(f"What remains behaves most like {unknown}, for which the library has no name.")
-    lost = {one.effect.name: f"{one.effect.name} comes near, but {one.refused}" for one in refused}
+        said.append(f"The residual is most similar to {unknown}, which is not in the library.")
+    lost = {one.effect.name: f"{one.effect.name} reduces the gap, but {one.refused}" for one in refused}
     return [*said, *problem.notes, *(f"Not named: {'; '.join(lost.values())}." for _ in [lost] if lost)]

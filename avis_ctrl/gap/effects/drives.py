@@ -25,7 +25,7 @@ class ActuatorGain(Effect):
 
     name = "actuator_gain"
     title = "an actuator's force constant is not the one of the rig file"
-    looks_like = "the response to one input is off by the same real factor at every frequency and output"
+    looks_like = "the response to one input is wrong by the same real factor at every frequency and output"
 
     def places(self, model: Table) -> tuple[str, ...]:
         return model.actuators

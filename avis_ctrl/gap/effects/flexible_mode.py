@@ -28,8 +28,8 @@ class PayloadFlexibleMode(Effect):
     """
 
     name = "payload_flexible_mode"
-    title = "the payload bends: a mode beside its rigid motion"
-    looks_like = "a resonance above the suspension's, in rows and columns that share one shape"
+    title = "a flexible mode of the payload"
+    looks_like = "a resonance above those of the suspension, with one mode shape for all drives and sensors"
     holds_states = True
 
     def places(self, model: Table) -> tuple[str, ...]:

@@ -24,8 +24,8 @@ class LargeMotion(Effect):
         # Little room beyond 0 and 1, and a size above it: a gap of another origin must not lead a fit astray here.
         return tuple(EffectParameter(name, "1", text, 0.0, -0.5, 1.5, 4.0) for name, text in (
             ("mounts", "second-order terms of mounts and inertia, 1 by Newton and Euler"),
-            ("motors_turn", "share of the payload's rotation that turns the motors' axes"),
-            ("sensors_turn", "share of it that turns the sensors' axes")))
+            ("motors_turn", "fraction of the payload's rotation that turns the motors' axes"),
+            ("sensors_turn", "fraction of it that turns the sensors' axes")))
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return values["mounts"] * record.large_force + values["motors_turn"] * record.turned_force

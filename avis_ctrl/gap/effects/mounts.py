@@ -55,7 +55,7 @@ class MountRelaxation(OfMounts):
 
     name = "mount_relaxation"
     title = "the vertical stiffness of the mounts rises with frequency (a second chamber, a Maxwell branch)"
-    looks_like = "vertical resonances higher and more damped than low frequencies say"
+    looks_like = "vertical resonances higher and more damped than the low frequencies suggest"
     holds_states = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
@@ -302,7 +302,7 @@ class ContactFriction(Effect):
 
     name = "contact_friction"
     title = "friction at the actuators' contact points: stiff at small amplitude, slipping at large"
-    looks_like = "stiffness and damping that depend on level: stiffer at the low one, lossier between"
+    looks_like = "stiffness and damping that depend on the level: stiffer at a low level, more damped at a medium one"
     nonlinear = True
     strength = "stiffness_N_per_m"
 

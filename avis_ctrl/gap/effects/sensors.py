@@ -53,7 +53,7 @@ class GeophoneCorner(_OfSensor):
 
     name = "geophone_corner"
     title = "a geophone's suspension frequency is not the one that its compensation filter assumes"
-    looks_like = "one output is off around and below the suspension frequency, by the same factor from every input"
+    looks_like = "one output is wrong around and below the suspension frequency, by the same factor from every input"
 
     def places(self, model: Table) -> tuple[str, ...]:
         known = suspensions(model.rig)
@@ -79,7 +79,7 @@ class SensorGain(_OfSensor):
 
     name = "sensor_gain"
     title = "a sensor's sensitivity is not the one of the rig file"
-    looks_like = "one output is off by the same real factor at every frequency and from every input"
+    looks_like = "one output is wrong by the same real factor at every frequency and from every input"
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("gain", "1", "sensitivity over that of the rig file", 1.0, 0.1, 10.0, 1.0),)
@@ -94,7 +94,7 @@ class SensorMisalignment(_OfSensor):
 
     name = "sensor_misalignment"
     title = "a sensor's axis is tilted, so that it sees another axis too"
-    looks_like = "one output holds a share of the motion along another axis at its place, at every frequency"
+    looks_like = "one output contains a fraction of the motion along another axis at its place, at every frequency"
 
     def places(self, model: Table) -> tuple[str, ...]:
         return tuple(name for name in model.sensors.names if axis_of(model, name))

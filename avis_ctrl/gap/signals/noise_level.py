@@ -160,7 +160,7 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
     high = quiet_lines(left, (SETTINGS.sensor_band[0] * rate, SETTINGS.sensor_band[1] * rate), False, masks)
     if not any(len(one.left) for one in high):
         raise InputError("expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
-                         " to tell the noise from what u drives", field="residuals")
+                         " to estimate the noise", field="residuals")
     sensors = _sensor_noise(high, first.y_names, first.y_unit)
     lsb = {name: (steps_V or {}).get(name, nominal_converter(rig).lsb_V) for name in first.y_names}
     expected = {name: float(np.hypot(ambient.sensor_noise_rms_V, lsb[name] / np.sqrt(12))) for name in first.y_names}

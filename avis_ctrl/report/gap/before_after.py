@@ -1,4 +1,4 @@
-"""The gap before and after: residual over noise, frequency responses, and the ladder of stages."""
+"""The gap before and after: residual over noise, frequency responses, and the stages."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
         panels.append(Panel(hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log"),
                             tuple(curves), (), title))
     return Figure("gap_spectrum", "The gap on held-out data: power of the residual relative to that of the "
-                  "measured noise, by frequency band. For a model that lacks nothing the mean lies at 1, and the worst "
-                  f"of {heat.before.shape[1]} channels a little above.", tuple(panels), 2, 0.95)
+                  "measured noise, by frequency band. For a complete model the mean is 1, and the worst of "
+                  f"{heat.before.shape[1]} channels is a little above.", tuple(panels), 2, 0.95)
 
 
 def edges_of(heat: HeatMap) -> np.ndarray:
@@ -83,8 +83,8 @@ def ladder(gap: Gap) -> Figure:
                  Style("#8fbbdc"), line=False, bars=0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
     ticks = tuple((float(k), textwrap.fill(rung(one.name, k), LETTERS)) for k, one in enumerate(gap.stages))
-    return Figure("ladder", "The ladder of stages: normalised r.m.s. error on held-out data, and that of noise alone. "
-                  "Logarithmic.",
+    return Figure("ladder", "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. "
+                  "Logarithmic scale.",
                   (Panel(Axis("", "linear", (-0.6, len(values) - 0.4), ticks),
                          Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))), (bars, *lines)),),
                   height=0.7)
@@ -103,8 +103,8 @@ def _stages(gap: Gap) -> Table:
             one.chi2_per_dof, 4)))
     if np.isfinite(gap.noise_nrmse):
         rows.append(("noise alone", wording.percent(gap.noise_nrmse), "1", "1"))
-    return table("The stages. Each model is fitted to the same records; the figures are of records or periods that no "
-                 f"fit has seen{f' ({gap.held_out})' if gap.held_out else ''}. Error: r.m.s. of the residual "
+    return table("Each model is fitted to the same records; the figures are those of records or periods that no fit "
+                 f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
                  "relative to that of the measured outputs.",
                  ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"), rows)
 

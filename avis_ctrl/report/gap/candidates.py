@@ -1,4 +1,4 @@
-"""The runners-up and why they lost."""
+"""Candidates that were fitted and not named, with reasons."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ def candidates(found: Found) -> Section:
     """Candidates that were refitted, the most probable first."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
-        return Section("Runners-up", "considered", (Paragraph(_none(found)),))
+        return Section("Rejected candidates", "considered", (Paragraph(_none(found)),))
     header = ("candidate", "chi-square / dof", "odds", "best size",
               "why it was not named")
     rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
              wording.quantities(one.parameters, MOST) or "not stated", one.reason) for one in ranked]
-    pieces: list[Piece] = [table("Candidates that were refitted together with all parameters of the rig, with "
-                                 "chi-square on lines of the held-out records, and why each lost. The lines are drawn "
-                                 "densely at the resonances: the figures differ from those of all lines in the ladder.",
+    pieces: list[Piece] = [table("Candidates that were fitted together with all parameters of the rig, and the reason "
+                                 "for rejection. Chi-square is that of selected lines of the held-out records, dense "
+                                 "at the resonances, and differs from that of all lines.",
                                  header, rows[:FIRST], "lrrll")]
     if rows[FIRST:]:
         pieces.append(Fold(f"{len(rows) - FIRST} more candidates",
                            (table("The others.", header, rows[FIRST:], "lrrll"),)))
-    return Section("Runners-up", "considered", tuple(pieces))
+    return Section("Rejected candidates", "considered", tuple(pieces))
 
 
 def _none(found: Found) -> str:
     if found.gap.verdict == "none":
-        return "No candidate was refitted: no score of any effect at any place was significant."
-    return "No other candidate was refitted."
+        return "No candidate was fitted: the score test was significant for no effect at any place."
+    return "No other candidate was fitted."

@@ -19,15 +19,15 @@ COLUMNS = {"model": "model", "missing": "linear, not in the model", "nonlinear":
            "unmeasured": "unmeasured inputs", "sensors": "sensors' noise"}
 # Fractions below this are not drawn.
 LEAST = 1e-9
-HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; what the excited "
-                 "lines hold beyond that and beyond any linear response is not linear.",
-       "levels": "No line is free of the drives, so noise and unmeasured inputs are taken for what is left at the "
-                 "lowest level, the model's own nonlinear terms taken off: they do not grow with the drives, and "
-                 "what is more at a higher level is not linear. Nonlinearity of the lowest level that the model lacks "
-                 "counts as unmeasured inputs.",
+HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; the part of the "
+                 "excited lines that exceeds this and any linear response is not linear.",
+       "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
+                 "terms, is therefore attributed to noise and unmeasured inputs, which do not grow with the drives; "
+                 "any additional residual at a higher level is not linear. Nonlinearity at the lowest level that is "
+                 "not in the model counts as unmeasured inputs.",
        "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
-                    "from nonlinearity that the model lacks: \"not linear\" holds the model's own nonlinear terms "
-                    "only, and \"unmeasured inputs\" whatever else does not follow the drives linearly."}
+                    "from nonlinearity that is not in the model: \"not linear\" contains only the model's own "
+                    "nonlinear terms, and \"unmeasured inputs\" all else that does not follow the drives linearly."}
 
 
 def coherence(shares: tuple[PowerShares, ...]) -> list[Piece]:

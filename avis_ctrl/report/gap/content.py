@@ -25,9 +25,9 @@ def document(found: Found) -> Document:
     sections += [part for part in (controller(found),) if part is not None]
     sections += [measurement(found), gates_of(found.findings), method(found.gap)]
     told = {"seed": found.gap.seed, "seconds": found.gap.seconds, **found.provenance}
-    sections.append(provenance_table(told, "With the same measurement, rig, options, seed, library versions and "
-                                     "processor the same figures come out."))
+    sections.append(provenance_table(told, "The same measurement, rig, options, seed, library versions and "
+                                     "processor give the same figures."))
     name = found.gap.baseline.rig.name
     return Document(f"Gap between simulation and measurement of the rig {name}",
-                    "Where they disagree, which effect is missing, and what remains" + (f", {made}" if made else ""),
+                    "Where they disagree, and which effects the model misses" + (f", {made}" if made else ""),
                     stamp_of(found.provenance), tuple(sections))

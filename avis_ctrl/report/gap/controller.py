@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 
 def controller(found: Found) -> Section | None:
-    """Yesterday's controller on both models beside a new one; None where no design was asked for."""
+    """The previous controller on both models beside a new one; None where no design was asked for."""
     effect = found.design
     if effect is None:
         return None
     rows = [(who, model, *_figures(one)) for who, model, one in loops(effect)]
     pieces: list[Piece] = [Paragraph(effect.sentences[0])] if effect.sentences else []
     pieces += [table(
-        "The controllers. Upper bound of mu below 1: every table of the design's uncertainty set performs as asked. "
-        "Decibels count the largest singular value from floor to payload. Worst cases are upper bounds over the whole "
-        "set; \"unstable\" means that the set holds a table that the controller does not stabilise, or is not shown "
-        "to. Six: the nominal loop on all six coordinates, those beside the design's without control.",
+        "An upper bound of mu below 1 guarantees the specified performance for every table of the design's "
+        "uncertainty set. Decibels are those of the largest singular value from floor to payload. Worst cases are "
+        "upper bounds over the whole set; \"unstable\" means that the controller is not proved to stabilise every "
+        "table of the set. Six: the nominal loop of all six coordinates, those outside the design without control.",
         ("controller", "on model", "stable", "stable in six", "mu, upper bound", "mu, lower bound", "peak",
          "worst peak", "worst in band"), rows, "llccrrrrr"), _bounds(effect)]
     if effect.sentences[1:]:
@@ -36,7 +36,7 @@ def controller(found: Found) -> Section | None:
 
 def loops(effect: DesignEffect) -> list[tuple[str, str, LoopFigures]]:
     """Controller, model and figures of the loops that were computed."""
-    every = (("yesterday's", "re-identified", effect.before), ("yesterday's", "updated", effect.after),
+    every = (("previous", "re-identified", effect.before), ("previous", "updated", effect.after),
              ("new", "updated", effect.new))
     return [(who, model, one) for who, model, one in every if one is not None]
 
@@ -61,8 +61,8 @@ def _bounds(effect: DesignEffect) -> Figure:
     top = 1.15 * max(1.0, float(np.max(mu[np.isfinite(mu)], initial=0.0)))
     bars = Curve(place, np.where(np.isfinite(mu), mu, np.nan), "upper bound of mu", Style("#8fbbdc"), line=False,
                  bars=0.5)
-    return Figure("gap_mu", "Upper bound of mu, robust performance, of each controller on each model; below 1 every "
-                  f"table of the set performs as asked.{lost}",
+    return Figure("gap_mu", "Upper bound of mu (robust performance) of each controller with each model; below 1 the "
+                  f"specified performance is guaranteed for every table of the set.{lost}",
                   (Panel(Axis("", "linear", (-0.6, len(mu) - 0.4), ticks),
                          Axis("mu, upper bound [-]", "linear", (0.0, top)),
                          (bars, level(-0.5, len(mu) - 0.5, 1.0, "limit", STYLES["limit"]))),), height=0.7)

@@ -34,10 +34,10 @@ def by_record(gap: Gap) -> Figure:
     panels = (_panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
               _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s))
     return Figure("gap_records", "Residual of each record, relative to the noise. Filled: held-out records; open: "
-                  "fitted. The error of a linear model that lacks something linear grows in proportion to the level. "
-                  "An error that is the same at every level is noise; one that grows otherwise depends on amplitude. "
-                  "A slope over time is drift. The lines are drawn at random, dense near resonances, and are the same "
-                  "for all records: these values differ from those of all lines in the ladder.", panels, 2, 0.85)
+                  "fitted. A missing linear effect gives an error in proportion to the level. An error that is the "
+                  "same at every level is noise; one that grows otherwise depends on amplitude. A slope over time is "
+                  "drift. The frequency lines are a random selection, dense near resonances, the same for all records: "
+                  "these values differ from those of all lines in the table of stages.", panels, 2, 0.85)
 
 
 def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:

@@ -53,12 +53,12 @@ def _told(one: NamedEffect) -> str:
     effect = wording.known(one.name)
     text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."
     if effect is not None:
-        text += f" What it does to responses: {effect.looks_like}."
+        text += f" Influence on the responses: {effect.looks_like}."
     if one.confirmation:
         text += f" {one.confirmation[:1].upper()}{one.confirmation[1:].rstrip('.')}."
     if one.indistinguishable_from:
         names = words.joined(list(map(wording.titled, one.indistinguishable_from)))
-        text += f" This data cannot tell it from {names}."
+        text += f" These data cannot distinguish it from {names}."
     return text
 
 
@@ -81,8 +81,8 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
     if not gap.effects:
         return table("The rig's own parameters as re-identified.", ("parameter", "value", "± 1 σ", "unit"), rows,
                      "lrrl")
-    return table("A model that lacks an effect bends its own parameters to make up for it; the change is what they "
-                 "give back. A large change is no error: it may lie along a direction that the data hardly determine.",
+    return table("A model without the effect is fitted with biased parameters; the change shows by how much. "
+                 "A large change is no error: it may lie along a direction that the data hardly determine.",
                  ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
 
 
@@ -108,8 +108,8 @@ def _always(gap: Gap) -> list[Piece]:
         told.append(f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}" if name in sigma else
                     f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}")
     return [Paragraph("Every model, with or without a named effect, also holds the second-order terms of large "
-                      "rotations, which are physics of any table and no effect. They enter with factors, 0 or 1 by "
-                      f"theory, that are fitted along, often poorly known: {'; '.join(told)}.", "note")]
+                      "rotations, which every table has. They enter with factors, 0 or 1 by theory, that are fitted, "
+                      f"too, and are often poorly determined: {'; '.join(told)}.", "note")]
 
 
 def _deviations(gap: Gap) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The records that were looked at, and how they were divided."""
+"""The records, and how they were divided."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def measurement(found: Found) -> Section:
                      words.yes(bool(h.floor_names))))
     source = f" ({campaign.source})" if campaign.source else ""
     how = found.gap.held_out.rstrip(".")
-    divided = f" Divided: {how}." if how else ""
+    divided = f" Held out: {how}." if how else ""
     pieces: list[Piece] = [table(
         f"The records{source}, sampled at {words.number(campaign.sample_rate_Hz)} Hz; {len(campaign.u_names)} drives, "
         f"{len(campaign.y_names)} outputs [{words.unit(campaign.y_unit)}]. Levels are r.m.s. of the drives.{divided}",
         ("record", "excitation", "level", "starts at", "duration", "periods", "floor measured"), rows, "llrrrrc")]
     if in_short(campaign.notes):
-        pieces += [Heading("What the reader says of the file"), Bullets(tuple(in_short(campaign.notes)))]
+        pieces += [Heading("Notes on reading the file"), Bullets(tuple(in_short(campaign.notes)))]
     return Section("Measurement", "measurement", tuple(pieces))

@@ -11,10 +11,10 @@ SOURCES = (
     "G. H. Golub, V. Pereyra: The differentiation of pseudo-inverses and nonlinear least squares problems whose "
     "variables separate, SIAM J. Numer. Anal. 10 (1973) 413-432 (variable projection).",
     "H. Zhou, L. Hu, J. Zhou, K. Lange: MM algorithms for variance components models, J. Comput. Graph. Stat. 28 "
-    "(2019) 350-361 (variances of what has no name).",
+    "(2019) 350-361 (variance components).",
     "D. J. C. MacKay: Bayesian interpolation, Neural Computation 4 (1992) 415-447 (evidence, Laplace's method).",
     "Q. H. Vuong: Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 57 (1989) 307-333 "
-    "(how certain one law is ahead of another).",
+    "(significance of the difference between two laws).",
     "J. A. Hausman: Specification tests in econometrics, Econometrica 46 (1978) 1251-1271 (halves of the data).",
     "R. Pintelon, J. Schoukens: System Identification: A Frequency Domain Approach, 2nd ed., Wiley, 2012 (likelihood "
     "on spectral lines, nonparametric noise).",
@@ -30,10 +30,10 @@ def method(gap: Gap) -> Section:
         Paragraph("theta are mass, inertia, stiffness and damping (normal priors of 5 %, damping 20 %), t the "
                   "tolerances of the rig file, a the parameters of effects. x are the states at the ends of the "
                   "record; they are projected out. E are relative errors of every path from a drive to a sensor, "
-                  "constant over a third of an octave and the same at every level: what has no name. Their variance "
-                  "is estimated for each sensor and band, that of an additional noise (distortion) for each level "
-                  "too, and the path errors are integrated out. Where octaves or levels differ by more than these "
-                  "variances explain, the standard deviations cover it."),
+                  "constant over a third of an octave and the same at every level: unexplained errors of the model. "
+                  "Their variance is estimated for each sensor and band, that of an additional noise (distortion) for "
+                  "each level too, and the path errors are integrated out. Where octaves or levels differ by more than "
+                  "these variances explain, the standard deviations cover it."),
         Paragraph("Evidence. Of a model with certain effects, by Laplace's method, J the penalised sum of squares at "
                   "the estimate, C the covariance of path errors and noise, H the information with priors; the "
                   "constant contains the price of the states at the ends of the records:"),
@@ -42,24 +42,25 @@ def method(gap: Gap) -> Section:
         Paragraph("Search. A score test with priors says by how much each effect at each place would lower J to first "
                   "order. The best of each name are fitted with all parameters and tolerances, and the one of the "
                   "largest evidence is taken if it is ahead of the present model by more than the number of candidates "
-                  "explains. The search goes on with it in the model, until what is found takes less than 1 % of the "
+                  "explains. The search goes on with it in the model, until an effect explains less than 1 % of the "
                   "gap."),
         Paragraph("Names. An effect that was found is named if it is more probable than not, if its parameters from "
                   "the lower and the upper half of the band, and from low and high levels, agree with the whole, if "
-                  "physics allows its values, and if held-out records bear it out. Its probability counts all that "
-                  "was fitted in its place, among it faults that the library has no name for. Odds are those of the "
-                  "evidence, or those by how evenly the difference of log-likelihoods d_g is spread over bands and "
-                  "levels g, whichever are less certain, because textbook laws are not quite those of real elements:"),
+                  "its values are physically possible, and if the held-out records are more likely with it. Its "
+                  "probability is relative to all that was fitted in its place, including faults that are not in the "
+                  "library. Odds are those of the evidence, or those by how evenly the difference of log-likelihoods "
+                  "d_g is spread over bands and levels g, whichever is less certain, because textbook laws are not "
+                  "quite those of real elements:"),
         Formula("z = sum_g d_g slash (sum_g (d_g - overline(d))^2)^(1 slash 2), quad P = Phi(z)",
                 "z is the sum of the differences over their spread; the probability is the normal distribution of z"),
         Paragraph("Errors and noise in per cent, on records that no fit has seen:"),
         Formula("op(\"n.r.m.s.\") = (1 / n_y sum_i sum_k abs(e_(k i))^2 slash sum_k abs(Y_(k i))^2)^(1 slash 2)",
                 "the normalised error is the root of the mean over outputs of the residual's power over the output's"),
         Paragraph("What held out means. No parameter is fitted to the held-out records; they decide whether an effect "
-                  "is named, so that their figures after naming are no fully independent test. Hum, what is wrong with "
-                  "a converter, and the levels of floor and sensors are found in all records, and hum is taken out of "
-                  "all. Where a channel clips, what the model expects behind the limit stands in place of the clipped "
-                  "samples, of held-out records too: these samples test nothing. Forces that depend on amplitude or "
+                  "is named, so that their figures after naming are no fully independent test. Hum, faults of "
+                  "a converter, and the levels of floor and sensors are found in all records, and hum is removed from "
+                  "all. Where a channel clips, the clipped samples are replaced by the model's prediction, in held-out "
+                  "records too: these samples test nothing. Forces that depend on amplitude or "
                   "time act on the motion of the mounts as the model has it, corrected by each record's own sensors; "
                   "avis predict goes from drives and floor alone."),
         Paragraph(f"Held out: {gap.held_out.rstrip('.')}." if gap.held_out else

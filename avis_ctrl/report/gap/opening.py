@@ -26,8 +26,7 @@ def opening(found: Found) -> Section:
         pieces.append(_named(gap))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
-        pieces.append(Paragraph("The section on what remains lists the smallest effects that can be distinguished "
-                                "from zero."))
+        pieces.append(Paragraph("The section on the residual lists the detection limits of the effects."))
     open_still = gap.verdict in ("unexplained", "partly explained")
     if told := (*gap.sentences[1:], *([gap.next_experiment] if open_still and gap.next_experiment else [])):
         pieces.append(Bullets(tuple(map(wording.said, told))))
@@ -56,13 +55,13 @@ def in_numbers(gap: Gap) -> str:
     told = [f"{wording.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
     text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
     if np.isfinite(gap.noise_nrmse):
-        text += f"; that of noise alone is {wording.percent(gap.noise_nrmse)}"
+        text += f"; that of the noise alone is estimated at {wording.percent(gap.noise_nrmse)}"
     first, last = _reference(gap), gap.stages[-1].nrmse
     if gap.effects and first > 0 and last > 0:
-        text += f". Naming the effect{'s' * (len(gap.effects) > 1)} divides the re-identified error by "
-        text += words.number(first / last)
+        text += f". With the effect{'s' * (len(gap.effects) > 1)} the error is "
+        text += f"{words.number(first / last)} times smaller than that of the re-identified model"
         if gap.noise_nrmse > 0:
-            text += f", to {words.number(last / gap.noise_nrmse)} times the noise"
+            text += f", and {words.number(last / gap.noise_nrmse)} times the noise"
     return text + "."
 
 
@@ -79,7 +78,7 @@ def _group(one: NamedEffect) -> str:
 
 
 def _stage(name: str) -> str:
-    return {"nominal": "with the model as its file has it", "re-identified": "after re-identification",
+    return {"nominal": "with the values of the rig file", "re-identified": "after re-identification",
             "tolerances": "with all tolerances"}.get(name, f"with {wording.titled(name)}")
 
 

@@ -36,8 +36,8 @@ def places(found: Found) -> Section:
 
 def _nowhere(gap: Gap) -> str:
     if gap.verdict == "none":
-        return ("The residual counts as noise as a whole. Bands that stand out of it by themselves are in the section "
-                "on what remains." if gap.remaining else "No band of any channel stands out of the noise.")
+        return ("As a whole the residual does not exceed the noise. Single bands that do are listed in the section on "
+                "the residual." if gap.remaining else "No band of any channel exceeds the noise significantly.")
     return "The places of the gap were not stated."
 
 

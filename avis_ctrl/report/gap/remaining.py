@@ -1,4 +1,4 @@
-"""What remains, and what to measure next."""
+"""The residual, and what to measure next."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def remaining(found: Found) -> Section:
     if gap.remaining:
         pieces.append(table_of(gap.remaining, "Where the residual of the updated model lies, on held-out data. "))
     if gap.detectable:
-        pieces += [Heading("The smallest effects that can be distinguished from zero"), detectable(gap)]
+        pieces += [Heading("Detection limits"), detectable(gap)]
     pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(found))]
-    return Section("What remains, and what to measure next", "remaining", tuple(pieces))
+    return Section("Residual, and what to measure next", "remaining", tuple(pieces))
 
 
 def detectable(gap: Gap) -> Table:
@@ -36,16 +36,16 @@ def detectable(gap: Gap) -> Table:
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, spoken(parameter, unit), size))
-    return table("The size at which an effect that is absent would differ from zero by five standard deviations of the "
-                 "fit, at the best and at the worst of its places; the search finds effects of about this size. "
-                 "Smaller ones may be present. \"At no size\": re-identified parameters of the rig would absorb the "
-                 "effect. Effects with a frequency or another shape of their own are not in this table.",
-                 ("effect", "place", "parameter", "seen from about"), rows, "lllr")
+    return table("Detection limits: the size at which an effect would differ from zero by five standard deviations of "
+                 "the fit, at the best and at the worst of its places. Smaller effects may be present. \"Not "
+                 "detectable\": the re-identified parameters of the rig absorb the effect. Effects with a frequency or "
+                 "a shape of their own are not in this table.",
+                 ("effect", "place", "parameter", "detection limit"), rows, "lllr")
 
 
 def _seen(one: Detectable) -> str:
     unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
-    return f"{words.number(one.value, 2)}{unit}" if np.isfinite(one.value) else "at no size"
+    return f"{words.number(one.value, 2)}{unit}" if np.isfinite(one.value) else "not detectable"
 
 
 def _left(gap: Gap) -> str:
@@ -55,25 +55,25 @@ def _left(gap: Gap) -> str:
                 "rig file's ambient level.")
     left = gap.left
     if left is None:
-        return "What remains was not computed."
+        return "The residual was not computed."
     after = " with the named effects" if gap.effects else ""
     level = {True: "It grows faster than the drives: its cause is not linear.",
              False: "It does not grow faster than the drives.",
-             None: "These records do not show whether it grows faster than the drives."}[left.grows_with_level]
+             None: "From these records it is not known whether it grows faster than the drives."}[left.grows_with_level]
     places = ("The table below lists where it lies." if gap.remaining else
-              f"No band of any channel stands out of the measured noise{after}.")
+              f"No band of any channel exceeds the estimated noise significantly{after}.")
     return (f"On held-out records the residual of the updated model is {wording.percent(left.nrmse)} of the response, "
-            f"r.m.s., which is {words.number(left.over_noise)} times the noise. Its power beyond noise is "
+            f"r.m.s., which is {words.number(left.over_noise)} times the estimated noise. Its power beyond noise is "
             f"{wording.percent(left.share)} of that of the re-identified model. {level} {places}")
 
 
 def _nothing(found: Found) -> str:
     gap = found.gap
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
-        return "No experiment was found that would distinguish the inseparable effects."
+        return "No further measurement was found that would distinguish the effects that these data confuse."
     if gap.verdict in ("partly explained", "unexplained"):
-        return "No further measurement was found that would show more."
+        return "No further measurement was found that would explain more."
     if gap.effects and found.design is None:
-        return ("No further measurement is needed to decide what is missing. avis gap --design shows what it means for "
-                "the controller; avis predict tests the updated model on another campaign.")
+        return ("No further measurement is needed to name the missing effects. avis gap --design shows their influence "
+                "on the controller; avis predict tests the updated model on another campaign.")
     return "No further measurement is needed for this question."

@@ -46,9 +46,9 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
     return table(f"The controllers and their state-space files. The fastest pole is compared with half the sample "
                  f"rate of {words.number(rate, 4)} Hz. The gain at rest turns the offset of the sensors' electronics "
                  "into drive voltage: the last column is the part of a drive's range that the largest offsets of the "
-                 "rig file cost, each with its worst sign.",
+                 "rig file need, each with its worst sign.",
                  ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself",
-                  "gain at rest", "offset costs"), rows, "llrrrcrr")
+                  "gain at rest", "offset needs"), rows, "llrrrcrr")
 
 
 def _gains(made: list[ControllerResult]) -> Figure:

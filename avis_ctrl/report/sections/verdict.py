@@ -41,10 +41,10 @@ def _asked(result: DesignResult) -> Paragraph:
     spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
     members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
     return Paragraph(
-        f"Asked was one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
+        f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
         f"{result.rig.name}, stable and within the bounds for {members}: "
         f"transmissibility at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and at most "
-        f"{design.transmissibility.peak_dB:+g} dB elsewhere.".replace(" -", " −"))
+        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies.".replace(" -", " −"))
 
 
 def _achieved(result: DesignResult) -> str:

@@ -177,9 +177,10 @@ ADDED: dict[str, AddedSignal] = {one.name: one for one in (
                 lambda model: ("loop",) if _read(model) else (),
                 lambda model: EffectParameter("relative", "1", "rate of one clock over the other's, less one", 0.0,
                                               -0.01, 0.01, 1e-6), _other_clock),
-    DriveCrosstalk("drive_crosstalk", "a share of one motor's voltage on another",
-                   "a share of {source}'s voltage on {into}", lambda model: pairs(model.actuators),
-                   lambda model: EffectParameter("share", "1", "share of the other's voltage", 0.0, -2.0, 2.0, 0.01)),
+    DriveCrosstalk("drive_crosstalk", "a fraction of one motor's voltage on another",
+                   "a fraction of {source}'s voltage on {into}", lambda model: pairs(model.actuators),
+                   lambda model: EffectParameter("share", "1", "fraction of the other's "
+                                                               "voltage", 0.0, -2.0, 2.0, 0.01)),
     _force_law("drive_quadratic", "unlike force of push and pull", "u^2", "1/V", 1, lambda u: u ** 2),
     _force_law("drive_absolute", "a force constant that depends on the voltage", "u|u|", "1/V", 1,
                lambda u: u * np.abs(u)),

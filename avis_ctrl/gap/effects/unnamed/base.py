@@ -16,7 +16,7 @@ class UnnamedFault(Effect):
     """One that is never named. words : for a sentence, with {place}, {into} and {source} of a pair, and values."""
 
     outside = True
-    looks_like = "what the library has no name for"
+    looks_like = "not in the library"
     words: str
 
     def said(self, place: str, values: Values) -> str:

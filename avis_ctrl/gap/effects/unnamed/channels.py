@@ -37,14 +37,14 @@ class SensorCrosstalk(FirstOrder):
     """One output holds a share of another output's signal."""
 
     name = "sensor_crosstalk"
-    title = "a share of one sensor's signal in another's"
-    words = "a share of {source}'s signal in {into}"
+    title = "a fraction of one sensor's signal in another's"
+    words = "a fraction of {source}'s signal in {into}"
 
     def places(self, model: Table) -> tuple[str, ...]:
         return pairs(model.sensors.names)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("share", "1", "share of the other's signal", 0.0, -2.0, 2.0, 0.01),)
+        return (EffectParameter("share", "1", "fraction of the other's signal", 0.0, -2.0, 2.0, 0.01),)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         into, source = place.split("/")
@@ -59,8 +59,8 @@ class SensorCrosstalkOfAll(FirstOrder):
     """One output holds shares of all others: a common ground, or a sensor somewhere else on the payload."""
 
     name = "sensor_crosstalk_of_all"
-    title = "shares of all sensors' signals in one"
-    words = "shares of the other sensors' signals in {place}"
+    title = "fractions of all sensors' signals in one"
+    words = "fractions of the other sensors' signals in {place}"
 
     def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names if len(model.sensors.names) > 2 else ()
