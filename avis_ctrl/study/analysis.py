@@ -25,7 +25,8 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 # Bounds are proved to half a per cent (0.04 dB) above the highest value found: finer proofs only cost time.
 SLACK = 5e-3
-# Of the table without control: nothing is decided by its bounds, and its narrow peaks take many intervals.
+# Of the table without control where there are many blocks: nothing is decided by its bounds, and its narrow peaks take
+# many intervals.
 PASSIVE_SLACK = 2e-2
 # Where only the largest gain is wanted, not its curve.
 FEW_POINTS = 4
@@ -63,7 +64,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     low, high = design.transmissibility.band_Hz
     nominal = performance.select(slice(n_z, None), slice(n_w, None))
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
-    slack = PASSIVE_SLACK if K is None else SLACK
+    slack = PASSIVE_SLACK if K is None and blocks.many else SLACK
     robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=slack)
     worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
     worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high),

@@ -50,7 +50,7 @@ def result_dict(result: DesignResult) -> dict[str, Any]:
         "requirements": [{"name": r.name, "limit": r.limit, "value": r.value, "unit": r.unit, "met": r.met}
                          for r in result.requirements],
         "by_axis": [{"axis": one.axis, "worst_case_band_dB": decibels(one.mu), "skyhook_dB": decibels(one.skyhook)}
-                    for one in result.by_axis],
+                    for one in result.by_axis or ()],
         "simulation": result.simulation.as_dict() if result.simulation is not None else {},
         "all_axes": _all_axes(result.loop),
         "seconds": result.seconds, "provenance": result.provenance,

@@ -50,7 +50,7 @@ def alone() -> Iterator[None]:
 class Workers:
     """A pool where there are processors for one, else the same calls one after the other in this process.
 
-    beside : this process computes, too, takes one of the processors, and decides on Ctrl-C.
+    beside : this process computes, too, and decides on Ctrl-C.
     """
 
     def __init__(self, count: int | None = None, beside: bool = False):
@@ -63,7 +63,7 @@ class Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
         on_interrupt = signal.SIG_IGN if self._beside else signal.SIG_DFL
-        self._pool = (ProcessPoolExecutor(self._count - self._beside, multiprocessing.get_context(method), as_worker,
+        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), as_worker,
                                           (os.getpid(), on_interrupt)) if self._count > 1 else None)
         self._others = set(multiprocessing.active_children())
         return self

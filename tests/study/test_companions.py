@@ -62,11 +62,11 @@ def test_the_classical_rule_is_unstable_with_1_Hz_geophones_and_x_and_y_are_name
     assert culprit.kind == "companions" and set(culprit.loops) <= {"x", "y"} and culprit.growth_per_s > 0
     without = {axis: loop for axis, loop in classical.loops.items() if axis not in culprit.loops}
     assert spectral_radius(replace(classical, loops=without)) < 1 <= culprit.radius
-    # The nonlinear simulation, which shares no eigenvalue with this, grows at the rate that was told.
-    record = simulate(classical, 40.0, seed=1, settle_s=0.0)
+    # The nonlinear simulation, which shares no eigenvalue with this, grows at that rate until the drives saturate.
+    record = simulate(classical, 16.0, seed=1, settle_s=0.0)
     early, late = (np.sqrt(np.mean(record.velocity("x")[part] ** 2))
-                   for part in (slice(20000, 25000), slice(35000, None)))
-    assert np.log(late / early) / 15.0 == pytest.approx(culprit.growth_per_s, rel=0.3)
+                   for part in (slice(4000, 6000), slice(14000, None)))
+    assert np.log(late / early) / 10.0 == pytest.approx(culprit.growth_per_s, rel=0.3)
 
 
 def test_designed_loops_keep_the_gain_margins_that_their_modulus_margin_implies(bare, companions):

@@ -51,6 +51,11 @@ def direct(rig, design, omega, axes):
             moved = H[j, kept] @ (against if sensor.quantity == "displacement" else q)
             digital = filter_.leading * np.prod([one - z for z in filter_.zeros]) / np.prod(
                 [one - p for p in filter_.poles])
+            if sensor.inertial:
+                # A tilt phi turns the direction d by phi x d: the mass feels g e_z . (phi x d) as acceleration.
+                turned = np.zeros((6, q.shape[1]), complex)
+                turned[kept] = q
+                moved = moved + 9.80665 * np.cross(sensor.direction, [0.0, 0.0, 1.0]) @ turned[3:] / one ** 2
             seen[j] = digital * volts / sensor.gain * moved
         found[k] = lever[:, None] * (decoder.decoding @ seen)
     return found
