@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, discretise, gain, h2_norm, hinf_norm, tf
+from avis_ctrl.lti.norms import norm_is_below
 
 
 def random_stable(rng, n, n_y, n_u, direct=1.0, margin=None):
@@ -35,6 +36,15 @@ def test_hinf_norm_agrees_with_slicot(seed, n, direct):
     G = random_stable(np.random.default_rng(seed), n, 2, 3, direct)
     expected, _ = control.linfnorm(G.to_control(), tol=1e-10)
     assert hinf_norm(G).gain == pytest.approx(expected, rel=1.1e-6)
+
+
+@given(st.integers(0, 2 ** 31), st.integers(1, 12), st.sampled_from([0.0, 1.0]))
+@settings(max_examples=40, deadline=None)
+def test_a_level_is_compared_as_by_slicot(seed, n, direct):
+    G = random_stable(np.random.default_rng(seed), n, 2, 3, direct)
+    expected, _ = control.linfnorm(G.to_control(), tol=1e-10)
+    assert norm_is_below(G, expected * (1 + 1e-5)) and not norm_is_below(G, expected * (1 - 1e-5))
+    assert not norm_is_below(StateSpace(-G.A, G.B, G.C, G.D), 10 * expected)
 
 
 @given(st.integers(0, 2 ** 31))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -319,3 +320,20 @@ def test_the_factor_of_a_repeated_block_is_refined_like_a_scalar_scaling(seed):
     found, best, start = constants(seed, ComplexScalar(2), 1.0)
     assert found == pytest.approx(constants(seed, ComplexFull(2, 2), 1.0)[0], rel=1e-6)
     assert (found - best) < 0.5 * (start - best)
+
+
+def test_scalings_of_a_group_share_the_states_of_signals_that_depend_on_each_other():
+    """Three blocks act by two forces and see two motions: d_k(s) = g_k d(s) adds twice two states an order, not six."""
+    rng = np.random.default_rng(3)
+    structure = BlockStructure.of([ComplexFull(1, 1)] * 3).with_performance(1, 1)
+    B, C = rng.normal(size=(4, 2)) @ rng.normal(size=(2, 3)), rng.normal(size=(3, 2)) @ rng.normal(size=(2, 4))
+    P = StateSpace(-np.diag([1.0, 2.0, 5.0, 9.0]), np.hstack([B, rng.normal(size=(4, 2))]),
+                   np.vstack([C, rng.normal(size=(2, 4))]), np.zeros((5, 5)))
+    d = ScalarScaling.from_roots(1.0, [-3.0], [-0.7])
+    parts = tuple(ScalarScaling(np.r_[gain_, d.theta[1:]]) for gain_ in (0.3, -1.0, 2.0))
+    apart = Scalings(structure, (*parts, ScalarScaling.constant(1.0)))
+    grouped = replace(apart, groups=(0, 0, 0, 1))
+    omega = np.geomspace(0.01, 100.0, 30)
+    assert np.allclose(grouped.scale(P).frequency_response(omega), apart.scale(P).frequency_response(omega), rtol=1e-10)
+    assert [one.scale(P).nstates - P.nstates for one in (apart, grouped)] == [6, 4]
+    assert Scalings.from_dicts(structure, grouped.as_dicts()).groups == grouped.groups

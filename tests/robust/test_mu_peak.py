@@ -418,3 +418,24 @@ def test_a_band_of_a_sampled_system_is_in_its_own_frequencies(band_Hz):
     assert found.guaranteed and sigma.max() <= found.upper <= 1.01 * sigma.max()
     assert found.omega == pytest.approx(omega[np.argmax(sigma)], rel=2e-3)
     assert np.all((found.frequencies >= low * (1 - 1e-9)) & (found.frequencies <= high * (1 + 1e-9)))
+
+
+def test_a_known_robust_stability_changes_no_bound(rng):
+    """With and without it, in a band and at all frequencies; a perturbation that destabilises is returned."""
+    N = StateSpace(-np.eye(6) + 0.3 * rng.standard_normal((6, 6)), 0.4 * rng.standard_normal((6, 4)),
+                   0.4 * rng.standard_normal((4, 6)), np.zeros((4, 4)))
+    blocks, inner = [R(), C()], N.select(range(2), range(2))
+    robust = mu_peak(inner, blocks)
+    assert robust.upper < 1
+    for band in ((0.0, np.inf), (0.5, 3.0)):
+        alone, told = (worst_case_gain(N, blocks, band=band, robust=one) for one in (None, robust))
+        few = worst_case_gain(N, blocks, band=band, points=3)
+        assert alone.guaranteed and told.guaranteed and few.guaranteed
+        assert told.upper == pytest.approx(alone.upper, rel=2e-3) and few.upper == pytest.approx(alone.upper, rel=2e-3)
+        assert few.frequencies.size < alone.frequencies.size
+    large = N.scaled(left=np.r_[np.full(2, 2.0 / robust.lower), np.ones(2)])
+    unstable = mu_peak(large.select(range(2), range(2)), blocks)
+    found = worst_case_gain(large, blocks, robust=unstable)
+    assert found.lower == found.upper == np.inf
+    singular = np.eye(2) - large.select(range(2), range(2)).frequency_response(np.array([found.omega]))[0] @ found.delta
+    assert np.linalg.norm(found.delta, 2) <= 1 and np.linalg.svd(singular)[1][-1] < 1e-6
