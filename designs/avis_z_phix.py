@@ -14,7 +14,7 @@ sections = {
     "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0], "transition_octaves": 0.8,
                          "tolerance_dB": 1.0},
     "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0, "reduction": 30.0},
-    "synthesis": {"max_iterations": 8, "target_mu": 0.9},
+    "synthesis": {"max_iterations": 8, "target_mu": 0.88},
     "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1},
     "requirement": [{"quantity": "mu_upper", "at_most": 1.0},
                     {"quantity": "mu_gap_percent", "at_most": 5.0},
