@@ -73,7 +73,7 @@ def test_emps_gap_on_unseen_data(emps):
     assert emps.stages[0].nrmse / np.sqrt(emps.stages[0].chi2_per_dof) == pytest.approx(0.005, abs=0.001)
     # That is several times below what friction with two effects leaves: the tool says so.
     assert emps.verdict == "partly explained" and emps.where and emps.over_noise > 4
-    assert "more is missing" in emps.sentences[0]
+    assert "not explained" in emps.sentences[0]
 
 
 def test_emps_has_no_delay_and_no_lag(emps):
