@@ -24,8 +24,8 @@ def _against_skyhook(result: DesignResult) -> Table:
     rows = [(words.axis(one.axis), words.decibel(one.mu), words.decibel(one.skyhook), words.decibel(one.advantage))
             for one in result.by_axis]
     return table(f"Worst case of each axis over {low:g} to {high:g} Hz, for a floor that moves in any direction: upper "
-                 "bound of the mu controller over the whole set, and what a plant of the set makes of the tuned "
-                 "skyhook, which may have the same worst-case peak.",
+                 "bound of the mu controller over the whole set, and lower bound of the tuned skyhook, which a plant "
+                 "of the set reaches.",
                  ("axis", "mu synthesis, at most", "skyhook, at least", "improvement, at least"), rows, "lrrr")
 
 
