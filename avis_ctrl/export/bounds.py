@@ -47,7 +47,7 @@ class CoverSettings:
     beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
     harmless : errors below this fraction of the largest gain of the controller, or of the table, need not be followed
-        closely. The least gain may be a hundredth of it, and a hundredth of a loop gain moves mu by about as much.
+        closely. The least gain may be a thousandth of it, and a hundredth of a loop gain moves mu by about as much.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     """
 
@@ -57,7 +57,7 @@ class CoverSettings:
     beyond: float = 30.0
     points_beyond: int = 15
     excess_dB: float = 2.0
-    harmless: float = 1e-4
+    harmless: float = 1e-5
     most: int = 6
 
 
