@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from enum import Enum
 from html import escape
+from textwrap import fill
 from typing import Any, ClassVar
 
-LONGEST = 60
+
+@dataclass(frozen=True)
+class SummarySettings:
+    """longest : letters of a value in a repr or a table. line : letters of a line to which sentences are wrapped."""
+
+    longest: int = 60
+    line: int = 100
+
+
+SETTINGS = SummarySettings()
+
+
+def wrapped(sentence: str) -> str:
+    """In lines for a terminal."""
+    return fill(sentence, SETTINGS.line)
 
 
 def in_short(value: Any) -> str:
@@ -21,13 +36,13 @@ def in_short(value: Any) -> str:
         return in_short(value.item()) if not value.shape else f"array{tuple(value.shape)}"
     if isinstance(value, dict):
         few = ", ".join(f"{key}: {in_short(one)}" for key, one in value.items())
-        return few if len(few) <= LONGEST else f"{len(value)} entries"
+        return few if len(few) <= SETTINGS.longest else f"{len(value)} entries"
     if isinstance(value, (list, tuple)):
         return f"({', '.join(map(in_short, value))})" if len(value) <= 2 else f"{len(value)} items"
     if isinstance(value, Enum):
         return value.name
     text = repr(value)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST - 3]}..."
+    return text if len(text) <= SETTINGS.longest else f"{text[:SETTINGS.longest - 3]}..."
 
 
 def count_of(number: int, noun: str) -> str:

@@ -47,7 +47,8 @@ class CoverSettings:
     beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
     harmless : errors below this fraction of the largest gain of the controller, or of the table, need not be followed
-        closely. The least gain may be a thousandth of it, and a hundredth of a loop gain moves mu by about as much.
+        closely. With several axes the smallest singular value may be a thousandth of the largest, and an error of one
+        per cent of it moves mu by about one per cent.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     """
 

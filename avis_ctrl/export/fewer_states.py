@@ -10,17 +10,18 @@ from threadpoolctl import threadpool_limits
 from avis_ctrl.errors import InputError
 from avis_ctrl.export.certificate import Progress
 from avis_ctrl.export.design_folder import Added, DesignFolder
+from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.fixed_order import Task, fixed_order
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.roll_off import gain_limit
+from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 
 def mu_asked(design: Design) -> float:
     """What the design's requirements allow mu to be; inf where they do not name it."""
-    return min((one.at_most for one in design.requirement if one.quantity == "mu_upper" and one.at_most is not None),
-               default=np.inf)
+    return min(design.upper_limits("mu_upper"), default=np.inf)
 
 
 def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Progress = lambda text: None
@@ -42,10 +43,15 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
                          "states", field="--order", value=order)
     with threadpool_limits(1):
         task = Task(P.P, P.all_blocks.complexified(), limit=gain_limit(folder.plant, folder.rig.sample_rate_Hz))
-        found, tried = K, [(K.nstates, mu_peak(P.closed(K), P.all_blocks, slack=SLACK).upper)]
+        tried = [_order_and_mu(P, K)]
         for step in fixed_order(task, K, order, [folder.controller(one) for one in folder.names if one != name]):
             found = step.K
-            tried.append((found.nstates, mu_peak(P.closed(found), P.all_blocks, slack=SLACK).upper))
+            tried.append(_order_and_mu(P, found))
             progress(f"{found.nstates} states: mu at most {tried[-1][1]:.4g} with the design's model")
     made = f"{name}_{order}"
     return replace(folder, added={made: Added(found.renamed(K.inputs, K.outputs), tuple(tried))}), made
+
+
+def _order_and_mu(P: GeneralizedPlant, K: StateSpace) -> tuple[int, float]:
+    """States of K, and the upper bound of mu of the design model with it."""
+    return K.nstates, mu_peak(P.closed(K), P.all_blocks, slack=SLACK).upper

@@ -19,7 +19,18 @@ from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
 from avis_ctrl.gap.probability import odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
-from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Tolerance, Verdict, Where
+from avis_ctrl.gap.result import (
+    Considered,
+    Detectable,
+    Gap,
+    NamedEffect,
+    Remainder,
+    Stage,
+    Tolerance,
+    Verdict,
+    Where,
+    missed,
+)
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
@@ -317,9 +328,8 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
     if verdict == "unexplained":
         return (f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
                 f"error on held-out records is {_percent(left.nrmse)}; {rest}.{also}")
-    count = "one effect" if len(told) == 1 else f"{len(told)} effects"
-    return (f"The model misses {count}: {'; '.join(one.in_words() for one in told)}. With this and all tolerances "
-            f"fitted, the gap falls from {_percent(before)} to {_percent(left.nrmse)}; {rest}.{also}")
+    return (f"{missed(told)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
+            f"{_percent(left.nrmse)}; {rest}.{also}")
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:

@@ -62,6 +62,12 @@ class NamedEffect:
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 
 
+def missed(told: Sequence[NamedEffect]) -> str:
+    """The sentence that names the missing effects."""
+    count = "one effect" if len(told) == 1 else f"{len(told)} effects"
+    return f"The model misses {count}: {'; '.join(one.in_words() for one in told)}."
+
+
 @dataclass(frozen=True)
 class Remainder:
     """What the updated model leaves of held-out records.

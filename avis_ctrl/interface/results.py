@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -31,10 +30,7 @@ from avis_ctrl.study.identification_files import RIG_FILE
 from avis_ctrl.study.identification_output import identified_toml, require_readable, write_identification
 from avis_ctrl.study.output import FILES, FOLDERS, write_study
 from avis_ctrl.study.verdict import all_axes, first_sentence
-from avis_ctrl.summary import html_table
-
-# Columns to which sentences of a summary are wrapped.
-WIDTH = 100
+from avis_ctrl.summary import html_table, wrapped
 
 
 class DesignStudy:
@@ -69,14 +65,14 @@ class DesignStudy:
 
     def summary(self) -> str:
         """The verdict in words, and one line for each requirement."""
-        lines = [fill(first_sentence(self.result), WIDTH)]
+        lines = [wrapped(first_sentence(self.result))]
         if self.result.stable:
-            lines.append(fill(all_axes(self.result), WIDTH))
+            lines.append(wrapped(all_axes(self.result)))
         rows = self._rows()
         widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
         lines += ["  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
                   for name, limit, value, met in rows]
-        return "\n".join([*lines, *(fill(note, WIDTH) for note in self.result.notes)])
+        return "\n".join([*lines, *map(wrapped, self.result.notes)])
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         rows = []
@@ -154,9 +150,9 @@ class IdentificationStudy:
         """The identified values, the verdict on held-out records, what the data do not determine."""
         verdict, *more = self.found.validation.sentences
         rest = (*self.found.campaign_fit.notes, *more, *self.found.identifiability.sentences)
-        return "\n".join([fill(f"{verdict[:1].upper()}{verdict[1:]}.", WIDTH),
+        return "\n".join([wrapped(f"{verdict[:1].upper()}{verdict[1:]}."),
                           *(f"  {name:20s} {value:>26s} {unit}" for name, value, unit in self._rows()),
-                          *(fill(sentence, WIDTH) for sentence in rest)])
+                          *map(wrapped, rest)])
 
     def plot_values(self, ax: Any = None) -> Any:
         """Identified over starting value of each parameter, with its standard deviation."""
@@ -240,7 +236,7 @@ class GapStudy:
     def summary(self) -> str:
         """The verdict and the sentences of the report."""
         first, *more = self.gap.sentences
-        return "\n".join(fill(sentence, WIDTH) for sentence in (f"{self.verdict}: {first}", *more))
+        return "\n".join(map(wrapped, (f"{self.verdict}: {first}", *more)))
 
     def _rows(self) -> list[tuple[str, str]]:
         rows = [(stage.name, f"{100 * stage.nrmse:.3g} %") for stage in self.gap.stages]

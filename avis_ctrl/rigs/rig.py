@@ -145,7 +145,7 @@ class Rig(ABC):
         return tuple(axes), np.array([direction @ point_map(place) for place, direction in axes.values()])
 
     def tilt_rows(self) -> np.ndarray:
-        """(n, 6) from q to the acceleration that gravity feigns to each sensor; zero for those against the chassis."""
+        """(n, 6) from q to the apparent acceleration by gravity of each sensor; zero for those against the chassis."""
         return np.array([one.inertial * tilt_row(one.direction) for one in self.sensors()])
 
     def with_parameters(self, changes: Mapping[str, float]) -> Self:

@@ -18,7 +18,8 @@ Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
 Positive = Annotated[float, Field(gt=0, le=LIMIT)]
 NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
 # No table is larger: far points leave no digits for the inertia beside m r^2.
-Length = Annotated[float, Field(ge=-100.0, le=100.0)]
+FARTHEST_M = 100.0
+Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 PositiveLength = Annotated[float, Field(gt=0, le=100.0)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Point = Annotated[list[Length], Field(min_length=3, max_length=3)]

@@ -34,7 +34,7 @@ def point_map(p: ArrayLike) -> np.ndarray:
 
 
 def tilt_row(direction: ArrayLike) -> np.ndarray:
-    """(6,) acceleration per unit of q that gravity feigns to a proof mass moving along a body-fixed unit direction d.
+    """(6,) apparent acceleration by gravity, per unit of q, along a body-fixed unit direction d.
 
     A turned body lays d over by phi x d: the mass feels d . (a + g e_z), in which g e_z . (phi x d) is new.
     """

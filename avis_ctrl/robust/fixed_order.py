@@ -117,7 +117,8 @@ class Task:
         """Largest gain of K over its limit."""
         if self.limit is None:
             return 0.0
-        return float(np.max(np.exp(_gain(K, self.limit.omega)[0]) / self.limit.most))
+        size = np.linalg.norm(K.frequency_response(self.limit.omega), 2, axis=(1, 2))
+        return float(np.max(size / self.limit.most))
 
     def descended(self, K: StateSpace, stages: Sequence[float]) -> Step:
         """The best controller after each of some stages of descent from K, K among them."""

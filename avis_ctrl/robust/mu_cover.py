@@ -155,7 +155,7 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
     gaps, state.gaps = state.gaps, []
     omega = np.array([_points(*gap) for gap in gaps])
     M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
-    shared = enough(M, structure, _accuracy(slack), 1.0)
+    shared = enough(M, structure, accuracy_of(slack), 1.0)
     open_gaps = []
     for k, gap in enumerate(gaps):
         if shared.beta[k] >= 1.0:
@@ -175,7 +175,7 @@ def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, 
     unit : N scaled so that the level is one.
     """
     middles = np.array([midpoint(*gap) for gap in open_gaps])
-    at_one = enough(unit.frequency_response(middles)[:, None], structure, _accuracy(slack), 1.0).beta
+    at_one = enough(unit.frequency_response(middles)[:, None], structure, accuracy_of(slack), 1.0).beta
     above = middles[at_one >= 1.0]
     needed = bound(N.frequency_response(above)[:, None]) if above.size else above
     narrow = [gap for gap in open_gaps if _is_narrow(gap)]
@@ -195,8 +195,8 @@ def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, 
         state.raised_at.append(float(middles[worst]))
 
 
-def _accuracy(slack: float) -> float:
-    """Of beta^2 that goes with a slack of beta."""
+def accuracy_of(slack: float) -> float:
+    """Accuracy of lambda = beta^2 that goes with a slack of beta."""
     return max(slack / 5, 1e-4)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -19,9 +20,9 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
-from avis_ctrl.robust.mu_cover import Cover, Interval, cover
-from avis_ctrl.robust.mu_gain import worst_gain
-from avis_ctrl.robust.mu_lmi import Array, Scalings
+from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, cover
+from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
+from avis_ctrl.robust.mu_lmi import Array
 from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, highest, skewed_upper_bound, upper_bound
@@ -30,8 +31,6 @@ from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
-# A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
-TINY = 1e-9
 KNOWN_SLACK = 5e-3
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
@@ -57,6 +56,25 @@ class MuPeak(Shown):
     frequencies: Array
     upper_curve: Array
     lower_curve: Array
+
+
+class Stability(Protocol):
+    """Bounds of mu of the blocks alone: a `MuPeak`, or what a caller keeps of one."""
+
+    @property
+    def upper(self) -> float: ...
+    @property
+    def lower(self) -> float: ...
+    @property
+    def omega(self) -> float: ...
+    @property
+    def guaranteed(self) -> bool: ...
+    @property
+    def delta(self) -> Array | None: ...
+
+
+# What a search finds at some frequencies: bounds with their proofs.
+Found = TypeVar("Found", UpperBound, WorstGain)
 
 
 def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
@@ -98,7 +116,7 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
 
 
 def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
-                    band: Interval = ALL_FREQUENCIES, slack: float = SLACK, robust: MuPeak | None = None,
+                    band: Interval = ALL_FREQUENCIES, slack: float = SLACK, robust: Stability | None = None,
                     points: int = 40) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
@@ -107,7 +125,7 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     N : stable system; the first sum(cols) outputs and sum(rows) inputs belong to the blocks, the rest are e and d.
     band : (low, high) in rad/s. The gain is that in the band; robust stability is asked at all frequencies.
     slack : as for mu_peak.
-    robust : `mu_peak` of the blocks' own channels at all frequencies, where it is known; computed otherwise.
+    robust : bounds of `mu_peak` for the blocks' own channels at all frequencies, if known; computed otherwise.
     points : frequencies of the two curves, beside those of the highest gains; fewer take less time.
 
     upper is inf where robust stability is not proved; lower is inf where `delta` (norm at most 1) destabilises.
@@ -124,13 +142,13 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
                          f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
     with one_thread():
         part = _prepared(system, structure)
-        known = replace(robust, delta=None) if robust is not None else None
-        found = _worst_case_gain(part.N, part.structure, _continuous_band(system, band), slack, system.dt, known,
-                                 points)
-        found = _in_rad_s(system, part, found)
-    if robust is not None and robust.lower >= 1.0:
-        return replace(found, omega=robust.omega, delta=robust.delta)
-    return found
+        inside = _continuous_band(system, band)
+        if robust is None or robust.lower < 1.0:
+            found = _worst_case_gain(part.N, part.structure, inside, slack, system.dt, robust, points)
+            return _in_rad_s(system, part, found)
+        found = _destabilised(part.N, part.structure, robust, first_frequencies(part.N, inside))
+        # Frequency and perturbation of `robust` are those of the whole system already.
+        return replace(_in_rad_s(system, part, replace(found, delta=None)), omega=robust.omega, delta=robust.delta)
 
 
 def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
@@ -180,20 +198,10 @@ class _Scan:
     slack: float
 
     @staticmethod
-    def of(N: StateSpace, band: Interval, bound: Callable[[Array], UpperBound], slack: float) -> _Scan:
-        seen: list[tuple[Array, UpperBound]] = []
-
-        def value(omega: Array) -> Array:
-            found = bound(N.frequency_response(omega)[:, None])
-            seen.append((omega, found))
-            return found.beta
-        first = first_frequencies(N, band)
-        refine_maxima(value, first, value(first), tolerance=_tolerance(slack))
-        omega = np.concatenate([w for w, _ in seen])
+    def of(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> _Scan:
+        omega, found = _searched(N, band, slack, lambda M: highest(M[:, None], structure, accuracy_of(slack)))
         order = np.argsort(omega)
-        scalings = Scalings(*(np.concatenate(s)[order] for s in zip(*(u.scalings for _, u in seen), strict=True)))
-        return _Scan(omega[order], UpperBound(np.concatenate([u.beta for _, u in seen])[order], scalings),
-                     slack)
+        return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
 
     @property
     def peak(self) -> Array:
@@ -202,19 +210,36 @@ class _Scan:
 
     @property
     def level(self) -> float:
-        return max(float(np.max(self.bound.beta)) * (1 + self.slack), TINY)
+        return _level(self.bound.beta, self.slack)
 
 
-def _tolerance(slack: float) -> float:
-    """Accuracy of lambda = beta^2 that goes with a slack of beta."""
-    return max(slack / 5, 1e-4)
+def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array], Found]) -> tuple[Array, list[Found]]:
+    """Frequencies (n,) in the order of a search for the highest values, and what look(M) found at them, part by part.
+
+    look : of responses M (m, n_out, n_in) what begins with the values (m,).
+    """
+    seen: list[tuple[Array, Found]] = []
+
+    def value(omega: Array) -> Array:
+        found = look(N.frequency_response(omega))
+        seen.append((omega, found))
+        return found[0]
+    first = first_frequencies(N, band)
+    refine_maxima(value, first, value(first), tolerance=accuracy_of(slack))
+    return np.concatenate([omega for omega, _ in seen]), [found for _, found in seen]
+
+
+def _level(bounds: Array, slack: float) -> float:
+    """The level to prove, above the highest bound found."""
+    # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
+    return max(float(np.max(bounds)) * (1 + slack), 1e-9)
 
 
 def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: float,
              known_upper: float | None = None, dt: float = 0.0) -> MuPeak:
     """mu_peak of a continuous system, or of the image of one sampled at dt."""
-    accuracy = _tolerance(slack)
-    scan = _Scan.of(N, band, lambda M: highest(M, structure, accuracy), slack)
+    accuracy = accuracy_of(slack)
+    scan = _Scan.of(N, structure, band, slack)
     # One stage draws the curve; the search goes on at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
@@ -243,8 +268,7 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
     """Largest verified lower bound: harder search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))
     M = N.frequency_response(omega[top])
-    scalings = Scalings(*(s[top] for s in found.scalings))
-    hard = lower_bound(M, structure, found.beta[top], scalings, enough=0.995, seed=1)
+    hard = lower_bound(M, structure, *found.at(top), enough=0.995, seed=1)
     values = np.maximum(hard.beta, lower.beta[top])
     deltas = np.where((hard.beta >= lower.beta[top])[:, None, None], hard.delta, lower.delta[top])
     k = int(np.argmax(values))
@@ -259,28 +283,25 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
 
 
 def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float,
-                     known: MuPeak | None, points: int) -> MuPeak:
+                     known: Stability | None, points: int) -> MuPeak:
     """worst_case_gain of a continuous system, or of the image of one sampled at dt."""
-    accuracy = _tolerance(slack)
+    accuracy = accuracy_of(slack)
     n_z, n_w = structure.n_z, structure.n_w
     n_e = N.noutputs - n_z
     whole = structure.with_performance(N.ninputs - n_w, n_e)
-    if known is not None and known.lower >= 1.0:
-        return _destabilised(N, structure, known, first_frequencies(N, band))
 
     def scaled(system: StateSpace, level: float) -> StateSpace:
         return system.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
 
     # Lower bounds are cheap and close: they say where the upper ones are worth computing.
-    reached = _Reached.of(N, structure, band, accuracy)
+    reached = _Reached.of(N, structure, band, slack)
     shown = reached.thinned(points)
     upper = skewed_upper_bound(N.frequency_response(shown.omega)[:, None], whole, accuracy).beta
     done = None
     proved = known is not None and known.guaranteed and known.upper < 1.0
     if np.all(np.isfinite(upper)) and (proved or _robustly_stable(N.select(range(n_z), range(n_w)), structure, band)):
-        level = max(float(np.max(upper)) * (1 + slack), TINY)
-        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, accuracy).beta, level, band,
-                     shown.omega[[int(np.argmax(upper))]], slack=slack)
+        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, accuracy).beta, _level(upper, slack),
+                     band, shown.omega[[int(np.argmax(upper))]], slack=slack)
     if done is not None and np.isfinite(done.level):
         k = int(np.argmax(reached.gain))
         return MuPeak(done.level, float(reached.gain[k]), float(reached.omega[k]), reached.delta[k], not done.gaps,
@@ -303,19 +324,11 @@ class _Reached:
     delta: Array
 
     @staticmethod
-    def of(N: StateSpace, structure: BlockStructure, band: Interval, accuracy: float) -> _Reached:
-        seen: list[_Reached] = []
-
-        def value(omega: Array) -> Array:
-            found = worst_gain(N.frequency_response(omega), structure)
-            seen.append(_Reached(omega, found.gain, found.delta))
-            return found.gain
-        first = first_frequencies(N, band)
-        refine_maxima(value, first, value(first), tolerance=accuracy)
-        omega = np.concatenate([one.omega for one in seen])
+    def of(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> _Reached:
+        omega, found = _searched(N, band, slack, lambda M: worst_gain(M, structure))
         order = np.argsort(omega)
-        return _Reached(omega[order], np.concatenate([one.gain for one in seen])[order],
-                        np.concatenate([one.delta for one in seen])[order])
+        gain, delta = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
+        return _Reached(omega[order], gain, delta)
 
     def thinned(self, most: int, highest: int = 4) -> _Reached:
         """At most so many frequencies, evenly chosen, and those of the highest gains."""
@@ -324,14 +337,14 @@ class _Reached:
         return _Reached(self.omega[kept], self.gain[kept], self.delta[kept])
 
 
-def _destabilised(N: StateSpace, structure: BlockStructure, robust: MuPeak, omega: Array) -> MuPeak:
+def _destabilised(N: StateSpace, structure: BlockStructure, robust: Stability, omega: Array) -> MuPeak:
     """The result where a perturbation of norm at most 1 makes the loop unstable: no gain is bounded."""
     gain, _ = _gain_of_stable(N.frequency_response(omega), structure, robust)
     return MuPeak(np.inf, np.inf, robust.omega, robust.delta, True,
                   "a perturbation of norm at most 1 makes the loop unstable", omega, np.full(omega.size, np.inf), gain)
 
 
-def _gain_of_stable(M: Array, structure: BlockStructure, robust: MuPeak) -> tuple[Array, Array]:
+def _gain_of_stable(M: Array, structure: BlockStructure, robust: Stability) -> tuple[Array, Array]:
     """Gains (n,) and perturbations (n, n_w, n_z) at each frequency, of those that provably keep the loop stable."""
     radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
     n_z = structure.n_z

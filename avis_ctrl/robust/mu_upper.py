@@ -27,6 +27,10 @@ class UpperBound(NamedTuple):
     beta: Array
     scalings: Scalings
 
+    def at(self, which: Array) -> UpperBound:
+        """Some of the batch, by number."""
+        return UpperBound(self.beta[which], Scalings(*(one[which] for one in self.scalings)))
+
     @staticmethod
     def joined(parts: Sequence[UpperBound]) -> UpperBound:
         """One batch of several."""

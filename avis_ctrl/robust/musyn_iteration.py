@@ -15,7 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,6 +79,11 @@ class Problem:
     structure: BlockStructure
     nmeas: int
     ncon: int
+
+    @cached_property
+    def scaled(self) -> ScaledProblem:
+        """For tests of the gamma that scalings allow."""
+        return ScaledProblem.of(self.P, self.nmeas, self.ncon)
 
 
 def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], options: Options) -> tuple[State, str]:
@@ -178,11 +183,11 @@ def _k_step(problem: Problem, state: State, proposals: Iterable[Proposal], optio
     The fit of scalings to the last loop does not tell what the next one will be; one test of gamma does.
     """
     best: tuple[Proposal, Synthesis] | None = None
-    scaled = ScaledProblem.of(problem.P, problem.nmeas, problem.ncon)
     hint = state.path.gamma if state.path else None
     for proposal in proposals:
         try:
-            if best and not scaled.reaches(proposal.scalings, (1 - SETTINGS.stall) * best[1].gamma_optimal_bounds[1]):
+            if best and not problem.scaled.reaches(proposal.scalings,
+                                                   (1 - SETTINGS.stall) * best[1].gamma_optimal_bounds[1]):
                 continue
             made = hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
                            gamma_hint=best[1].gamma if best else hint)
@@ -262,11 +267,11 @@ def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
 
 def _other_constants(problem: Problem, gamma: float, options: Options) -> Proposal | None:
     """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
-    best, scaled = None, ScaledProblem.of(problem.P, problem.nmeas, problem.ncon)
+    best = None
     for d in SETTINGS.constants:
         scalings = Scalings.uniform(problem.structure, d)
         try:
-            if not scaled.reaches(scalings, (1 - SETTINGS.stall) * gamma):
+            if not problem.scaled.reaches(scalings, (1 - SETTINGS.stall) * gamma):
                 continue
             made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
         except ComputationError:

@@ -130,7 +130,8 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tup
            quantities: tuple[str, ...]) -> StateSpace:
     """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f).
 
-    "NAME_motion" along each sensor; what gravity feigns, tilt q, is in acceleration and beside velocity ("NAME_tilt").
+    "NAME_motion" along each sensor; apparent acceleration by gravity, tilt q, is part of acceleration, and
+    "NAME_tilt" beside velocity.
     """
     n_u, zero, one = len(eom.actuators), np.zeros((N_Q, N_Q)), np.eye(N_Q)
     acceleration_x = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor]))

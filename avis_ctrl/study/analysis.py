@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,13 +26,22 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 # Bounds are proved to half a per cent (0.04 dB) above the highest value found: finer proofs only cost time.
 SLACK = 5e-3
-# Of the table without control where there are many blocks: nothing is decided by its bounds, and its narrow peaks take
-# many intervals.
-PASSIVE_SLACK = 2e-2
-# Where only the largest gain is wanted, not its curve.
-FEW_POINTS = 4
-# In a band of two or three octaves; a lower bound at a few points is one all the same.
-AXIS_POINTS = 24
+
+
+@dataclass(frozen=True)
+class AnalysisSettings:
+    """passive_slack : as `SLACK`, of the table without control if there are many blocks: no decision depends on its
+        bounds, and its narrow peaks need many intervals.
+    few_points : frequencies of the upper bound where only the largest gain is wanted, not its curve.
+    axis_points : frequencies of the lower bound of an axis, in a band of two or three octaves.
+    """
+
+    passive_slack: float = 2e-2
+    few_points: int = 4
+    axis_points: int = 24
+
+
+SETTINGS = AnalysisSettings()
 PLOT_HZ = np.geomspace(0.1, 200.0, 300)
 # The level that a Gaussian signal of this bandwidth passes once in ten minutes: sqrt(2 ln(f T)), Rice 1944.
 PEAK_SECONDS, PEAK_BANDWIDTH_HZ = 600.0, 10.0
@@ -64,7 +74,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     low, high = design.transmissibility.band_Hz
     nominal = performance.select(slice(n_z, None), slice(n_w, None))
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
-    slack = PASSIVE_SLACK if K is None and blocks.many else SLACK
+    slack = SETTINGS.passive_slack if K is None and blocks.many else SLACK
     robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=slack)
     worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
     worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high),
@@ -80,20 +90,21 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         _by_slicot(nominal))
 
 
-def worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, proved: bool) -> np.ndarray:
+def worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, stability: Bound | None = None
+                  ) -> np.ndarray:
     """(n_axes,) bounds of each axis' worst-case velocity in the band, for a floor of unit velocity in any direction.
 
-    proved : upper bounds over the whole set and between frequencies; else lower ones, each reached by a plant.
+    stability : robust stability of the loop with K; with it the bounds are upper ones, over the whole set and between
+        frequencies; without it they are lower ones, each reached by a plant.
     """
     part = plant.full.restricted([*plant.floor_velocities], [*plant.velocities])
     motion, blocks = part.closed(K), plant.synthesis.blocks
     band = design.transmissibility.band_Hz[0] * 2 * np.pi, design.transmissibility.band_Hz[1] * 2 * np.pi
     rows = [[*range(blocks.n_z), blocks.n_z + k] for k in range(len(plant.axes))]
-    if proved:
-        robust = mu_peak(motion.select(slice(blocks.n_z), slice(blocks.n_w)), blocks, slack=SLACK)
-        return np.array([worst_case_gain(motion.select(row, None), blocks, band=band, slack=SLACK, robust=robust,
-                                         points=FEW_POINTS).upper for row in rows])
-    M = motion.frequency_response(np.geomspace(*band, AXIS_POINTS))
+    if stability is not None:
+        return np.array([worst_case_gain(motion.select(row, None), blocks, band=band, slack=SLACK, robust=stability,
+                                         points=SETTINGS.few_points).upper for row in rows])
+    M = motion.frequency_response(np.geomspace(*band, SETTINGS.axis_points))
     return np.array([np.max(worst_gain(M[:, row], blocks).gain) for row in rows])
 
 

@@ -241,6 +241,10 @@ class Design(Section):
         """A key that is written would replace the rig file's."""
         return electronics.model_dump(exclude_unset=True)
 
+    def upper_limits(self, quantity: Quantity) -> list[float]:
+        """What the requirements on a quantity allow it at most."""
+        return [one.at_most for one in self.requirement if one.quantity == quantity and one.at_most is not None]
+
     def equipped(self, rig: Rig) -> Rig:
         """The rig with what the design file says of its electronics."""
         given = {name: getattr(self.electronics, name) for name in self.electronics.model_fields_set}

@@ -49,6 +49,5 @@ def tuned_loops(plant: DesignPlant, rig: Rig, design: Design, K: StateSpace, set
     except ComputationError:  # the axes of K need one another
         *_, found = fixed_order(task, skyhook, order)
     K = found.K.renamed(K.inputs, K.outputs)
-    moved = [np.count_nonzero(np.any(K.C[[k]], axis=0)) for k in range(K.noutputs)]
-    states = ", ".join(f"{axis} {n}" for axis, n in zip(plant.axes, moved, strict=True))
+    states = ", ".join(f"{axis} {np.count_nonzero(row)}" for axis, row in zip(plant.axes, K.C, strict=True))
     return Candidate("loops", LOOPS_TITLE, "skyhook", K, (f"states of each axis's loop: {states}",))

@@ -15,11 +15,9 @@ from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
+from avis_ctrl.rigs.rig_sections import FARTHEST_M
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.identification_design import default_design, design_toml
-
-# Positions of a rig file are at most 100 m from the centre; a longer payload is one in millimetres.
-LONGEST_SIDE_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,8 @@ def rig_text(new: NewRig) -> str:
     for field in ("mass_kg", "vertical_Hz", "horizontal_Hz", "damping", "constant_N_per_V", "limit_V",
                   "sample_rate_Hz"):
         require_positive(getattr(new, field), field)
-    if len(new.size_m) != 3 or not all(0 < side <= LONGEST_SIDE_M for side in new.size_m):
-        raise InputError(f"expected three positive lengths in metres, at most {LONGEST_SIDE_M:g}", field="size_m",
+    if len(new.size_m) != 3 or not all(0 < side <= FARTHEST_M for side in new.size_m):
+        raise InputError(f"expected three positive lengths in metres, at most {FARTHEST_M:g}", field="size_m",
                          value=new.size_m)
     if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):
         raise InputError("expected a name without quotes", field="name", value=new.name)

@@ -148,7 +148,7 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     if wiring is not None:
         decoding = np.zeros_like(decoding)
         decoding[:, [decoder.sensors.index(name) for name in wiring.sensors]] = wiring.decoding
-    # Motion that each sensor measures per unit of the kept axes, rotations at the edge, and what gravity feigns.
+    # Motion that each sensor measures per unit of the kept axes, rotations at the edge, and apparent acceleration.
     kept = [COORDINATES.index(name) for name in design.keep]
     rows, tilt = decoder.matrix[:, kept] / lever, rig.tilt_rows()[:, kept] / lever * gravity
 
@@ -318,7 +318,8 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
                  uncertain: bool) -> list[_Noise]:
     """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
 
-    rows : (n_s, n_axes) each, from the axes' motion to that along each sensor, and to what gravity feigns there.
+    rows : (n_s, n_axes) each, from the axes' motion to that along each sensor, and to its apparent
+        acceleration by gravity.
 
     One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
     """
@@ -364,7 +365,7 @@ def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.nd
         diagram.means(read, "motion decoded for this axis, before the sensor chain", "m/s" if of == "dot" else "m")
     system = chain.renamed([read], [made])
     if felt := [a for a in range(len(axes)) if abs(tilt[a]) > 1e-9 * GRAVITY]:
-        # Of the acceleration that a tilt feigns, the chain sees the velocity: the tilt's rate twice integrated.
+        # The chain measures velocity: the rate of the apparent acceleration, integrated twice.
         diagram.add(f"gravity in {label}", gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"]),
                     "sum")
         diagram.means(f"{made}_tilt", "rate of what gravity adds to the measured acceleration", "m/s^3")

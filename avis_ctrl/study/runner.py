@@ -8,7 +8,7 @@ from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,6 +25,7 @@ from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passi
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import (
     AxisGain,
+    Bound,
     Candidate,
     ControllerResult,
     DesignResult,
@@ -108,10 +109,12 @@ def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Pr
 
 @dataclass(frozen=True)
 class Early:
-    """Bounds under way by the controllers' names, and the peak that the tuned skyhook among them may have at worst."""
+    """The pool, bounds under way in it by the controllers' names, and the peak that the tuned skyhook among them may
+    have at worst."""
 
+    workers: Workers
     bounds: Mapping[str, Future]
-    peak_limit: float | None = None
+    peak_limit: float | None
 
 
 def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers) -> Early:
@@ -120,8 +123,8 @@ def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candida
     limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
     jobs = {}
     if limit is not None:
-        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, limit, samples)
-    return Early(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
+        jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples)
+    return Early(workers, jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
 
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate],
@@ -169,7 +172,7 @@ ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
 
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None,
-            early: Early = Early({})) -> Compared:
+            early: Early | None = None) -> Compared:
     """Bounds of every controller, one loop an axis tuned on mu and a skyhook tuned to the worst-case peak of mu where
     the design compares with them, and the simulation of mu.
 
@@ -183,12 +186,13 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     ComputationError : the mu controller itself, or the table without control, could not be analysed.
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
-    with Workers() as workers:
-        jobs = {early.bounds.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name
+    begun = early.bounds if early is not None else {}
+    with Workers() if early is None else nullcontext(early.workers) as workers:
+        jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name
                 for c in candidates}
         if "loops" in design.compare_with:
             made = next(c.K for c in candidates if c.name == "mu")
-            jobs[workers.submit(_own_loops, design, plant, rig, made, samples)] = "loops"
+            jobs[workers.submit(_tuned, design, plant, rig, "loops", made, samples)] = "loops"
         progress("bounds of every controller over the whole uncertainty set, closed loop of the nonlinear rig")
         found: dict[str, ControllerResult | FailedController] = {}
 
@@ -204,12 +208,12 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
-        by_axis = workers.submit(_worst_by_axis, design, plant, mu.K, True)
+        by_axis = workers.submit(_worst_by_axis, design, plant, mu.K, mu.stability)
         jobs = {}
         if "skyhook" in design.compare_with:
             limit = skyhook_limit(design, mu)
-            jobs = {early.bounds["skyhook"] if limit == early.peak_limit else
-                    workers.submit(_tuned, design, plant, rig, limit, samples): "skyhook"}
+            jobs = {begun["skyhook"] if early is not None and limit == early.peak_limit else
+                    workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples): "skyhook"}
         gather()
         loop = simulation.result()
         proved = by_axis.result()
@@ -217,11 +221,11 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         found["mu"] = mu
         if isinstance(skyhook := found.get("skyhook"), ControllerResult) and best_of(mu, [skyhook]) is not mu:
             found["mu"] = mu = best_of(mu, [skyhook])
-            loop, proved = simulate_study(design, rig, plant, mu), _worst_by_axis(design, plant, mu.K, True)
+            loop, proved = simulate_study(design, rig, plant, mu), _worst_by_axis(design, plant, mu.K, mu.stability)
         rival = np.full(len(plant.axes), np.nan)
         if isinstance(skyhook, ControllerResult):
             stable = np.isfinite(skyhook.worst_peak.upper)
-            rival = _worst_by_axis(design, plant, skyhook.K, False) if stable else np.full(len(plant.axes), np.inf)
+            rival = _worst_by_axis(design, plant, skyhook.K) if stable else np.full(len(plant.axes), np.inf)
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
@@ -233,9 +237,10 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
                           zip(plant.axes, proved, rival, strict=True)))
 
 
-def _worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, proved: bool) -> np.ndarray:
+def _worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, stability: Bound | None = None
+                   ) -> np.ndarray:
     with threadpool_limits(1):
-        return worst_by_axis(design, plant, K, proved)
+        return worst_by_axis(design, plant, K, stability)
 
 
 def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray
@@ -247,23 +252,15 @@ def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndar
             return FailedController(c.name, c.title, c.kind, str(error))
 
 
-def _tuned(design: Design, plant: DesignPlant, rig: Rig, peak_limit: float, samples: np.ndarray
-           ) -> ControllerResult | FailedController:
+def _tuned(design: Design, plant: DesignPlant, rig: Rig, name: Literal["skyhook", "loops"], given: Any,
+           samples: np.ndarray) -> ControllerResult | FailedController:
+    """given : the peak that the skyhook may have, or the controller that the loops start from."""
+    make, title = (tuned_skyhook, "skyhook, tuned") if name == "skyhook" else (tuned_loops, LOOPS_TITLE)
     with threadpool_limits(1):
         try:
-            candidate = tuned_skyhook(plant, rig, design, peak_limit)
+            candidate = make(plant, rig, design, given)
         except ComputationError as error:
-            return FailedController("skyhook", "skyhook, tuned", "skyhook", str(error))
-        return _measured(design, plant, candidate, samples)
-
-
-def _own_loops(design: Design, plant: DesignPlant, rig: Rig, K: StateSpace, samples: np.ndarray
-               ) -> ControllerResult | FailedController:
-    with threadpool_limits(1):
-        try:
-            candidate = tuned_loops(plant, rig, design, K)
-        except ComputationError as error:
-            return FailedController("loops", LOOPS_TITLE, "skyhook", str(error))
+            return FailedController(name, title, "skyhook", str(error))
         return _measured(design, plant, candidate, samples)
 
 
@@ -274,8 +271,7 @@ def skyhook_limit(design: Design, mu: ControllerResult) -> float:
 
 
 def _asked_peaks(design: Design) -> list[float]:
-    return [10 ** (one.at_most / 20) for one in design.requirement
-            if one.quantity == "worst_case_peak_transmissibility_dB" and one.at_most is not None]
+    return [10 ** (limit / 20) for limit in design.upper_limits("worst_case_peak_transmissibility_dB")]
 
 
 def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:

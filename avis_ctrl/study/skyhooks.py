@@ -17,7 +17,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
-from avis_ctrl.study.analysis import FEW_POINTS, SLACK
+from avis_ctrl.study.analysis import SETTINGS, SLACK
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.plant import DesignPlant
@@ -180,12 +180,12 @@ class _Contest:
         closed = motion.closed(loops.controller())
         if not closed.is_stable():
             return Merit(np.inf, np.inf, self.peak_limit, 1.0), None
-        worst = worst_case_gain(closed, motion.blocks, slack=SLACK, points=FEW_POINTS)
+        worst = worst_case_gain(closed, motion.blocks, slack=SLACK, points=SETTINGS.few_points)
         if worst.upper > self.peak_limit:
             return Merit(worst.upper, np.inf, self.peak_limit), worst
         low, high = self.band_Hz
         band = worst_case_gain(closed, motion.blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK,
-                               points=FEW_POINTS)
+                               points=SETTINGS.few_points)
         return Merit(worst.upper, band.upper, self.peak_limit), worst
 
 

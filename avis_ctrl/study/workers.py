@@ -57,14 +57,13 @@ class Workers:
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         most = 1 if _alone else MOST
         self._count = min(most, available) if count is None else count
-        self._beside = beside
+        self._on_interrupt = signal.SIG_IGN if beside else signal.SIG_DFL
 
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-        on_interrupt = signal.SIG_IGN if self._beside else signal.SIG_DFL
         self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), as_worker,
-                                          (os.getpid(), on_interrupt)) if self._count > 1 else None)
+                                          (os.getpid(), self._on_interrupt)) if self._count > 1 else None)
         self._others = set(multiprocessing.active_children())
         return self
 

@@ -28,7 +28,7 @@ from avis_ctrl.gap.axis.search import (
 )
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.result import NamedEffect
+from avis_ctrl.gap.result import NamedEffect, missed
 from avis_ctrl.gap.validation import Half, halves
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.measurement.gates.finding import Picture, Series
@@ -335,9 +335,8 @@ def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], trac
         said = [f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
                 "library explains it."]
     else:
-        count = "one effect" if len(told) == 1 else f"{len(told)} effects"
-        said = [f"The model misses {count}: {'; '.join(one.in_words() for one in told)}. With this the gap on held-out "
-                f"data falls from {first} to {last}.{' A part is not explained.' * (verdict != 'explained')}"]
+        said = [f"{missed(told)} With this the gap on held-out data falls from {first} to {last}."
+                f"{' A part is not explained.' * (verdict != 'explained')}"]
     if traces:
         said.append("Traces, below 1 % of the gap: " + "; ".join(
             f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})"
