@@ -148,14 +148,15 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Each = one_by_one,
-           enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
+           enough: Callable[[Step], bool] = lambda step: False, known: Sequence[Step] = ()) -> list[Step]:
     """Effects in the order in which they are found; last of all the values of the rig file that are beyond their
     tolerance, which show in how far one of them had to move, and hardly in what remains.
 
-    enough : whether the search may end with a step, because what it found takes next to nothing.
+    enough : whether the search may end with a step, because what it found takes next to nothing. known : steps that it
+    continues.
     The last step has the fit with everything that was found.
     """
-    steps: list[Step] = []
+    steps = list(known)
 
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
         while len(steps) < settings.longest:
