@@ -265,7 +265,7 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
         if not before:
             break
         known = next((step.fitted for step in fits.steps if set(step.fitted.labels) == before), None)
-        one = known or without_effect(one, label, data, settings)
+        one = known or without_effect(one, label, data, settings.quick)
     return found[::-1]
 
 

@@ -219,7 +219,6 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     rest = without_effect(best, step.label, data, settings)
     if rest is None:
         return step
-    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     begun = without_path_errors(rest, data, settings)
     known = {name_of(label) for label in best.labels}
     tried, mine = {step.label: best.bare()}, step.tried[step.label].log_evidence
@@ -227,7 +226,7 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     for label, fitted in step.tried.items():
         if name_of(label) in known or mine - fitted.log_evidence > later:
             continue
-        one = with_effect(begun, fitted.model.effects[-1], data, quick)
+        one = with_effect(begun, fitted.model.effects[-1], data, settings.quick)
         if one is not None:
             tried[label] = one.bare()
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
@@ -271,8 +270,7 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     physics forbids, or to one within its tolerance."""
     if not chosen:
         return {}
-    profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
-                                                            iterations=settings.quick_iterations)
+    profile = Profile(now, data, settings)
 
     def fitted(one: ActiveEffect, iterations: int) -> _Begun | None:
         try:
@@ -294,7 +292,7 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
         return one, fitted(starts[0], settings.rough_iterations) if starts else None
 
     def ended(one: ActiveEffect) -> Fitted | None:
-        return _small(with_effect(now, one, data, quick))
+        return _small(with_effect(now, one, data, settings.quick))
     made = each(begun, chosen)
     most = max((end.gain for _, end in made if end is not None), default=0.0)
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
