@@ -191,7 +191,7 @@ def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -
     On the rig as its file has it; RANGE_SHARE of the converter's range is for the answer to the drives. Where there is
     no converter, ASSUMED_RANGE_V stands for its range.
     """
-    most = signals.scaled_to_limit()
+    most = signals.scaled_to()
     level, range_V = float(np.mean(most.rms_V)), ASSUMED_RANGE_V
     if loop.sensors.converter is not None:
         range_V = loop.sensors.converter.limits_V[1]

@@ -405,7 +405,7 @@ RESPONSES_REFUSED = {
     "coherence 0": (put("coherence", np.zeros((5, 2, 1))), "0 for some entry at every line"),
     "shape": (put("value", np.zeros((5, 1, 2), complex)), r"value = \(5, 1, 2\): expected shape \(5, 2, 1\)"),
     "nan": (put("value", np.full((5, 2, 1), np.nan)), "expected finite numbers; 10 are not, the first at line 0"),
-    "text": (put("value", "abc"), "/frf/value: expected numbers, found objects"),
+    "text": (put("value", "abc"), "/frf: value: expected numbers, found objects"),
     "order": (put("frequency_Hz", [1.0, 2.0, 2.0, 3.0, 4.0]), "expected increasing frequencies"),
     "no inputs": (group_edit(lambda g: g.attrs.pop("inputs")), "/frf: inputs: missing"),
     "unit": (group_edit(lambda g: g.attrs.update(output_unit="K")), "/frf: output_unit = 'K': expected a unit of"),

@@ -14,23 +14,23 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordHeader, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
     as_text,
     existing_file,
-    header_from,
     kind_of,
     printable,
     reading,
     require,
-    units_of,
+    stated_period,
+    within,
 )
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
+from avis_ctrl.measurement.formats.records import Hints, Part, record_from
 from avis_ctrl.measurement.formats.stored import (
     Columns,
-    StoredRecord,
     access,
     attributes,
     full_name,
@@ -42,6 +42,9 @@ from avis_ctrl.measurement.formats.stored import (
 
 FORMAT, VERSION = "avis-campaign", 1
 ROLES = ("u", "y", "floor")
+# What each record states.
+STATED = {"sample_rate_Hz": "the sample rate in Hz", "excitation": f"one of {', '.join(EXCITATIONS)}",
+          "level_V": "the r.m.s. of the driven voltages", "start_s": "the time of the first sample in s"}
 CHUNK = 1 << 14  # samples of a record that lie together on disk
 
 
@@ -62,10 +65,13 @@ def read(path: str | Path, rig: str | None = None) -> Campaign:
             raise InputError(f"missing; the file holds {listed(file)}", field="/records")
         if not isinstance(group, h5py.Group):
             raise InputError("expected a group, found a data set", field="/records")
-        records = tuple(_record(group, name, str(path)) for name in _in_order(group))
+        records = []
+        for name in _in_order(group):
+            with within(f"record {printable(name)}"):
+                records.append(_record(group, name, str(path)))
         if not records:
             raise InputError("expected at least one record; the group is empty", field="/records")
-        return Campaign(rig or stated, records, str(path))
+        return Campaign(rig or stated, tuple(records), str(path))
 
 
 def listed(group: h5py.Group) -> str:
@@ -76,13 +82,19 @@ def listed(group: h5py.Group) -> str:
 def check_root(file: h5py.File) -> str:
     """Name of the rig, after format and version were checked."""
     found = attributes(file, "format", "version", "rig")
-    stated = as_text(require(found, "format", "attributes of the file", f"{FORMAT!r}"), "attribute format")
-    if stated != FORMAT:
-        raise InputError(f"expected {FORMAT!r}", field="attribute format", value=stated)
-    version = as_number(require(found, "version", "attributes of the file", f"{VERSION}"), "attribute version")
-    if version != VERSION:
-        raise InputError(f"this release reads version {VERSION}", field="attribute version", value=version)
-    return as_text(require(found, "rig", "attributes of the file", "the name of the rig"), "attribute rig")
+    with within("attributes of the file"):
+        require(found, "format", f"{FORMAT!r}")
+        require(found, "version", f"{VERSION}")
+        check_version(found["format"], found["version"])
+        return as_text(require(found, "rig", "the name of the rig"), "rig")
+
+
+def check_version(stated: Any, version: Any) -> None:
+    """Refuse another format than that of a campaign, and another version."""
+    if (name := as_text(stated, "format")) != FORMAT:
+        raise InputError(f"expected {FORMAT!r}", field="format", value=name)
+    if (number := as_number(version, "version")) != VERSION:
+        raise InputError(f"this release reads version {VERSION}", field="version", value=number)
 
 
 def _in_order(group: h5py.Group) -> list[str]:
@@ -95,53 +107,45 @@ def _in_order(group: h5py.Group) -> list[str]:
                                            for part in re.split(r"(\d+)", name)])
 
 
-def _record(group: h5py.Group, name: str, path: str) -> StoredRecord:
-    where, record = f"record {printable(name)}", member(group, name)
+def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
+    record = member(group, name)
     if not isinstance(record, h5py.Group):
-        raise InputError("expected a group with u and y, found a data set", field=where)
-    channels: dict[str, tuple[str, ...]] = {}
-    units: dict[str, str] = {}
-    columns: dict[str, tuple[Columns, ...]] = {}
-    samples = {}
+        raise InputError("expected a group with u and y, found a data set")
+    parts = {}
     for role in ROLES:
         dataset = member(record, role)
-        if dataset is None:
-            if role == "floor":
-                continue
-            raise InputError(f"missing; the record holds {listed(record)}", field=f"{where}: {role}")
-        samples[role], count = _shape(dataset, f"{where}: {role}")
-        stated = attributes(dataset, "names", "unit")
-        channels[role] = as_names(require(stated, "names", f"{where}: {role}", "the channels' names"),
-                                  f"{where}: {role} names", count)
-        units[role], factors = units_of(require(stated, "unit", f"{where}: {role}", "such as 'V'"), role, where,
-                                        count)
-        columns[role] = (Columns(full_name(dataset), factors),)
-    require_one_length(samples, where)
-    stated = attributes(record, "sample_rate_Hz", "excitation", "level_V", "start_s", "period_s")
-    return StoredRecord(header_from(stated, name, samples["u"], channels, units), path, columns)
+        if dataset is not None:
+            parts[role] = _part(dataset, role)
+        elif role != "floor":
+            raise InputError(f"missing; the record holds {listed(record)}", field=role)
+    if "floor" in parts and tuple(parts["floor"].names) != FLOOR_NAMES:
+        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names",
+                         value=parts["floor"].names)
+    found = attributes(record, *STATED, "period_s")
+    given = {field: require(found, field, expected) for field, expected in STATED.items()}
+    rate, level, start = (as_number(given[field], field) for field in ("sample_rate_Hz", "level_V", "start_s"))
+    hints = Hints(excitation=as_text(given["excitation"], "excitation"), level_V=level,
+                  period_s=stated_period(found.get("period_s"), "period_s"))
+    return record_from(name, parts, rate, start, hints, path)[0]
 
 
-def require_one_length(samples: dict[str, int], where: str) -> None:
-    """All parts of a record are equally long."""
-    if len(set(samples.values())) > 1:
-        lengths = ", ".join(f"{role} has {count}" for role, count in samples.items())
-        raise InputError(f"expected equally many samples; {lengths}", field=where)
-
-
-def _shape(dataset: Any, field: str) -> tuple[int, int]:
-    """(samples, channels) of a data set of real numbers."""
+def _part(dataset: Any, role: str) -> Part:
+    """What a data set of (samples, channels) says of its channels; the samples stay where they are."""
     if not isinstance(dataset, h5py.Dataset):
-        raise InputError("expected a data set, found a group", field=field)
+        raise InputError("expected a data set, found a group", field=role)
     shape, dtype = layout(dataset)
     if dtype.kind not in "fiu":
-        raise InputError("expected real numbers", field=field, value=f"data set of {kind_of(dtype)}")
+        raise InputError("expected real numbers", field=role, value=f"data set of {kind_of(dtype)}")
     if shape is None or len(shape) not in (1, 2):
-        raise InputError("expected shape (samples, channels)", field=field, value=shape)
+        raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
         raise InputError(f"expected shape (samples, channels); {samples} samples of {count} channels look transposed",
-                         field=field, value=shape)
-    return samples, count
+                         field=role, value=shape)
+    stated = attributes(dataset, "names", "unit")
+    with within(role):
+        names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
+    return Part(as_names(names, f"{role} names", count), unit, Columns(full_name(dataset), samples))
 
 
 def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20) -> None:

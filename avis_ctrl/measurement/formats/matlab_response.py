@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.formats.common import INPUT_UNITS, OUTPUT_UNITS, as_names, as_number, as_text, unit_of
-from avis_ctrl.measurement.formats.flat import Hints
+from avis_ctrl.measurement.formats.common import as_names
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe
-from avis_ctrl.measurement.formats.response import response_from
+from avis_ctrl.measurement.formats.records import Hints
+from avis_ctrl.measurement.formats.response import stated_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 
@@ -24,24 +24,17 @@ def response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
     ------
     InputError : a variable that is missing, of another kind or shape, or whose dimensions cannot be told apart.
     """
-    frequency = _array(tree, "frequency_Hz").reshape(-1)
-    H = _array(tree, "H")
-    sizes = (len(frequency), *_sizes(tree, H, len(frequency)))
-    names = {field: as_names(tree[field], field, count) if field in tree else
-             tuple(f"{letter}{i + 1}" for i in range(count))
-             for field, letter, count in (("outputs", "y", sizes[1]), ("inputs", "u", sizes[2]))}
-    output_unit = unit_of(hints.y_unit or as_text(tree.get("output_unit", "V"), "output_unit"), "output_unit",
-                          OUTPUT_UNITS)
-    input_unit = unit_of(hints.u_unit or as_text(tree.get("input_unit", "V"), "input_unit"), "input_unit", INPUT_UNITS)
-    factor = output_unit.factor / input_unit.factor
-    variance = lines_first(_array(tree, "variance"), sizes, "variance") * factor ** 2 if "variance" in tree else None
-    coherence = lines_first(_array(tree, "coherence"), sizes, "coherence") if "coherence" in tree else None
-    averages = hints.averages
-    if averages is None and "averages" in tree:
-        averages = as_number(_array(tree, "averages"), "averages")
-    return response_from(frequency, lines_first(H, sizes, "H") * factor, names["inputs"], names["outputs"],
-                         variance=variance, coherence=coherence, averages=averages, input_unit=input_unit.si,
-                         output_unit=output_unit.si, relative_standard_deviation=hints.relative_standard_deviation)
+    frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
+    n_y, n_u = _sizes(tree, H, len(frequency))
+    fields = {"input_unit": "V", "output_unit": "V", "outputs": [f"y{i + 1}" for i in range(n_y)],
+              "inputs": [f"u{i + 1}" for i in range(n_u)]}
+    fields |= {field: tree[field] for field in fields if field in tree}
+    for field, count in (("outputs", n_y), ("inputs", n_u)):
+        as_names(fields[field], field, count)
+    shaped = {field: lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
+              for field in ("H", "variance", "coherence") if field in tree}
+    averages = {"averages": _array(tree, "averages")} if "averages" in tree else {}
+    return stated_response({"frequency_Hz": frequency, "value": shaped.pop("H"), **fields, **shaped, **averages}, hints)
 
 
 def _array(tree: Mapping[str, Any], name: str) -> np.ndarray:

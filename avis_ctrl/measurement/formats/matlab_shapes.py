@@ -11,8 +11,8 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats.common import as_names, as_number, as_text, numbers, stated_period
-from avis_ctrl.measurement.formats.flat import Hints
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
+from avis_ctrl.measurement.formats.records import Hints
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
 MUCH_LONGER = 10  # a record has at least that many times more samples than channels, where names do not say
@@ -48,7 +48,7 @@ def matrix(value: Any, field: str) -> Matrix:
     return value
 
 
-def sample_count(matrices: Mapping[str, Sequence[Matrix]], where: str, channels: Mapping[str, int],
+def sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[str, int],
                  known: int | None = None) -> int:
     """Number of samples that all matrices share, whichever way round they are.
 
@@ -69,16 +69,16 @@ def sample_count(matrices: Mapping[str, Sequence[Matrix]], where: str, channels:
                 lengths = {length for length, others in ((rows, columns), (columns, rows)) if others == channels[role]}
                 if not lengths:
                     raise InputError(f"expected {channels[role]} channels, as there are names; it is {rows}x{columns}",
-                                     field=f"{where}: {role}")
+                                     field=role)
             possible = lengths if possible is None else possible & lengths
     if not possible:
         also = "" if known is None else f", t has {known}"
-        raise InputError(f"expected equally many samples; {shown}{also}", field=where)
+        raise InputError(f"expected equally many samples; {shown}{also}")
     samples = max(possible)
     square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
     if square or (len(possible) > 1 and samples < MUCH_LONGER * min(possible)):
         raise InputError(f"rows and columns could both be the samples: {shown}; expected names of the channels or a "
-                         "time vector that distinguishes them", field=where)
+                         "time vector that distinguishes them")
     return samples
 
 
@@ -109,12 +109,6 @@ def stated_names(value: Sequence[str], tree: Mapping[str, Any], field: str, coun
         raise InputError("no variable of that name, and too few for names of the channels themselves (A+B+...); the "
                          f"file has {overview(tree)}", field=field, value=value[0])
     return as_names(list(value), field, count)
-
-
-def unit_label(tree: Mapping[str, Any], role: str) -> str | None:
-    """What the file says of a role's unit, None where it says nothing."""
-    label = tree.get(f"{role}_unit")
-    return None if empty(label) else as_text(label, f"{role}_unit")
 
 
 def clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],

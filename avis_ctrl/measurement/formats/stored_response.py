@@ -8,7 +8,6 @@ outputs, input_unit, output_unit; optional method, dof, and data sets measuremen
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,27 +15,19 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.formats.common import (
-    INPUT_UNITS,
-    OUTPUT_UNITS,
-    as_names,
-    as_number,
-    as_text,
-    existing_file,
-    kind_of,
-    reading,
-    require,
-    require_small,
-    unit_of,
-)
+from avis_ctrl.measurement.formats.common import existing_file, kind_of, reading, require, require_small, within
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_root, listed
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
-from avis_ctrl.measurement.formats.response import response_from
+from avis_ctrl.measurement.formats.records import Hints
+from avis_ctrl.measurement.formats.response import COVARIANCES, stated_response
 from avis_ctrl.measurement.formats.stored import attributes, layout, member, open_hdf5, values
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
-ATTRIBUTES = ("inputs", "outputs", "input_unit", "output_unit", "method", "dof", "averages")
-COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
+# Attributes that have to be there, and data sets with the kinds of numbers that they hold.
+NAMED = {"inputs": "the channels' names", "outputs": "the channels' names", "input_unit": "such as 'V'",
+         "output_unit": "such as 'V'"}
+DATASETS = {"frequency_Hz": "fiu", "value": "fiuc", "coherence": "fiu", "variance": "fiu",
+            **dict.fromkeys(COVARIANCES, "fiuc")}
 
 
 def write_frequency_response(path: str | Path, response: FrequencyResponse, rig: str = "unnamed") -> None:
@@ -62,11 +53,10 @@ def write_frequency_response(path: str | Path, response: FrequencyResponse, rig:
             group.attrs[field] = getattr(response, field)
 
 
-def read_frequency_response(path: str | Path, averages: float | None = None,
-                            relative_standard_deviation: float | None = None) -> FrequencyResponse:
+def read_frequency_response(path: str | Path, hints: Hints | None = None) -> FrequencyResponse:
     """The frequency response of an HDF5 campaign.
 
-    averages, relative_standard_deviation : used where the file does not state them, see `response_from`.
+    hints : averages, relative_standard_deviation, see `response_from`.
 
     Raises
     ------
@@ -78,40 +68,14 @@ def read_frequency_response(path: str | Path, averages: float | None = None,
         group = member(file, "frf")
         if not isinstance(group, h5py.Group):
             raise InputError(f"missing; the file holds {listed(file)}", field="/frf")
-        return _response(path, group, averages, relative_standard_deviation)
-
-
-def _response(path: Path, group: h5py.Group, averages: float | None, relative: float | None) -> FrequencyResponse:
-    frequency, value = _numbers(path, group, "frequency_Hz", "fiu"), _numbers(path, group, "value", "fiuc")
-    if frequency is None or value is None:
-        raise InputError(f"expected frequency_Hz and value; the group holds {listed(group)}", field="/frf")
-    stated = attributes(group, *ATTRIBUTES)
-    names = {field: as_names(require(stated, field, "/frf", "the channels' names"), f"/frf: {field}")
-             for field in ("inputs", "outputs")}
-    units = {field: unit_of(as_text(require(stated, field, "/frf", "such as 'V'"), f"/frf: {field}"),
-                            f"/frf: {field}", allowed)
-             for field, allowed in (("input_unit", INPUT_UNITS), ("output_unit", OUTPUT_UNITS))}
-    factor = units["output_unit"].factor / units["input_unit"].factor
-    method = as_text(stated.get("method", ""), "/frf: method")
-    common = {"input_unit": units["input_unit"].si, "output_unit": units["output_unit"].si, "method": method}
-    covariances = {field: _numbers(path, group, field, "fiuc") for field in COVARIANCES}
-    coherence, variance = _numbers(path, group, "coherence", "fiu"), _numbers(path, group, "variance", "fiu")
-    if covariances["noise"] is not None and covariances["gram"] is not None:
-        if factor != 1.0:
-            raise InputError("expected SI units beside noise and gram", field="/frf: units",
-                             value=str(stated["output_unit"]))
-        dof = stated.get("dof", np.inf)
-        dof = np.inf if np.array_equal(dof, np.inf) else as_number(dof, "/frf: dof")
-        return FrequencyResponse(frequency, value, inputs=names["inputs"], outputs=names["outputs"], dof=dof,
-                                 coherence=coherence, **covariances, **common)  # type: ignore[arg-type]
-    if "averages" in stated:
-        averages = as_number(stated["averages"], "/frf: averages")
-    response = response_from(frequency, value * factor, names["inputs"], names["outputs"], coherence=coherence,
-                             variance=None if variance is None else variance * factor ** 2, averages=averages,
-                             relative_standard_deviation=relative, **common)
-    if variance is not None and coherence is not None and coherence.shape == response.value.shape[:2]:
-        response = replace(response, coherence=coherence)
-    return response
+        with within("/frf"):
+            fields = {name: _numbers(path, group, name, kinds) for name, kinds in DATASETS.items()}
+            if fields["frequency_Hz"] is None or fields["value"] is None:
+                raise InputError(f"expected frequency_Hz and value; the group holds {listed(group)}")
+            stated = attributes(group, *NAMED, "method", "dof", "averages")
+            for field, expected in NAMED.items():
+                require(stated, field, expected)
+            return stated_response(fields | stated, hints or Hints())
 
 
 def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
@@ -120,9 +84,9 @@ def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
     if dataset is None:
         return None
     if not isinstance(dataset, h5py.Dataset):
-        raise InputError("expected numbers, found a group", field=f"/frf/{name}")
+        raise InputError("expected numbers, found a group", field=name)
     shape, dtype = layout(dataset)
     if dtype.kind not in kinds:
-        raise InputError(f"expected numbers, found {kind_of(dtype)}", field=f"/frf/{name}")
+        raise InputError(f"expected numbers, found {kind_of(dtype)}", field=name)
     require_small(path, math.prod(shape or ()) * dtype.itemsize)
     return values(dataset)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -155,9 +155,6 @@ class FrequencyResponse:
 
     def at(self, keep: np.ndarray) -> FrequencyResponse:
         """Some of the lines, by mask or index."""
-        def cut(array: np.ndarray | None) -> np.ndarray | None:
-            return None if array is None else array[keep]
-        return FrequencyResponse(self.frequency_Hz[keep], self.value[keep], cut(self.noise), cut(self.gram),
-                                 self.inputs, self.outputs, self.input_unit, self.output_unit, self.dof,
-                                 cut(self.measurement_noise), cut(self.distortion), cut(self.coherence),
-                                 cut(self.entry_variance), self.method, self.shared)
+        by_line = {field.name: array[keep] for field in fields(self)
+                   if isinstance(array := getattr(self, field.name), np.ndarray)}
+        return replace(self, **by_line)
