@@ -176,7 +176,7 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
         raise InputError(f"expected at least two periods of {m.period_s:g} s: the first contains the transient",
                          field="duration_s", value=samples / fs)
     return multisine(MultisineSettings(names, fs, m.period_s, (low, high), limit_V, None, m.lines, m.spacing,
-                                       m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
+                                       m.group, m.scheme, one.records, dealt, m.compensate_hold, m.low_crest,
                                        seed))
 
 

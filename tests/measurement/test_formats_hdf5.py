@@ -323,7 +323,7 @@ def covariance_response(rng, n=5, n_y=3, n_u=2):
     value = rng.normal(size=(n, n_y, n_u)) + 1j * rng.normal(size=(n, n_y, n_u))
     return FrequencyResponse(np.sort(rng.uniform(1, 9, n)), value, hermitian(n_y), hermitian(n_u), ("A1", "A2"),
                              ("S1", "S2", "S3"), "V", "m/s", 12.0, hermitian(n_y), hermitian(n_y),
-                             rng.uniform(0, 1, (n, n_y)), method="local polynomial")
+                             method="local polynomial")
 
 
 def same(one, two):
@@ -424,7 +424,7 @@ def test_a_wrong_response_is_refused_in_one_line(path, rng, case):
 def test_a_stated_deviation_stands_in_for_unknown_errors_and_lines_of_no_coherence_are_left_out(path, rng):
     response_file(path, rng, group_edit(lambda g: g.pop("coherence")))
     response = read_measurements(path, relative_standard_deviation=0.1)
-    np.testing.assert_allclose(response.standard_deviation, 0.1 * np.abs(response.value))
+    np.testing.assert_allclose(response.entry_variance, (0.1 * np.abs(response.value)) ** 2)
     assert "stated relative standard deviation 0.1" in response.method
 
     def one_zero(group):

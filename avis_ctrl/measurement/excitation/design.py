@@ -21,7 +21,6 @@ depends on the distribution, is then that for signals of this kind.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
@@ -36,8 +35,6 @@ Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]
 # Samples times drives times records: 1 GiB.
 MOST_VOLTAGES = 2 ** 27
-# Relative amplitude of the lines: at frequencies [Hz], or one number a line.
-Shape = Callable[[np.ndarray], np.ndarray] | Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +116,8 @@ class MultisineSettings:
     scheme : how the inputs are told apart, see above.
     realisations : independent draws of the phases; the lines are the same in all.
     dealt : by how many places the zippered lines of the first realisation are dealt on.
-    shape : relative amplitude, a function of Hz, or one number for each line that is excited; flat when None.
     compensate_hold : divide the amplitudes by the sinc of the zero-order hold, so that the held voltage, not its
-        samples, has the shape asked.
+        samples, is flat.
     low_crest : minimise the crest factor; False keeps the phases drawn.
     seed : of all that is random.
 
@@ -142,7 +138,6 @@ class MultisineSettings:
     scheme: Scheme = "orthogonal"
     realisations: int = 1
     dealt: int = 0
-    shape: Shape | None = None
     compensate_hold: bool = False
     low_crest: bool = True
     seed: int = 1
@@ -180,14 +175,11 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
 
     Raises
     ------
-    InputError : a band that leaves an input without lines, a shape that does not fit or is not positive, a level
-        beyond the limit.
+    InputError : a band that leaves an input without lines, a level beyond the limit.
     """
     rng, n_u, N = np.random.default_rng(settings.seed), len(settings.inputs), settings.samples
     lines, detection = choose_lines(settings, rng)
-    shape = _shape(settings, lines)
-    amplitude = shape / np.sinc(lines / N) if settings.compensate_hold else shape
-    plain = _plain(settings) | {"shape": None if settings.shape is None else shape.tolist()}
+    amplitude = np.ones(lines.size) / (np.sinc(lines / N) if settings.compensate_hold else 1.0)
     T = orthogonal_matrix(n_u) if settings.scheme == "orthogonal" else np.ones((1, 1))
     u, before = [], []
     for r in range(settings.realisations):
@@ -201,7 +193,7 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
     return ExcitationSignals(
         "multisine", settings.inputs, settings.sample_rate_Hz, np.concatenate(u), settings.period_s,
         lines / settings.period_s, detection / settings.period_s, settings.limit_V,
-        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)), plain).scaled_to(settings.rms_V)
+        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)), _plain(settings)).scaled_to(settings.rms_V)
 
 
 def _one_input(lines: np.ndarray, amplitude: np.ndarray, turns: np.ndarray, samples: int, low_crest: bool,
@@ -235,16 +227,6 @@ def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple
 def orthogonal_matrix(n: int) -> np.ndarray:
     """(n, n), T T^H = n I, entries of modulus one: Hadamard's for a power of two, otherwise the DFT's."""
     return hadamard(n).astype(float) if n & (n - 1) == 0 else dft(n)
-
-
-def _shape(settings: MultisineSettings, lines: np.ndarray) -> np.ndarray:
-    """(n_lines,) relative amplitudes."""
-    shape = np.ones(lines.size) if settings.shape is None else settings.shape
-    amplitude = np.asarray(shape(lines / settings.period_s) if callable(shape) else shape, float)
-    if amplitude.shape != lines.shape or not (np.all(np.isfinite(amplitude)) and np.all(amplitude > 0)):
-        raise InputError(f"expected {lines.size} finite, positive amplitudes, one for each excited line", field="shape",
-                         value=f"array of shape {amplitude.shape}")
-    return amplitude
 
 
 @dataclass(frozen=True)
@@ -305,7 +287,7 @@ def band_limited(samples: int, sample_rate_Hz: float, band_Hz: tuple[float, floa
 
 
 def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
-    """Settings as numbers, strings and lists, for files; a shape is left to the caller."""
+    """Settings as numbers, strings and lists, for files."""
     values = {one.name: getattr(settings, one.name) for one in fields(settings)}
     values = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}

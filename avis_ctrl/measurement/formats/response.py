@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,17 +65,14 @@ def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyRespons
                              value=str(fields["output_unit"]))
         dof = fields.get("dof", np.inf)
         common |= {field: fields.get(field) for field in COVARIANCES}
-        return FrequencyResponse(frequency, value, inputs=inputs, outputs=outputs, coherence=coherence, **common,
+        return FrequencyResponse(frequency, value, inputs=inputs, outputs=outputs, **common,
                                  dof=np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof"))
     averages = hints.averages
     if averages is None and fields.get("averages") is not None:
         averages = as_number(fields["averages"], "averages")
-    response = response_from(frequency, value * factor, inputs, outputs, coherence=coherence, **common,
-                             variance=None if variance is None else variance * factor ** 2, averages=averages,
-                             relative_standard_deviation=hints.relative_standard_deviation)
-    if variance is not None and coherence is not None and coherence.shape == response.value.shape[:2]:
-        response = replace(response, coherence=coherence)  # multiple coherence, which says nothing of entries
-    return response
+    return response_from(frequency, value * factor, inputs, outputs, coherence=coherence, averages=averages,
+                         variance=None if variance is None else variance * factor ** 2,
+                         relative_standard_deviation=hints.relative_standard_deviation, **common)
 
 
 def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[str], outputs: Sequence[str], *,

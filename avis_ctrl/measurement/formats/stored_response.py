@@ -42,7 +42,7 @@ def write_frequency_response(path: str | Path, response: FrequencyResponse, rig:
         file.attrs.update({"format": FORMAT, "version": VERSION, "rig": rig})
         group = file.create_group("frf")
         group["frequency_Hz"], group["value"] = response.frequency_Hz, np.asarray(response.value, complex)
-        for field in (*COVARIANCES, "coherence"):
+        for field in COVARIANCES:
             if getattr(response, field) is not None:
                 group[field] = getattr(response, field)
         if response.entry_variance is not None:

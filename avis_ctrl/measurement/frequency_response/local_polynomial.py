@@ -32,20 +32,12 @@ from avis_ctrl.measurement.frequency_response.spectra import (
 class NoiseCovariance:
     """Covariance of the outputs' noise on one line of a transform over sqrt(samples).
 
-    frequency_Hz : (n,); covariance : (n, n_y, n_y) Hermitian, positive definite; dof : (n,) complex degrees of
-    freedom; sample_rate_Hz : a one-sided power spectral density is 2 covariance / sample_rate_Hz.
+    covariance : (n, n_y, n_y) Hermitian, positive definite; dof : (n,) complex degrees of freedom. A one-sided power
+    spectral density is 2 covariance over the sample rate.
     """
 
-    frequency_Hz: np.ndarray
     covariance: np.ndarray
     dof: np.ndarray
-    outputs: tuple[str, ...]
-    sample_rate_Hz: float
-
-    @property
-    def density(self) -> np.ndarray:
-        """(n, n_y, n_y) one-sided cross power spectral density, squared unit of y per Hz."""
-        return 2 * self.covariance / self.sample_rate_Hz
 
 
 def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
@@ -136,12 +128,11 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     # What the outputs hold beside the inputs is known whether or not these are told apart.
     found = data.fit(centres, order, width).estimate(data.names, partial=True)
     least = min(-(-(len(data.used.outputs) + 2) // found.dof), centres.size)
-    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * data.step_Hz, least,
-                     data.used.outputs, campaign.sample_rate_Hz)
+    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * data.step_Hz, least)
 
 
-def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float, least: int,
-              outputs: tuple[str, ...], sample_rate_Hz: float) -> NoiseCovariance:
+def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float,
+              least: int) -> NoiseCovariance:
     """Means over the centres near each frequency, at least `least` of them."""
     low = np.searchsorted(centres, frequency_Hz - smooth_Hz)
     high = np.searchsorted(centres, frequency_Hz + smooth_Hz, side="right")
@@ -155,7 +146,7 @@ def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np
     if least * dof < noise.shape[1]:
         raise InputError(f"expected longer records: {least * dof} degrees of freedom cannot give a definite covariance "
                          f"of {noise.shape[1]} outputs", field="records")
-    return NoiseCovariance(frequency_Hz, mean, (count * dof).astype(float), outputs, sample_rate_Hz)
+    return NoiseCovariance(mean, (count * dof).astype(float))
 
 
 @dataclass(frozen=True)

@@ -104,18 +104,17 @@ class Clipping(Gate):
         names = tuple(dict.fromkeys(row.channel for row in wrong))
         found = [self._unit(wrong, names, expectation, campaign)] if wrong else []
         bad = [row for row in rows if row.count and row.p < level and row.channel not in names]
-        for channel in dict.fromkeys(row.channel for row in bad):
-            found.append(self._finding([row for row in bad if row.channel == channel]))
-        if found:
-            return found
+        found += [self._finding([row for row in bad if row.channel == channel])
+                  for channel in dict.fromkeys(row.channel for row in bad)]
         peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
         top = max(peaks, key=lambda n: peaks[n])
         limits = () if expectation.y_range_V is None else (Limit("converter", expectation.y_range_V[1]),)
-        x = np.arange(len(peaks))
         picture = Picture("Largest absolute value of each channel", "channel", f"largest value [{campaign.y_unit}]",
-                          (Series("peak", x, np.array(list(peaks.values())), "bars"),), limits, x_names=tuple(peaks))
-        return [Finding(self.name, "ok", f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
-                        value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
+                          (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),), limits,
+                          x_names=tuple(peaks))
+        return found or [
+            Finding(self.name, "ok", f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
+                    value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
 
     def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
         """Most samples at or beyond the range, in some record."""

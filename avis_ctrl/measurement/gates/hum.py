@@ -59,7 +59,6 @@ class _Line:
 class _Kept:
     record: str
     lines: list[_Line]
-    tested: int
     passed_over: int
     rms: np.ndarray
     f: np.ndarray
@@ -94,27 +93,22 @@ class Hum(Gate):
                 made = _tested(f, P, driven, k * mains, mains, K)
                 lines += made or []
                 passed += made is None
-        return _Kept(h.name, lines, len(lines), passed, y.std(axis=0), f, np.sqrt(P))
+        return _Kept(h.name, lines, passed, y.std(axis=0), f, np.sqrt(P))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        tested = sum(k.tested for k in kept)
-        found = []
-        names = campaign.y_names
-        for j, name in enumerate(names):
-            for mains in MAINS_HZ:
-                hits = [(k, line) for k in kept for line in k.lines if line.channel == j and line.mains_Hz == mains
-                        and line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio]
-                if hits:
-                    found.append(self._finding(name, mains, hits, campaign.y_unit))
-        passed = sum(k.passed_over for k in kept)
-        if not found:
-            note = f"; {passed} lines are excited by u and were not tested" if passed else ""
-            what = "No mains hum was found" if tested else "No line of the mains could be tested"
-            last = kept[-1]
-            found.append(
-                Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", value=None,
-                        limit=FALSE_ALARM, picture=self._picture(last, 0, names[0], campaign.y_unit, [])))
-        return found
+        tested, passed = sum(len(k.lines) for k in kept), sum(k.passed_over for k in kept)
+        hits: dict[tuple[int, float], list[tuple[_Kept, _Line]]] = {}
+        for k in kept:
+            for line in k.lines:
+                if line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio:
+                    hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
+        found = [self._finding(campaign.y_names[j], mains, some, campaign.y_unit)
+                 for (j, mains), some in sorted(hits.items())]
+        note = f"; {passed} lines are excited by u and were not tested" if passed else ""
+        what = "No mains hum was found" if tested else "No line of the mains could be tested"
+        return found or [
+            Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", limit=FALSE_ALARM,
+                    picture=self._picture(kept[-1], 0, campaign.y_names[0], campaign.y_unit, []))]
 
     def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)

@@ -22,7 +22,7 @@ from avis_ctrl.measurement.gates.finding import (
     percent,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, h1, moving, octaves, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -109,7 +109,7 @@ class Comparison(Gate):
         if not seen.driven or h.excitation == "sine":
             return None
         u, y, wrap = usable(seen)
-        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0)))), wrap)
+        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
             return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
         P = len(periods)
