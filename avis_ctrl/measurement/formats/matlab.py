@@ -2,12 +2,12 @@
 
 Layout A, the contract's: a struct array (or cell array of structs) `records` with the fields u, y and sample_rate_Hz,
 and excitation, level_V, start_s, period_s (empty, 0 or NaN where not periodic), floor, u_names, y_names, u_unit,
-y_unit, floor_unit, t where they are known; beside it `rig`. Records of v7.3 files stay on disk.
+y_unit, floor_unit, t where they are known; beside it `rig`.
 
 Layout B, flat variables of one record: u, y, t or fs (Fs, sample_rate_Hz) or Ts, optionally floor, u_names, y_names,
 u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a mapping of columns says which variable is what.
 
-Rows or columns may be the samples; what cannot be told apart is refused.
+Samples of v7.3 files stay on disk. Rows or columns may be the samples; what cannot be told apart is refused.
 """
 
 from __future__ import annotations

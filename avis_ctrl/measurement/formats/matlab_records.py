@@ -15,25 +15,25 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
-from avis_ctrl.measurement.formats.common import as_text, require_small, within
-from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
-from avis_ctrl.measurement.formats.matlab_shapes import (
-    PERIODS,
-    USUAL,
-    clock,
-    empty,
-    matrix,
-    oriented,
-    plain,
-    sample_count,
-    stated_names,
-    usual,
-    with_stated,
+from avis_ctrl.measurement.formats.common import (
+    as_names,
+    as_number,
+    as_text,
+    numbers,
+    require_small,
+    stated_period,
+    within,
 )
-from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe, overview
+from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
+from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.stored import Columns
+from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
+MUCH_LONGER = 10  # a record has at least that many times more samples than channels, where names do not say
+USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output"), "t": ("t", "time"), "floor": ("floor",),
+         "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"), "u_names": ("u_names",), "y_names": ("y_names",)}
+PERIODS = ("Ts", "dt")
 # What may stand beside `records` for all of them.
 SHARED = ("u_names", "y_names", "u_unit", "y_unit", "floor_unit", *USUAL["sample_rate_Hz"], *PERIODS)
 
@@ -48,18 +48,18 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
     ------
     InputError : everything that is missing, of all records, in one line; a field that is wrong, with its record.
     """
-    check_version(tree.get("format", FORMAT), plain(tree.get("version", VERSION)))
+    check_version(tree.get("format", FORMAT), _plain(tree.get("version", VERSION)))
     records = _structs(tree)
-    names = [as_text(record["name"], f"records({i + 1}).name") if not empty(record.get("name")) else f"{i:02d}"
+    names = [as_text(record["name"], f"records({i + 1}).name") if not _empty(record.get("name")) else f"{i:02d}"
              for i, record in enumerate(records)]
     for name in names:
         if names.count(name) > 1:
             raise InputError("expected different names of records", field="records: name", value=name)
-    beside = {key: tree[key] for key in SHARED if not empty(tree.get(key))}
-    complete = [beside | {key: value for key, value in record.items() if not empty(value)} for record in records]
+    beside = {key: tree[key] for key in SHARED if not _empty(tree.get(key))}
+    complete = [beside | {key: value for key, value in record.items() if not _empty(value)} for record in records]
     _require(dict(zip(names, complete, strict=True)), hints)
     built: list[RecordSource] = []
-    notes = [] if rig or not empty(tree.get("rig")) else [f"rig not stated; taken as {UNNAMED!r}"]
+    notes = [] if rig or not _empty(tree.get("rig")) else [f"rig not stated; taken as {UNNAMED!r}"]
     for name, fields in zip(names, complete, strict=True):
         end = built[-1].header.start_s + built[-1].header.duration_s if built else None
         with within(f"record {name}"):
@@ -74,12 +74,12 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
 def flat_campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None,
                   hints: Hints) -> Campaign:
     """The campaign of one record whose fields are the variables of the file; columns : which variable is what."""
-    record, notes = _record(path, "00", tree, tree, columns, with_stated(hints, tree), None)
+    record, notes = _record(path, "00", tree, tree, columns, _with_stated(hints, tree), None)
     return Campaign(_rig(rig, tree), (record,), str(path), tuple(notes))
 
 
 def _rig(rig: str | None, tree: Mapping[str, Any]) -> str:
-    return rig or (UNNAMED if empty(tree.get("rig")) else as_text(tree["rig"], "rig"))
+    return rig or (UNNAMED if _empty(tree.get("rig")) else as_text(tree["rig"], "rig"))
 
 
 def _structs(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -97,10 +97,10 @@ def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
     for name, fields in records.items():
         excitation = hints.excitation or (fields.get("excitation") if isinstance(fields.get("excitation"), str) else "")
         with within(f"record {name}"):
-            period = with_stated(hints, {"period_s": fields.get("period_s")}).period_s
+            period = _with_stated(hints, {"period_s": fields.get("period_s")}).period_s
         timed = hints.sample_rate_Hz or any(key in fields for key in (*USUAL["t"], *USUAL["sample_rate_Hz"], *PERIODS))
-        for what, there in (("u, the voltages played (zeros at rest)", usual(fields, "u")),
-                            ("y, what the sensors gave", usual(fields, "y")),
+        for what, there in (("u, the voltages played (zeros at rest)", _usual(fields, "u")),
+                            ("y, what the sensors gave", _usual(fields, "y")),
                             ("sample_rate_Hz, fs or a time vector t", timed),
                             ("period_s, the period in s of a multisine (not 0 or NaN)",
                              period or excitation != "multisine")):
@@ -115,7 +115,7 @@ def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
 
 def _own_hints(hints: Hints, fields: Mapping[str, Any]) -> Hints:
     """Hints completed by the record; a period that the caller gives is that of the multisines."""
-    stated = with_stated(replace(hints, period_s=None), fields)
+    stated = _with_stated(replace(hints, period_s=None), fields)
     given = hints.period_s if stated.excitation in (None, "multisine") else None
     return replace(stated, period_s=stated.period_s if given is None else given)
 
@@ -132,14 +132,14 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
         if not chosen[role] and (role == "y" or hints.excitation not in ("rest", "floor")):
             raise InputError(f"which variable is it? The file has {overview(fields)}; say with columns (such as "
                              "u=vir, y=qm, t=t)", field=role)
-    matrices = {role: [matrix(fields[variable], variable) for variable in chosen[role]]
+    matrices = {role: [_matrix(fields[variable], variable) for variable in chosen[role]]
                 for role in ("u", "y", "floor") if chosen[role] or role == "u"}
-    rate, start, note, known = clock(fields, chosen, hints)
+    rate, start, note, known = _clock(fields, chosen, hints)
     notes += [note] if note else []
     if not chosen["sample_rate_Hz"] and hints.sample_rate_Hz is None and chosen["t"]:
         notes.append(f"sample rate not stated; {rate:.9g} Hz by {chosen['t'][0]}")
     stated = _stated_names(matrices, chosen, tree)
-    samples = sample_count(matrices, {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1},
+    samples = _sample_count(matrices, {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1},
                            known)
     if hints.start_s is None and end_s is not None and (not chosen["t"] or start < end_s):
         start = end_s
@@ -159,10 +159,10 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
         elif len(names) != sum(counts):
             raise InputError(f"expected {sum(counts)} names, one per channel; there are {len(names)}",
                              field=f"{role}_names", value=names)
-        label = plain(fields.get(f"{role}_unit"))
+        label = _plain(fields.get(f"{role}_unit"))
         place = Columns(str(items[0].dataset), samples, items[0].shape[0] == samples) if stored else np.hstack(
-            [np.zeros((samples, 0)), *(oriented(item, samples, role) for item in items)])
-        parts[role] = Part(names, None if empty(label) else label, place)
+            [np.zeros((samples, 0)), *(_oriented(item, samples, role) for item in items)])
+        parts[role] = Part(names, None if _empty(label) else label, place)
     record, assumed = record_from(name, parts, rate, start, hints, str(path) if stored else "")
     return record, [*(f"record {name}: {note}" for note in notes), *assumed]
 
@@ -173,7 +173,7 @@ def _chosen(fields: Mapping[str, Any], columns: Mapped | None) -> dict[str, list
     for role in USUAL:
         names = mapped(columns, role)
         if names is None:
-            names = usual(fields, role)
+            names = _usual(fields, role)
         elif not role.endswith("_names"):  # those may be the names themselves
             pick(names, list(fields), role)
         chosen[role] = names
@@ -188,5 +188,124 @@ def _stated_names(matrices: Mapping[str, Sequence[Matrix]], chosen: Mapping[str,
         items = matrices[role]
         if items and (given := chosen[f"{role}_names"]):
             one = len(items) == 1 and 1 in items[0].shape
-            stated[role] = stated_names(given, tree, f"{role}_names", 1 if one else None)
+            stated[role] = _names(given, tree, f"{role}_names", 1 if one else None)
     return stated
+
+
+def _plain(value: Any) -> Any:
+    """A small matrix as an array."""
+    return value.read() if isinstance(value, Matrix) and math.prod(value.shape) <= 1000 else value
+
+
+def _empty(value: Any) -> bool:
+    """Nothing, an array of no elements, an empty cell array, an empty text: how struct arrays leave a field out."""
+    if isinstance(value, Matrix):
+        return 0 in value.shape
+    return value is None or (isinstance(value, (list, str)) and not value)
+
+
+def _usual(tree: Mapping[str, Any], role: str) -> list[str]:
+    """The variable or field that is called what a role usually is, if there is one."""
+    return [name for name in USUAL[role] if not _empty(tree.get(name))][:1]
+
+
+def _matrix(value: Any, field: str) -> Matrix:
+    """A real matrix with samples in it, or an InputError that says what it is."""
+    if not isinstance(value, Matrix) or value.kind not in "fiu" or len(value.shape) != 2:
+        words = f"a {value.kind}" if isinstance(value, Unreadable) else describe(value)
+        raise InputError("expected a real matrix, samples by channels", field=field, value=words)
+    if 0 in value.shape:
+        raise InputError("expected samples, found an empty array", field=field)
+    return value
+
+
+def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[str, int],
+                 known: int | None = None) -> int:
+    """Number of samples that all matrices share, whichever way round they are.
+
+    channels : number of channels of a role, where names tell it; known : length of the time vector.
+
+    Raises
+    ------
+    InputError : no common length; square matrices; rows and columns that could both be the samples.
+    """
+    shapes = {role: [item.shape for item in items] for role, items in matrices.items()}
+    shown = ", ".join(f"{role} is {' and '.join('x'.join(map(str, shape)) for shape in some)}"
+                      for role, some in shapes.items())
+    possible = None if known is None else {known}
+    for role, some in shapes.items():
+        for rows, columns in some:
+            lengths = {rows, columns} if min(rows, columns) > 1 else {max(rows, columns)}
+            if role in channels:
+                lengths = {length for length, others in ((rows, columns), (columns, rows)) if others == channels[role]}
+                if not lengths:
+                    raise InputError(f"expected {channels[role]} channels, as there are names; it is {rows}x{columns}",
+                                     field=role)
+            possible = lengths if possible is None else possible & lengths
+    if not possible:
+        also = "" if known is None else f", t has {known}"
+        raise InputError(f"expected equally many samples; {shown}{also}")
+    samples = max(possible)
+    square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
+    if square or (len(possible) > 1 and samples < MUCH_LONGER * min(possible)):
+        raise InputError(f"rows and columns could both be the samples: {shown}; expected names of the channels or a "
+                         "time vector that distinguishes them")
+    return samples
+
+
+def _oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
+    """(samples, channels) float64."""
+    array = numbers(item.read(), field)
+    return array if array.shape[0] == samples else array.T
+
+
+def _with_stated(hints: Hints, tree: Mapping[str, Any]) -> Hints:
+    """Hints completed by variables or fields of the same names."""
+    found: dict[str, Any] = {}
+    for field in ("level_V", "start_s"):
+        if getattr(hints, field) is None and not _empty(tree.get(field)):
+            found[field] = as_number(_plain(tree[field]), field)
+    if hints.period_s is None and not _empty(tree.get("period_s")):
+        found["period_s"] = stated_period(_plain(tree["period_s"]), "period_s")
+    if hints.excitation is None and not _empty(tree.get("excitation")):
+        found["excitation"] = as_text(tree["excitation"], "excitation")
+    return replace(hints, **found)
+
+
+def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int | None) -> tuple[str, ...]:
+    """Channel names from a variable of that name, or the names that the caller wrote instead of one."""
+    if len(value) == 1 and value[0] in tree:
+        return as_names(_plain(tree[value[0]]), field, count)
+    if len(value) == 1 and count is None:
+        raise InputError("no variable of that name, and too few for names of the channels themselves (A+B+...); the "
+                         f"file has {overview(tree)}", field=field, value=value[0])
+    return as_names(list(value), field, count)
+
+
+def _clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],
+           hints: Hints) -> tuple[float, float, str, int | None]:
+    """Sample rate [Hz], first time [s], note, number of samples (None where there is no time vector)."""
+    start, note, known, rate = 0.0, "", None, None
+    if chosen["t"]:
+        name = chosen["t"][0]
+        times = _matrix(tree[name], name)
+        if 1 not in times.shape:
+            raise InputError("expected a vector of time stamps in s", field=name, value=describe(times))
+        rate, start, note = sample_rate_from(numbers(times.read(), name).reshape(-1), field=name)
+        known = max(times.shape)
+    stated, source = hints.sample_rate_Hz, "hint sample_rate_Hz"
+    if stated is None and chosen["sample_rate_Hz"]:
+        source = chosen["sample_rate_Hz"][0]
+        stated = as_number(_plain(tree[source]), source)
+    for name in PERIODS:
+        if stated is None and rate is None and name in tree:
+            source, period = name, as_number(_plain(tree[name]), name)
+            if period <= 0:
+                raise InputError("expected a positive sampling period in s", field=name, value=period)
+            stated = 1 / period
+    if stated is not None and rate is not None and abs(stated / rate - 1) > 1e-3:
+        raise InputError(f"expected {rate:.9g} Hz, as the time vector says", field=source, value=stated)
+    result = stated if stated is not None else rate
+    if result is None:
+        raise InputError(f"expected t, fs or sample_rate_Hz; the file has {overview(tree)}", field="sample rate")
+    return result, start, note, known

@@ -14,9 +14,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
-from avis_ctrl.measurement.formats.records import ROLES, Hints, hints_from, mapped, with_header
+from avis_ctrl.measurement.formats.records import ROLES, hints_from, mapped, with_header
 from avis_ctrl.measurement.formats.stored import attributes, member, members, open_hdf5
-from avis_ctrl.measurement.formats.stored_response import read_frequency_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.layouts import FORMATS
 
@@ -70,13 +69,11 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
             head = stream.read(4096)
         kind = _format(path, head)
         if kind == "matlab":
-            measured: Campaign | FrequencyResponse = matlab.read(path, columns, rig, known)
+            measured = matlab.read(path, columns, rig, known)
             if isinstance(measured, Campaign):
                 return measured  # names told which way round a matrix is, or named the variable that holds them
-        elif kind == "hdf5":
-            measured = _hdf5(path, plain, rig, known)
         else:
-            measured = (uff if kind == "uff" else csv).read(path, plain, rig, known)
+            measured = {"hdf5": hdf5.read, "uff": uff.read, "csv": csv.read}[kind](path, plain, rig, known)
         return renamed(measured, naming)
 
 
@@ -132,15 +129,3 @@ def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[st
     if isinstance(measured, FrequencyResponse):
         return replace(measured, **changes)
     return replace(measured, records=tuple(with_header(record, **changes) for record in measured.records))
-
-
-def _hdf5(path: Path, columns: Mapping[str, Any] | None, rig: str | None, hints: Hints) -> Campaign | FrequencyResponse:
-    """Records, or a frequency response."""
-    with open_hdf5(path) as file:
-        names = members(file)
-    response = "frf" in names and "records" not in names
-    used = ("averages", "relative_standard_deviation") if response else ()
-    for name, value in {"columns": columns, **vars(hints)}.items():
-        if value is not None and name not in used:
-            raise InputError("an HDF5 campaign states this itself; expected no such argument", field=name, value=value)
-    return read_frequency_response(path, hints) if response else hdf5.read(path, rig)
