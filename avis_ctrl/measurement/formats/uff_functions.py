@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -120,11 +121,11 @@ def _closing(text: bytes, at: int, place: str) -> int:
 
 def _units(body: bytes, place: str) -> tuple[float, float]:
     """Factors of length and force of data set 164."""
-    factors = [float(word.replace("D", "E").replace("d", "e"))
-               for line in body.decode("latin-1").splitlines()[1:] for word in line.split()]
-    if len(factors) < 2 or not (0 < factors[0] < np.inf and 0 < factors[1] < np.inf):
-        raise InputError("expected positive factors of length and force in data set 164", field=place,
-                         value=factors[:2])
+    words = [word.upper().replace("D", "E") for line in body.decode("latin-1").splitlines()[1:]
+             for word in line.split()][:2]
+    factors = [float(word) for word in words if is_number(word)]
+    if len(factors) < 2 or not all(0 < factor < np.inf for factor in factors):
+        raise InputError("expected positive factors of length and force in data set 164", field=place, value=words)
     return factors[0], factors[1]
 
 
@@ -171,11 +172,7 @@ _AXIS = (10, 5, 5, 5, 21, 21)
 
 def _words(line: str, widths: tuple[int, ...]) -> list[str]:
     """Fields of fixed width."""
-    words, at = [], 0
-    for width in widths:
-        words.append(line[at:at + width].strip())
-        at += width
-    return words
+    return [line[start:stop].strip() for start, stop in pairwise(accumulate(widths, initial=0))]
 
 
 def _real(word: str) -> float:
