@@ -54,13 +54,11 @@ class _Kept:
 class DeadChannel(Gate):
     """Sensors that do not sense and drives that are never driven.
 
-    Constant channels need no statistics. A stuck code is a run of equal samples, at least 50 and five times as long as
-    any other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven
-    lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while
-    half of the channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all
-    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). On
-    clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
-    only.
+    Constant channels and stuck codes need no statistics. A channel is noise alone where its largest multiple coherence
+    over the driven lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records
+    and lines) while half of the channels respond, in terms of coherence / (1 - coherence); that is judged over all
+    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). False
+    alarms come from small signals only.
     """
 
     name = "dead channel"

@@ -69,12 +69,10 @@ class Hum(Gate):
     """Narrow lines at k 50 Hz and k 60 Hz, k = 1 .. 6, within 0.4 %.
 
     Power spectra are means over K Hann segments without overlap (K from 4 to 32). The largest bin within the tolerance
-    is compared with 16 bins on either side, the first three next to it left out; the louder side is the floor. Their
-    ratio is F(2K, 2 16 K) distributed where the floor is locally flat, so that 1 % shared over bins, lines, channels
-    and records controls false alarms; a line must moreover exceed its floor by a factor of 3, for floors that are not
-    quite flat. Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins) are
-    passed over: they are the experiment. A line is a warning where it makes more than 1 % of the channel's r.m.s. in
-    that record, otherwise a note.
+    is compared with the reference bins on either side; the louder side is the floor. Their ratio is F(2K, 2 m K)
+    distributed for m bins of a locally flat floor, so that 1 % shared over bins, lines, channels and records controls
+    false alarms. Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins)
+    are passed over: they are the experiment. A line is a warning where it is large, otherwise a note.
     """
 
     name = "hum"

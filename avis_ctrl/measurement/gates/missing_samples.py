@@ -57,12 +57,10 @@ class MissingSamples(Gate):
     Lost samples shift y against the commanded u. In each segment the delay of y behind H1 u is fitted to the phase of
     the driven lines, weighted by the residual; the largest step between means of the segments before and after any
     instant is tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three
-    estimates of H1; few segments), must exceed half a sample, and must explain the record: with the step undone the
-    residual of H1 falls by a tenth. A delay that runs away is no step. In a swept sine the delay changes with the
-    frequency, and so with time: steps are not looked for there. Where rows were lost from u and y together, a periodic
-    u shows it: each period is compared with the first by circular correlation, exactly, for u is commanded.
-    A repeated block is 16 or more rows equal in every channel of y to earlier ones, not a whole number of periods away
-    where the record is periodic; noise in one channel alone makes that impossible by chance.
+    estimates of H1; few segments), and must explain the record. A delay that runs away is no step. In a swept sine the
+    delay changes with the frequency, and so with time: steps are not looked for there. Where rows were lost from u and
+    y together, a periodic u shows it: each period is compared with the first by circular correlation, exactly, for u is
+    commanded. A repeated block is rows equal in every channel of y to earlier ones, not a whole number of periods away.
     """
 
     name = "missing samples"

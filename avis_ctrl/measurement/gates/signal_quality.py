@@ -139,12 +139,12 @@ class _Coherence:
 class Coherence(Gate):
     """Multiple coherence of each channel with all inputs, over the driven records near the largest level.
 
-    Records within a factor 1.4 of the largest level count together, which leaves long segments; the lowest frequency is
-    that of the second line of a segment, and the sentence says so where the voltage begins lower. Estimates are freed
-    of their bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what
-    is judged. A mean under 0.5 is a note. A channel that is low in all bands by more than chance (normal approximation
-    of the mean, 1 % shared over bands and channels) is a warning. Segments leak where a mode decays longer than they
-    last, which lowers the coherence there without any fault; the sentence states their length.
+    Records near the largest level count together, which leaves long segments; the lowest frequency is that of the
+    second line of a segment, and the sentence says so where the voltage begins lower. Estimates are freed of their
+    bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what is judged.
+    A channel that is low in all bands by more than chance (normal approximation of the mean, 1 % shared over bands and
+    channels) is a warning. Segments leak where a mode decays longer than they last, which lowers the coherence there
+    without any fault; the sentence states their length.
     """
 
     name = "coherence"
