@@ -14,7 +14,7 @@ from __future__ import annotations
 import codecs
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TextIO
@@ -23,14 +23,14 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
-from avis_ctrl.measurement.formats.common import as_number, existing_file, is_number, reading, require_small
+from avis_ctrl.measurement.formats.common import existing_file, is_number, reading, require_small, within
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
 CHUNK = 1 << 16  # lines that are turned into numbers at once
 LONGEST_LINE = 1 << 20  # characters
 USUAL = {"t": r"t|time|t_s|time_s", "u": r"u_?\w*|a[xyz]?\d+", "y": r"y_?\w*|s[xyz]?\d+"}
-STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s")
+STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s", "excitation")
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 
 
@@ -199,14 +199,9 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
 
 def _with_stated(hints: Hints, stated: dict[str, str]) -> Hints:
     """Hints completed by the comments of the file."""
-    found: dict[str, float | str] = {}
-    for field in STATED:
-        if field in stated and getattr(hints, field) is None:
-            text = stated[field].replace(",", ".")
-            found[field] = as_number(float(text) if is_number(text) else text, f"comment {field}")
-    if "excitation" in stated and hints.excitation is None:
-        found["excitation"] = stated["excitation"]
-    return replace(hints, **found)  # type: ignore[arg-type]
+    texts = {field: stated[field].replace(",", ".") for field in STATED if field in stated}
+    with within("comment"):
+        return hints.completed({field: float(text) if is_number(text) else text for field, text in texts.items()})
 
 
 def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[float, float, str]:

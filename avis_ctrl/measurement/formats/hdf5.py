@@ -31,7 +31,6 @@ from avis_ctrl.measurement.formats.common import (
     reading,
     require,
     require_small,
-    stated_period,
     within,
 )
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
@@ -147,11 +146,11 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
         raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names",
                          value=parts["floor"].names)
     found = attributes(record, *STATED, "period_s")
-    given = {field: require(found, field, expected) for field, expected in STATED.items()}
-    rate, level, start = (as_number(given[field], field) for field in ("sample_rate_Hz", "level_V", "start_s"))
-    hints = Hints(excitation=as_text(given["excitation"], "excitation"), level_V=level,
-                  period_s=stated_period(found.get("period_s"), "period_s"))
-    return record_from(name, parts, rate, start, hints, path)[0]
+    for field, expected in STATED.items():
+        require(found, field, expected)
+    hints = Hints().completed(found)
+    assert hints.sample_rate_Hz is not None
+    return record_from(name, parts, hints.sample_rate_Hz, 0.0, hints, path)[0]
 
 
 def _part(dataset: Any, role: str) -> Part:

@@ -1,4 +1,4 @@
-"""MATLAB .mat files, v5 and v7.3, in two layouts.
+"""MATLAB .mat files, v5 and v7.3: records in two layouts, or a frequency response.
 
 Layout A, the contract's: a struct array (or cell array of structs) `records` with the fields u, y and sample_rate_Hz,
 and excitation, level_V, start_s, period_s (empty, 0 or NaN where not periodic), floor, u_names, y_names, u_unit,
@@ -7,21 +7,27 @@ y_unit, floor_unit, t where they are known; beside it `rig`.
 Layout B, flat variables of one record: u, y, t or fs (Fs, sample_rate_Hz) or Ts, optionally floor, u_names, y_names,
 u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a mapping of columns says which variable is what.
 
+A frequency response is frequency_Hz, H, variance or coherence with averages, inputs, outputs and their units.
+
 Samples of v7.3 files stay on disk. Rows or columns may be the samples; what cannot be told apart is refused.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import matlab_records, matlab_v5, matlab_v73
-from avis_ctrl.measurement.formats.common import existing_file, reading
-from avis_ctrl.measurement.formats.matlab_response import response
+from avis_ctrl.measurement.formats.common import as_names, existing_file, reading
+from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe
 from avis_ctrl.measurement.formats.records import Hints, Mapped
+from avis_ctrl.measurement.formats.response import stated_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 # "MAT-File Format", level 4: thousands are the byte order (0 little, 1 big endian), tens the type of the numbers, ones
@@ -46,7 +52,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         if "records" in tree and usual_names:
             return matlab_records.campaign(path, tree, columns, rig, hints)
         if "frequency_Hz" in tree and "H" in tree and usual_names:
-            return response(tree, hints)
+            return _response(tree, hints)
         return matlab_records.flat_campaign(path, tree, columns, rig, hints)
 
 
@@ -74,3 +80,64 @@ def is_version_4(head: bytes) -> bool:
         if kind in MATRICES_V4 and min(rows, columns) >= 0 and imaginary in (0, 1) and name.endswith(b"\0"):
             return name[:-1].decode("latin-1").isidentifier()
     return False
+
+
+def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
+    """The frequency response that the variables hold.
+
+    H is (n, n_y, n_u) or, as in an frd object's ResponseData, (n_y, n_u, n); MATLAB drops trailing ones.
+
+    Raises
+    ------
+    InputError : a variable that is missing, of another kind or shape, or whose dimensions cannot be told apart.
+    """
+    frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
+    n_y, n_u = _sizes(tree, H, len(frequency))
+    fields = {"input_unit": "V", "output_unit": "V", "outputs": [f"y{i + 1}" for i in range(n_y)],
+              "inputs": [f"u{i + 1}" for i in range(n_u)]}
+    fields |= {field: tree[field] for field in fields if field in tree}
+    for field, count in (("outputs", n_y), ("inputs", n_u)):
+        as_names(fields[field], field, count)
+    shaped = {field: _lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
+              for field in ("H", "variance", "coherence") if field in tree}
+    averages = {"averages": _array(tree, "averages")} if "averages" in tree else {}
+    return stated_response({"frequency_Hz": frequency, "value": shaped.pop("H"), **fields, **shaped, **averages}, hints)
+
+
+def _array(tree: Mapping[str, Any], name: str) -> np.ndarray:
+    value = tree[name]
+    if not isinstance(value, Matrix) or value.kind not in "fiuc":
+        raise InputError("expected a numeric array", field=name, value=describe(value))
+    return value.read()
+
+
+def _sizes(tree: Mapping[str, Any], H: np.ndarray, lines: int) -> tuple[int, int]:
+    """Numbers of outputs and inputs, from their names or from a three-dimensional H."""
+    if "outputs" in tree and "inputs" in tree:
+        return len(as_names(tree["outputs"], "outputs")), len(as_names(tree["inputs"], "inputs"))
+    if H.size == lines:
+        return 1, 1
+    if H.ndim == 3 and (H.shape[0] == lines) != (H.shape[2] == lines):
+        return H.shape[1:] if H.shape[0] == lines else H.shape[:2]
+    raise InputError("expected inputs and outputs, names that tell which dimension is what", field="H", value=H.shape)
+
+
+def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> np.ndarray:
+    """(n, n_y, n_u) of an array of that shape or of (n_y, n_u, n), trailing ones dropped."""
+    n, n_y, n_u = sizes
+
+    def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
+        while len(shape) > 2 and shape[-1] == 1:
+            shape = shape[:-1]
+        return shape
+    first = padded(array.shape) == padded((n, n_y, n_u))
+    last = padded(array.shape) == padded((n_y, n_u, n))
+    if n_y == n_u == 1 and array.size == n:
+        return array.reshape(sizes)
+    if first and last:
+        raise InputError(f"as many lines as channels ({n}): which dimension is the frequency cannot be told",
+                         field=field, value=array.shape)
+    if not first and not last:
+        raise InputError(f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field,
+                         value=array.shape)
+    return array.reshape(sizes) if first else np.moveaxis(array.reshape(n_y, n_u, n), 2, 0)

@@ -21,7 +21,6 @@ from avis_ctrl.measurement.formats.common import (
     as_text,
     numbers,
     require_small,
-    stated_period,
     within,
 )
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
@@ -261,15 +260,8 @@ def _oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
 
 def _with_stated(hints: Hints, tree: Mapping[str, Any]) -> Hints:
     """Hints completed by variables or fields of the same names."""
-    found: dict[str, Any] = {}
-    for field in ("level_V", "start_s"):
-        if getattr(hints, field) is None and not _empty(tree.get(field)):
-            found[field] = as_number(_plain(tree[field]), field)
-    if hints.period_s is None and not _empty(tree.get("period_s")):
-        found["period_s"] = stated_period(_plain(tree["period_s"]), "period_s")
-    if hints.excitation is None and not _empty(tree.get("excitation")):
-        found["excitation"] = as_text(tree["excitation"], "excitation")
-    return replace(hints, **found)
+    return hints.completed({field: _plain(tree[field]) for field in ("level_V", "start_s", "period_s", "excitation")
+                            if not _empty(tree.get(field))})
 
 
 def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int | None) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Record, RecordHeader, RecordSource, ranges
-from avis_ctrl.measurement.formats.common import as_number, as_text, unit_of, units_of, within
+from avis_ctrl.measurement.formats.common import as_number, as_text, stated_period, unit_of, units_of, within
 from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
 ROLES = ("t", "u", "y", "floor", "sample_rate_Hz", "u_names", "y_names")
@@ -46,6 +46,15 @@ class Hints:
                 (as_text if field.name in ("excitation", "u_unit", "y_unit") else as_number)(value, field.name)
         if self.excitation is not None and self.excitation not in EXCITATIONS:
             raise InputError(f"expected one of {', '.join(EXCITATIONS)}", field="excitation", value=self.excitation)
+
+    def completed(self, stated: Mapping[str, Any]) -> Hints:
+        """With what a file states of a record: sample_rate_Hz, excitation, level_V, start_s, period_s.
+
+        Raises InputError if one of them is of another type.
+        """
+        kinds: dict[str, Any] = {"excitation": as_text, "period_s": stated_period}
+        return replace(self, **{field: kinds.get(field, as_number)(value, field) for field, value in stated.items()
+                                if value is not None and getattr(self, field) is None})
 
 
 def hints_from(given: Mapping[str, Any]) -> Hints:
