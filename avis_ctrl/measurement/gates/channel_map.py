@@ -224,17 +224,11 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
     power = np.sum(np.abs(U) ** 2, axis=1)
     keep = power > 1e-6 * power.max(initial=0.0)
     keep[0] = False
-    Y: np.ndarray | None = None
-    lines = np.flatnonzero(keep)
-    for part in np.array_split(lines, max(1, len(lines) // 8192 + 1)):
-        if not len(part):
-            continue
-        G = response(2 * np.pi * f[part], inputs)
-        if Y is None:
-            Y = np.zeros((len(f), G.shape[1]), complex)
-        Y[part] = np.einsum("fij,fj->fi", G, U[part])
-    if Y is None:
+    if not keep.any():
         return np.zeros((len(u), 0))
+    G = response(2 * np.pi * f[keep], inputs)
+    Y = np.zeros((len(f), G.shape[1]), complex)
+    Y[keep] = np.einsum("fij,fj->fi", G, U[keep])
     return np.fft.irfft(Y, n, axis=0)[: len(u)]
 
 

@@ -10,16 +10,7 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    quoted,
-    thinned,
-)
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
 from avis_ctrl.measurement.gates.h1 import h1, moving, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
@@ -130,7 +121,7 @@ class DeadChannel(Gate):
         rate = campaign.sample_rate_Hz
         t, x = kept.traces[j]
         picture = Picture(f"Record {kept.record}, {name}", "time [s]", f"{name} [{campaign.y_unit}]",
-                          (Series(name, *thinned(t, x)),), (Limit("stuck from", at / rate, "x"),))
+                          (Series(name, t, x),), (Limit("stuck from", at / rate, "x"),))
         return Finding(self.name, "warning",
                        f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
                        f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "

@@ -9,16 +9,7 @@ from scipy import signal, stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    thinned,
-)
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
 
 MAINS_HZ = (50.0, 60.0)
 
@@ -111,21 +102,20 @@ class Hum(Gate):
     def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)
         part = max(hit.rms / max(k.rms[hit.channel], 1e-300) for k, hit in hits)
-        severity: Severity = "warning" if part > SETTINGS.large else "note"
         records = tuple(dict.fromkeys(k.record for k, _ in hits))
         at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
         harmonics = ", ".join(f"{k * mains:g}" for k in at)
         picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
-        return Finding(self.name, severity,
+        return Finding(self.name, "warning" if part > SETTINGS.large else "note",
                        f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
                        f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
                        f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
                        "lines out of the fit.", (name,), records, float(line.ratio), SETTINGS.least_ratio, picture)
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
-        f, a = thinned(kept.f[1:], kept.asd[1:, j])
         return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/sqrt(Hz)]",
-                       (Series(name, f, a),), tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
+                       (Series(name, kept.f[1:], kept.asd[1:, j]),),
+                       tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
 
 
 def _length(samples: int, rate: float) -> int:

@@ -18,7 +18,6 @@ from avis_ctrl.measurement.gates.finding import (
     Limit,
     Picture,
     Series,
-    Severity,
     percent,
     quoted,
 )
@@ -160,10 +159,10 @@ def _judged(gate: str, differences: list[Difference], campaign: Campaign,
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
         if bad.any():
             names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-            severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
+            large = d.relative[bad].max() > SETTINGS.large
             sentence, records = said(d, bad, names)
-            found.append(Finding(gate, severity, sentence, names, records, float(d.T[bad].max()), 1.0,
-                                 _picture(d, campaign.y_names)))
+            found.append(Finding(gate, "warning" if large else "note", sentence, names, records, float(d.T[bad].max()),
+                                 1.0, _picture(d, campaign.y_names)))
     if found:
         return found
     d = max(differences, key=lambda d: d.noise)

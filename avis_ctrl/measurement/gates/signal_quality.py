@@ -10,16 +10,7 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    quoted,
-)
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
 from avis_ctrl.measurement.gates.h1 import H1, h1, moving, octaves, segment_length, spectra, thirds, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
@@ -193,7 +184,6 @@ class Coherence(Gate):
     def _low(self, names: tuple[str, ...], group: list[int], middle: np.ndarray, mean: np.ndarray, surely: bool,
              seconds: float, below: str, picture: Picture) -> Finding:
         """One channel that is low everywhere, or all those that are low somewhere."""
-        severity: Severity = "warning" if surely else "note"
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
@@ -201,7 +191,7 @@ class Coherence(Gate):
             count = int(np.count_nonzero(mean[:, j] < SETTINGS.low_coherence))
             said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in {count} bands)")
         more = f" and {len(group) - 4} more channels" if len(group) > 4 else ""
-        return Finding(self.name, severity,
+        return Finding(self.name, "warning" if surely else "note",
                        f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
                        f"the {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that "
                        "is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
