@@ -113,11 +113,3 @@ def equal_pieces(record: RecordSource, longest: int | None) -> list[tuple[int, i
     if period:
         share = max(share // period, 1) * period
     return [(start, stop) for start, stop in ranges(samples, share) if 2 * (stop - start) >= share]
-
-
-def hermitian_solve(numerator: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """numerator inv(gram) for stacks of matrices, gram Hermitian; columns scaled, units differ by orders."""
-    size = np.sqrt(np.real(np.einsum("...ii->...i", gram)))
-    scaled = gram / (size[..., :, None] * size[..., None, :])
-    right = np.linalg.solve(scaled, np.swapaxes(numerator.conj() / size[..., None, :], -1, -2))
-    return np.swapaxes(right.conj(), -1, -2) / size[..., None, :]
