@@ -106,8 +106,7 @@ class EkfResult:
     Attributes
     ----------
     names, units, initial, values : n_p.
-    scaled_covariance : (n_p, n_p) of theta / initial (of log theta with the log parametrisation).
-    prior_share : prior standard deviation in the same units.
+    scaled_covariance : (n_p, n_p) of theta / initial.
     history : decimated. innovations : one a record.
     guarded : (n_p,) at how many samples the guard held a parameter.
     """
@@ -117,8 +116,6 @@ class EkfResult:
     initial: np.ndarray
     values: np.ndarray
     scaled_covariance: np.ndarray
-    logarithmic: bool
-    prior_share: float
     history: EkfHistory
     innovations: tuple[Innovations, ...]
     guarded: np.ndarray
@@ -126,18 +123,12 @@ class EkfResult:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(n_p, n_p) in the parameters' units; to first order with the log parametrisation."""
-        scale = self.values if self.logarithmic else self.initial
-        return self.scaled_covariance * np.outer(scale, scale)
+        """(n_p, n_p) in the parameters' units."""
+        return self.scaled_covariance * np.outer(self.initial, self.initial)
 
     @property
     def sigma(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def correlation(self) -> np.ndarray:
-        sigma = np.sqrt(np.diag(self.scaled_covariance))
-        return self.scaled_covariance / np.outer(sigma, sigma)
 
     @property
     def directions(self) -> Directions:
@@ -145,7 +136,7 @@ class EkfResult:
 
         A ratio near 1 is a combination of which the data said nothing. With the source's reset it is the last record's.
         """
-        values, vectors = np.linalg.eigh(self.scaled_covariance / self.prior_share ** 2)
+        values, vectors = np.linalg.eigh(self.scaled_covariance / self.settings.prior_share ** 2)
         return Directions(self.names, values, vectors)
 
     @property
