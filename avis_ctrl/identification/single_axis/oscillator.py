@@ -16,13 +16,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.single_axis.fit import SingleAxisFit, not_below, residual_statistics, sandwich
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded, slopes
 
 TRANSIENT = 4  # coefficients of T
 SMOOTHED = 8  # lines on either side whose residual gives the noise
 CORRELATED_LINES = 4
-NAMES, UNITS = ("m", "d", "k"), ("u s^2 a unit of y", "u s a unit of y", "u a unit of y")
+PARAMETERS = {"m": "u s^2 a unit of y", "d": "u s a unit of y", "k": "u a unit of y"}
 
 
 def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float]) -> SingleAxisFit:
@@ -65,29 +64,15 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
                                measured=f"m {x[0] * to_units[0]:.3g}, k {x[2]:.3g}",
                                cause="input and output exchanged, or a band without the resonance",
                                next_step="check the columns and widen the band")
-    e = left(x, weight)
-    J = np.column_stack([(left(x + h, weight) - left(x - h, weight)) / (2 * h.max())
-                         for h in np.diag(1e-6 * np.abs(x) + 1e-300)]) / to_units
-    return _result(f, Y, error, x * to_units, e, J)
-
-
-def _result(f: np.ndarray, Y: np.ndarray, error: np.ndarray, theta: np.ndarray, e: np.ndarray, J: np.ndarray
-            ) -> SingleAxisFit:
-    n = len(f)
-    size = np.linalg.norm(J, axis=0)
-    bread = np.linalg.inv((J / size).T @ (J / size)) / np.outer(size, size)
-    scores = J[:n] * e[:n, None] + J[n:] * e[n:, None]
-    spent = len(theta) + TRANSIENT
+    J = slopes(lambda x: left(x, weight), x, np.abs(x)) / to_units
+    n, e, spent = len(f), left(x, weight), len(x) + TRANSIENT
     # Damping rests on the few lines of the resonance, to which the fit bends.
-    covariance = not_below(sandwich(bread, scores, CORRELATED_LINES, n * (1 - spent / (2 * n))), bread)
-    statistics = residual_statistics(error, Y, np.sqrt(np.diag(covariance)), np.sqrt(np.diag(bread)), CORRELATED_LINES)
-    information = Information(NAMES, theta, UNITS, J.T @ J, np.abs(theta))
-    return SingleAxisFit("m y'' + d y' + k y = u", information, covariance,
-                         f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
-                         float(e @ e), 2 * n - spent, "residual", statistics, f, Y, Y - error,
-                         ("of the best linear oscillator at the level of this record; another level has another, which "
-                          "the deviations do not hold",
-                          "figure data: spectrum of the output and of the model's, transient included"))
+    return concluded("m y'' + d y' + k y = u", PARAMETERS, x * to_units, e.reshape(2, n).T,
+                     J.reshape(2, n, -1).swapaxes(0, 1), spent, (f, Y, Y - error), lags=CORRELATED_LINES,
+                     method=f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
+                     notes=("of the best linear oscillator at the level of this record; another level has another, "
+                            "which the deviations do not hold",
+                            "figure data: spectrum of the output and of the model's, transient included"))
 
 
 def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, float]
