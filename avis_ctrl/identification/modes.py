@@ -27,7 +27,6 @@ from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.sample_and_hold import aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
@@ -275,15 +274,7 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     n, n_y, m = block.Y.shape
     omega, n_u = np.tile(block.omega, m), len(model.actuators)
     s = 1j * omega
-    chain = model.sensors.sense(omega)[:, 0]
-    if model.period_s:
-        drive = hold(omega, model.period_s, model.delay_s)
-        folded = aliases(omega, model.period_s, model.delay_s, model.sensors.motion, model.amplifier_corner_Hz,
-                         model.sensors.low_pass)
-    else:
-        drive, folded = np.exp(-s * model.delay_s), np.zeros(len(omega), complex)
-    if model.amplifier_corner_Hz:
-        drive = drive / (1 + s / (2 * np.pi * model.amplifier_corner_Hz))
+    chain, (drive, folded) = model.sensors.sense(omega)[:, 0], (one[:, 0, 0] for one in model.drive(omega))
     U = np.moveaxis(block.U[:, driven], 2, 0).reshape(m * n, -1)
     volts = driven < n_u
     # Of a floor's velocity the springs take the integral.
