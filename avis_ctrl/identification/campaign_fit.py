@@ -14,7 +14,7 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
-from avis_ctrl.identification.noise import noise_from_residuals, relative_noise, residual_noise
+from avis_ctrl.identification.noise import noise_from_residuals, relative_noise
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.identification.response import MOMENTS, ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
@@ -357,7 +357,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     notes.append(f"{turning.sentence}: {_share(blocks, added)}")
     first = replace(found, starts=first.starts)
     for k in range(reweights):
-        weighed = residual_noise(found.residuals, model=found.model)
+        weighed = noise_from_residuals(found.residuals, [one.block for one in found.residuals], found.model)
         if k == reweights - 1:
             added = terms(campaign, blocks, found.model)
             weighed = [replace(block, Y=one.Y) for block, one in
