@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.ekf import identify_ekf
 from avis_ctrl.identification.ekf_model import linear_model, source_parameters
-from avis_ctrl.identification.ekf_result import Directions, innovation_statistics, parameter_curves
+from avis_ctrl.identification.ekf_result import innovation_statistics, kinds
 from avis_ctrl.identification.ekf_settings import (
     HONEST_SETTINGS,
     SOURCE_SETTINGS,
@@ -17,6 +17,7 @@ from avis_ctrl.identification.ekf_settings import (
     floor_noise,
     measurement_variance,
 )
+from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.identification.prefilter import delayed, prefilter, sensor_inverse
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs import load_rig
@@ -184,14 +185,13 @@ def test_white_innovations_are_consistent_and_others_not(rng):
 def test_curves_of_the_sources_figures(rig, campaign):
     names = source_parameters(rig)
     result = identify_ekf(rig, campaign, names=names)
-    figures = parameter_curves(result)
-    assert [figure.title for figure in figures] == ["Mass and inertia", "Damping", "Stiffness"]
-    assert [len(figure.names) for figure in figures] == [4, 11, 11]
-    stiffness = figures[2]
-    assert stiffness.estimate.shape == stiffness.lower.shape == (4, 11) == (len(stiffness.time_s), 11)
-    assert np.all(stiffness.lower < stiffness.estimate) and np.all(stiffness.estimate < stiffness.upper)
+    assert {title: len(index) for title, index in kinds(result).items()} == {
+        "Mass and inertia": 4, "Damping": 11, "Stiffness": 11}
+    curves = result.history
+    assert curves.theta.shape == curves.lower.shape == (4, 26) == (len(curves.time_s), 26)
+    assert np.all(curves.lower < curves.theta) and np.all(curves.theta < curves.upper)
     # At the first sample nothing is known yet: the band is twice 25 % either way.
-    assert np.allclose(figures[0].upper[0] / figures[0].estimate[0], 1.5, rtol=1e-2)
+    assert np.allclose(curves.upper[0, :4] / curves.theta[0, :4], 1.5, rtol=1e-2)
 
 
 # -- input to refuse -----------------------------------------------------------------------------------------------
@@ -277,10 +277,8 @@ def test_some_channels_are_enough(rig, campaign):
     assert result.values.shape == (2,) and np.all(np.isfinite(result.sigma))
 
 
-def test_directions_that_kept_their_variance_are_said_in_words():
-    """The threshold itself counts as kept; members that carry a tenth or less are left out."""
-    found = Directions(("a", "b", "c"), np.array([0.01, 0.5, 1.0]),
-                       np.array([[0.0, 1.0, 0.0], [0.8, 0.0, -0.6], [0.6, 0.0, 0.8]]))
-    assert found.words() == ("not determined: a up (variance 0.5 of the prior's)",
-                             "not determined: c up with b down (variance 1 of the prior's)")
-    assert found.words(1.0) == found.words()[1:]
+def test_the_main_members_of_a_direction():
+    """Nine tenths of it, the largest first and positive; members that carry a tenth or less are left out."""
+    assert main_members(("a", "b", "c"), np.array([1.0, 0.0, 0.0])) == [("a", 1.0)]
+    assert main_members(("a", "b", "c"), np.array([0.0, -0.6, 0.8])) == [("c", 0.8), ("b", -0.6)]
+    assert main_members(("a", "b", "c"), np.array([-0.3, 0.0, -0.95])) == [("c", 0.95)]

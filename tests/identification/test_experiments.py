@@ -126,7 +126,7 @@ def test_sentences_and_the_plan(avis):
     longer = Experiment("Record twice as long", DRIVE)
     bench = Experiment("Measure isolator1.k_x", bench={"isolator1.k_x": 0.02})
     raised = Experiment("Raise 1 and 3", DRIVE,
-                        lambda m: changed(m, {"isolator1.p_z": 0.05, "isolator3.p_z": 0.05}))
+                        {"shifts": {"isolator1.p_z": 0.05, "isolator3.p_z": 0.05}})
     added = predicted(model, [longer, bench, raised], NOISE)
     ranked = compared(now, added)
     assert [one.experiment for one in ranked] == [raised, bench, longer]
