@@ -62,27 +62,24 @@ class ChangedModel(ResponseModel):
     more_sensors: tuple[AddedSensor, ...] = ()
     more_actuators: tuple[AddedActuator, ...] = ()
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return (*self.actuators, *FLOOR)
+    def __post_init__(self) -> None:
+        self._own()  # refuses what the rig does not have
 
     def matrices_of(self, rig: Rig) -> Matrices:
-        own = self._plain().matrices_of(rig)
+        own = self._own().matrices_of(rig)
         M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
         R = np.vstack([own.R, *(np.array(one.direction) @ point_map(one.place) for one in self.more_sensors)])
         T = np.column_stack([own.T, *(one.constant_N_per_V * point_map(one.place).T @ np.array(one.direction)
                                       for one in self.more_actuators)])
         return own._replace(M=M, R=R, T=T)
 
-    def _plain(self) -> ResponseModel:
-        n_y, n_u = len(self.more_sensors), len(self.more_actuators)
-        sensors = self.sensors.picked(range(len(self.sensors.names) - n_y))
+    def _own(self) -> ResponseModel:
+        """With the rig's own channels and parameters alone."""
+        n_y, n_u = (len(all_) - len(more) for all_, more in ((self.sensors.names, self.more_sensors),
+                                                             (self.actuators, self.more_actuators)))
         names = tuple(name for name in self.names if name in self.rig.parameters())
-        return ResponseModel(self.rig, names, sensors, self.actuators[:len(self.actuators) - n_u], self.period_s,
+        return ResponseModel(self.rig, names, self.sensors.picked(range(n_y)), self.actuators[:n_u], self.period_s,
                              self.delay_s, self.amplifier_corner_Hz)
-
-    def __post_init__(self) -> None:
-        self._plain()  # refuses what the rig does not have
 
 
 def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,

@@ -33,7 +33,7 @@ from scipy.optimize import lsq_linear
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FrequencyModel, moment_rows
-from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
+from avis_ctrl.identification.spectra import span, thinned, transient_columns, transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Prior = tuple[float, float]
@@ -46,10 +46,13 @@ class LikelihoodSettings:
     edge : distance that a moment of inertia keeps from the sum of the other two, relative to the sum of all three.
     near : distance from a limit, in relative units, within which a parameter counts as at it.
     known : smallest eigenvalue of the scaled normal matrix, relative to the largest, of a direction that is determined.
+    thin_lines, thin_by : lines of a block on which a start other than the first begins: so many, or one in so many.
     at_once : lines that are whitened together: with some hundred parameters they stay in the processor's cache.
     """
 
     few_lines: int = 4000
+    thin_lines: int = 200
+    thin_by: int = 8
     at_once: int = 32
     edge: float = 1e-6
     near: float = 1e-6
@@ -170,10 +173,8 @@ def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Pri
 
 
 def _thinned_descent(begin: Fitted, blocks, priors, first: Fitted, max_iterations: int) -> Fitted:
-    """A first descent on some of the lines, drawn at random: from afar it leads to the same place, in less time."""
-    rng = np.random.default_rng(0)
-    few = [block.lines(np.sort(rng.choice(len(block.omega), max(min(len(block.omega), 200), len(block.omega) // 8),
-                                          replace=False))) for block in blocks]
+    """A first descent on some of the lines: from afar it leads to the same place, in less time."""
+    few = [thinned(block, max(SETTINGS.thin_lines, len(block.omega) // SETTINGS.thin_by)) for block in blocks]
     descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
     descent.run(max_iterations)
     return descent.model

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.maximum_likelihood import Residual
@@ -40,7 +41,7 @@ def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> li
     for block in blocks:
         power = np.sum(np.abs(block.Y) ** 2, axis=2)
         width = max(3, len(block.omega) // 20)
-        level = _smoothed(power, width) + 1e-12 * power.max(0)
+        level = uniform_filter1d(power, width, axis=0, mode="nearest") + 1e-12 * power.max(0)
         found.append(block.with_noise(fraction ** 2 * level[:, :, None] * np.eye(level.shape[1])))
     return found
 
@@ -172,10 +173,3 @@ def _lifted(noise: np.ndarray) -> np.ndarray:
     size = np.real(np.einsum("nii->ni", noise))
     n_y = noise.shape[-1]
     return noise + 1e-9 * size[:, :, None] * np.eye(n_y) + 1e-30 * np.eye(n_y) * (size.max() or 1.0)
-
-
-def _smoothed(power: np.ndarray, width: int) -> np.ndarray:
-    """(n, n_y) running mean over lines."""
-    kernel = np.ones(width) / width
-    padded = np.pad(power, ((width // 2, width - 1 - width // 2), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, kernel, mode="valid") for column in padded.T], axis=1)

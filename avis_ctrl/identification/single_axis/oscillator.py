@@ -13,6 +13,7 @@ best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963).
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
@@ -57,7 +58,9 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
         x = found.x * scale
         e = left(x, weight)
         error = (e[:len(f)] + 1j * e[len(f):]) / weight
-        weight = np.sqrt(2 / _smoothed(np.abs(error) ** 2))
+        power = np.abs(error) ** 2
+        level = uniform_filter1d(power, 2 * SMOOTHED + 1, mode="nearest")
+        weight = np.sqrt(2 / np.maximum(level, 1e-12 * power.mean() + np.finfo(float).tiny))
     to_units = np.array([1 / s0 ** 2, 1 / s0, 1.0])
     if not (x[0] > 0 and x[2] > 0):
         raise ComputationError("no oscillator with positive mass and stiffness fits the record",
@@ -102,10 +105,3 @@ def _linear(U: np.ndarray, Y: np.ndarray, s: np.ndarray, powers: np.ndarray) -> 
 
 def _parts(z: np.ndarray) -> np.ndarray:
     return np.concatenate([z.real, z.imag])
-
-
-def _smoothed(power: np.ndarray) -> np.ndarray:
-    """Mean over the neighbouring lines."""
-    width = 2 * SMOOTHED + 1
-    mean = np.convolve(np.pad(power, SMOOTHED, mode="edge"), np.ones(width) / width, mode="valid")
-    return np.maximum(mean, 1e-12 * power.mean() + np.finfo(float).tiny)
