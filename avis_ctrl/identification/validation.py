@@ -8,7 +8,7 @@ them, or in none). The local polynomial model's covariance gives a second figure
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -113,27 +113,16 @@ class Validation:
         return all(one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for a file, without the arrays of figures."""
-        return {"verdict": self.verdict, "passed": self.passed, "sentences": list(self.sentences),
-                "notes": list(self.notes), "outputs": list(self.outputs), "band_Hz": list(self.band_Hz),
-                "held_out": [_plain(one) for one in self.held_out],
-                "modes": [{f.name: _number(getattr(row, f.name)) for f in fields(row)} for row in self.modes]}
+        """Values for a file, without the arrays of figures."""
+        return {"verdict": self.verdict, "passed": self.passed, "sentences": self.sentences, "notes": self.notes,
+                "outputs": self.outputs, "band_Hz": self.band_Hz, "modes": [vars(row) for row in self.modes],
+                "held_out": [_without_figures(one) for one in self.held_out]}
 
 
-def _plain(one: HeldOut) -> dict[str, Any]:
-    found = {f.name: _number(getattr(one, f.name)) for f in fields(one) if f.name != "whiteness"}
-    if one.whiteness is not None:
-        found["whiteness"] = {"white": one.whiteness.white, "sentences": list(one.whiteness.sentences)}
-    return found
-
-
-def _number(value: Any) -> Any:
-    """Arrays as lists; what is not a number as None, which JSON knows."""
-    if isinstance(value, np.ndarray):
-        return [_number(one) for one in value.tolist()]
-    if isinstance(value, (tuple, list)):
-        return [_number(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _without_figures(one: HeldOut) -> dict[str, Any]:
+    found = dict(vars(one))
+    white = found.pop("whiteness")
+    return found if white is None else found | {"whiteness": {"white": white.white, "sentences": white.sentences}}
 
 
 def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse

@@ -1,6 +1,5 @@
 """Validation on held-out data against the exact simulation, known laws, finite differences and Monte Carlo."""
 
-import json
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,6 +29,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import simulate
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.plan_file import plan_from_table
 
 BAND = (0.5, 30.0)
@@ -81,7 +81,7 @@ def test_an_identified_rig_leaves_what_noise_leaves(checked):
         assert 0.97 * one.nrms_all_interval[0] < one.nrms_all < 1.03 * one.nrms_all_interval[1]
         assert one.whiteness is not None and one.whiteness.white
     assert "expected" in checked.verdict and checked.verdict.startswith("the identified model agrees with the held-out")
-    json.dumps(checked.as_dict(), allow_nan=False)
+    as_json(checked.as_dict())
 
 
 def test_one_record_beyond_its_noise_is_enough(checked):
