@@ -110,11 +110,6 @@ class EkfResult:
         values, vectors = np.linalg.eigh(self.scaled_covariance / self.settings.prior_share ** 2)
         return values[values >= 0.5], vectors[:, values >= 0.5]
 
-    @property
-    def consistent(self) -> bool:
-        """Whether the innovations of the last record agree with the covariance; if not, sigma means little."""
-        return self.innovations[-1].consistent
-
 
 def kinds(result: EkfResult) -> dict[str, list[int]]:
     """Parameters by figure, as figs. 3.1 to 3.3 have them: mass and inertia, damping, stiffness, others."""

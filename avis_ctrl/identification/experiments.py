@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
 _LINES = 120
-FLOOR_BAND_HZ = (0.5, 60.0)
 Place = tuple[float, float, float]
 
 
@@ -106,51 +106,20 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
                         tuple(actuators))
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """Noise of a record on a line, for spectra scaled by 1/sqrt(samples).
+class Noise(NamedTuple):
+    """Covariance (n, n_y, n_y) of the noise of a record on lines omega (n,), for spectra scaled by 1/sqrt(samples)."""
 
-    sensor_V : r.m.s. of each channel (n_y,), or one for all, white, converter included. floor_m_per_s : r.m.s. of the
-    floor that was not measured, each direction, over 0.5-60 Hz. measured : (omega, covariance (n, n_y, n_y)) from a
-    campaign, in place of both. assumed : what no file said, in words.
-    """
+    omega: np.ndarray
+    covariance: np.ndarray
 
-    sensor_V: float | np.ndarray
-    floor_m_per_s: float = 0.0
-    measured: tuple[np.ndarray, np.ndarray] | None = None
-    assumed: str = ""
-
-    def covariance(self, model: ResponseModel, omega: np.ndarray, floor_known: bool) -> np.ndarray:
-        """(n, n_y, n_y); channels beyond those that were measured have the median channel's power, independent."""
-        n_y = len(model.sensors.names)
-        if self.measured is not None:
-            return self._interpolated(omega, n_y)
-        white = np.atleast_1d(self.sensor_V) ** 2
-        if len(white) < n_y:
-            white = np.concatenate([white, np.full(n_y - len(white), np.median(white))])
-        C = np.broadcast_to(white * np.eye(n_y, dtype=complex), (len(omega), n_y, n_y)).copy()
-        if self.floor_m_per_s and not floor_known:
-            U = np.zeros((len(omega), len(model.inputs), 3), complex)
-            U[:, -3:] = np.eye(3)
-            G = model.driven(omega, U, False).Y
-            rate = 1 / model.period_s if model.period_s else 1000.0
-            low, high = (2 * np.pi * f for f in FLOOR_BAND_HZ)
-            power = self.floor_m_per_s ** 2 * rate / 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0])
-            inside = (omega >= low) & (omega <= high)
-            C += np.where(inside, power, 0.0)[:, None, None] * G @ np.conj(G.swapaxes(1, 2))
-        return C
-
-    def _interpolated(self, omega: np.ndarray, n_y: int) -> np.ndarray:
-        assert self.measured is not None
-        known, covariance = self.measured
-        nearest = np.clip(np.searchsorted(known, omega), 0, len(known) - 1)
-        C = np.zeros((len(omega), n_y, n_y), complex)
-        own = covariance[nearest]
+    def at(self, omega: np.ndarray, n_y: int) -> np.ndarray:
+        """(.., n_y, n_y) on the nearest lines; channels beyond the measured ones have the median power, independent."""
+        own = self.covariance[np.clip(np.searchsorted(self.omega, omega), 0, len(self.omega) - 1)]
         n_own = own.shape[1]
-        C[:, :n_own, :n_own] = own
         middle = np.median(np.real(np.einsum("nii->ni", own)), axis=1)
-        C[:, range(n_own, n_y), range(n_own, n_y)] = middle[:, None]
-        return C
+        found = middle[:, None, None] * np.eye(n_y, dtype=complex)
+        found[:, :n_own, :n_own] = own
+        return found
 
 
 def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
@@ -163,8 +132,7 @@ def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
         raise InputError("expected records with an estimate of their noise", field="blocks", value=len(blocks))
     longest = max(records, key=lambda one: len(one.omega))
     assert longest.noise is not None
-    return Noise(float(np.sqrt(np.median(np.real(np.einsum("nkii->nki", longest.noise))))),
-                 measured=(longest.omega, longest.noise[:, 0]))
+    return Noise(longest.omega, longest.noise[:, 0])
 
 
 @dataclass(frozen=True)
@@ -203,7 +171,7 @@ def predicted_information(model: ResponseModel, drive: Drive, noise: Noise) -> I
     dY = model.driven(omega, U[:, :, np.array(columns) > 0]).dY if np.any(columns) else None
     H = np.zeros((len(model.names), len(model.names)))
     if dY is not None:
-        L = np.linalg.inv(np.linalg.cholesky(noise.covariance(model, omega, bool(drive.floor_m_per_s))))
+        L = np.linalg.inv(np.linalg.cholesky(noise.at(omega, len(model.sensors.names))))
         white = (L @ dY) * np.sqrt(2 * lines)[:, None, None]
         flat = white.reshape(len(white), -1)
         H = np.real(np.conj(flat) @ flat.T)

@@ -92,7 +92,6 @@ class Validation:
     outputs, band_Hz : of all figures. held_out : one a record, or piece of a long one.
     overlay : measured and model responses for figures, of all records; None where they allow none.
     modes : the model's beside the start's and those measured in the held-out data without the rig's equations.
-    mode_note : where the measured ones come from, or why there are none.
     verdict : one sentence with the numbers. sentences : the verdict, whiteness, time, modes and responses in words.
     notes : what was used, and what could not be computed.
     """
@@ -102,7 +101,6 @@ class Validation:
     held_out: tuple[HeldOut, ...]
     overlay: ResponseOverlay | None
     modes: tuple[ModeRow, ...]
-    mode_note: str
     verdict: str
     sentences: tuple[str, ...]
     notes: tuple[str, ...]
@@ -144,7 +142,7 @@ def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     drawn = _overlay(found, fitted, held_out, notes)
     verdict = verdict_of(figures)
     said = (verdict, *_sentences(figures), *_mode_sentence(modes), mode_note, *_overlay_sentence(drawn))
-    return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, mode_note, verdict,
+    return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, verdict,
                       said, tuple(notes))
 
 
@@ -309,8 +307,7 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     else:
         data = held_out
     try:
-        return overlay(measured_response(data, found.band_Hz, found.fit.model), found.fit.model, found.start,
-                       found.fit.information.covariance)
+        return overlay(measured_response(data, found.band_Hz, found.fit.model), found.fit.model, found.start)
     except AvisError as failed:
         notes.append(f"no measured response to draw ({failed})")
         return None

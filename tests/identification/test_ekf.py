@@ -278,7 +278,7 @@ def test_a_filter_told_a_tenth_of_the_noise_is_seen_through(rig, wrong, campaign
     right = identify_ekf(wrong, campaign, EkfSettings(R=None, Q=1e-15, v_sigma=1e-4, reset=False))
     small = identify_ekf(wrong, campaign, EkfSettings(R=1.15e-14, Q=1e-15, v_sigma=1e-4, reset=False))
     assert 0.95 < right.innovations[-1].nis_per_output < 1.05
-    assert small.innovations[-1].nis_per_output > 3 and not small.consistent
+    assert small.innovations[-1].nis_per_output > 3 and not small.innovations[-1].consistent
 
 
 # -- the rig -------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from avis_ctrl.rigs.rigid_body import cross_matrix
 MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
 BODY = ["mass", "J1", "J2", "J3"]
 CORNER = (0.4, 0.3, 0.1)
-NOISE = Noise(1e-3)
+NOISE = Noise(np.array([1.0]), 1e-6 * np.eye(6)[None])
 DRIVE = Drive(0.3, 60.0)
 
 
