@@ -84,7 +84,7 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
     if kind == "seismometer":
         responses, refused = stepped_sine(campaign, driven, measured, scale)
         fit = fit_seismometer(responses, **options)
-        return _noted(fit, refused)
+        return replace(fit, notes=(*fit.notes, *(f"left out: {reason}" for reason in refused)))
     time, channel = _channels(_single(campaign, path), driven, measured, scale)
     if kind == "drive":
         return fit_drive(time, channel["position"], channel["force"], reference=channel.get("reference"), **options)
@@ -210,7 +210,3 @@ def _decay(time: np.ndarray, y: np.ndarray, corner_Hz: float = 1.0, damping: flo
         raise InputError(f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
                          field="start_s, end_s", value=(start_s, end_s))
     return fit_decay(time[keep], y[keep], corner_Hz, damping, drift)
-
-
-def _noted(fit: SingleAxisFit, refused: Sequence[str]) -> SingleAxisFit:
-    return replace(fit, notes=(*fit.notes, *(f"left out: {reason}" for reason in refused)))
