@@ -10,8 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from avis_ctrl.identification.experiments import (
-    AddedActuator,
-    AddedSensor,
+    Added,
     Drive,
     Noise,
     changed,
@@ -87,7 +86,7 @@ def _alone_text(alone: Mapping[str, float]) -> str:
     return f", so that these parameters are determined individually: {listed(shown)}"
 
 
-Added = list[tuple[Experiment, Information]]
+Predictions = list[tuple[Experiment, Information]]
 
 
 def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
@@ -139,12 +138,12 @@ def _more_channels(model: ResponseModel, drive: Drive) -> list[Experiment]:
     x, y, z = model.rig.mounted_body().mounts[0].position
     top, found = (-x, -y, -z), []
     for axis, direction in {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}.items():
-        sensor = AddedSensor(f"added sensor {axis}", top, direction)
+        sensor = Added(f"added sensor {axis}", top, direction)
         found.append(Experiment(f"Add a calibrated sensor along {axis} on the payload at "
                                 f"({', '.join(f'{v:g}' for v in top)}) m and record once more", drive,
                                 {"sensors": [sensor]}))
     constant = float(np.max(np.abs(model.matrices.T)))
-    motor = AddedActuator("added actuator", top, (0.0, 0.0, 1.0), constant)
+    motor = Added("added actuator", top, (0.0, 0.0, 1.0), constant)
     found.append(Experiment("Add a calibrated vertical actuator at the same place and record once more", drive,
                             {"actuators": [motor]}))
     return found
@@ -177,20 +176,17 @@ def _independent(rows: np.ndarray) -> list[int]:
     return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][:len(rows)].tolist())
 
 
-def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Added:
+def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Predictions:
     """Each experiment with what it would add."""
     return [(one, one.information(model, noise)) for one in experiments]
 
 
-def compared(information: Information, added: Added) -> tuple[Outcome, ...]:
+def compared(information: Information, added: Predictions) -> tuple[Outcome, ...]:
     """What each experiment would add by itself, the best first: most combinations, then the smallest errors."""
-    found = [_outcome(information, one, extra) for one, extra in added]
-    return tuple(sorted(found, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter)))
-
-
-def _worst(outcome: Outcome) -> float:
-    """Predicted error of what is new."""
-    return float(np.median(list(outcome.alone.values()))) if outcome.alone else np.inf
+    def rank(one: Outcome) -> tuple[float, ...]:
+        error = float(np.median(list(one.alone.values()))) if one.alone else np.inf
+        return -one.gained, -len(one.alone), error, -one.tighter
+    return tuple(sorted((_outcome(information, one, extra) for one, extra in added), key=rank))
 
 
 def _outcome(before: Information, experiment: Experiment, added: Information) -> Outcome:
@@ -205,13 +201,12 @@ def _outcome(before: Information, experiment: Experiment, added: Information) ->
     return Outcome(experiment, after, after.rank, after.rank - before.rank, alone, tighter)
 
 
-def planned(information: Information, added: Added) -> tuple[Outcome, ...]:
+def planned(information: Information, added: Predictions) -> tuple[Outcome, ...]:
     """Experiments one after the other, each the one that adds most to those before; ends when nothing is gained."""
     chosen: list[Outcome] = []
     now = information
     while now.rank < len(now.names):
-        outcomes = [_outcome(now, one, extra) for one, extra in added]
-        best = min(outcomes, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter))
+        best = compared(now, added)[0]
         if not best.gained:
             break
         chosen.append(best)

@@ -32,23 +32,21 @@ _LINES = 120
 Place = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class AddedSensor:
-    """Calibrated sensor of the rig's own kind at a place [m] along a direction; it senses the payload."""
+class Added(NamedTuple):
+    """Calibrated sensor of the rig's own kind, or actuator, at a place [m] of the payload along a direction.
+
+    force : N/V of an actuator.
+    """
 
     name: str
     place: Place
     direction: Place
+    force: float = 1.0
 
-
-@dataclass(frozen=True)
-class AddedActuator:
-    """Calibrated actuator at a place [m] along a direction."""
-
-    name: str
-    place: Place
-    direction: Place
-    constant_N_per_V: float
+    @property
+    def row(self) -> np.ndarray:
+        """(6,) displacement along it by q; of an actuator, generalised force by volts."""
+        return self.force * np.array(self.direction) @ point_map(self.place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +57,8 @@ class ChangedModel(ResponseModel):
     """
 
     masses: tuple[tuple[float, Place], ...] = ()
-    more_sensors: tuple[AddedSensor, ...] = ()
-    more_actuators: tuple[AddedActuator, ...] = ()
+    more_sensors: tuple[Added, ...] = ()
+    more_actuators: tuple[Added, ...] = ()
 
     def __post_init__(self) -> None:
         self._own()  # refuses what the rig does not have
@@ -68,10 +66,8 @@ class ChangedModel(ResponseModel):
     def matrices_of(self, rig: Rig) -> Matrices:
         own = self._own().matrices_of(rig)
         M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
-        R = np.vstack([own.R, *(np.array(one.direction) @ point_map(one.place) for one in self.more_sensors)])
-        T = np.column_stack([own.T, *(one.constant_N_per_V * point_map(one.place).T @ np.array(one.direction)
-                                      for one in self.more_actuators)])
-        return own._replace(M=M, R=R, T=T)
+        R = np.vstack([own.R, *(one.row for one in self.more_sensors)])
+        return own._replace(M=M, R=R, T=np.column_stack([own.T, *(one.row for one in self.more_actuators)]))
 
     def _own(self) -> ResponseModel:
         """With the rig's own channels and parameters alone."""
@@ -83,8 +79,8 @@ class ChangedModel(ResponseModel):
 
 
 def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
-            masses: Sequence[tuple[float, Place]] = (), sensors: Sequence[AddedSensor] = (),
-            actuators: Sequence[AddedActuator] = ()) -> ChangedModel:
+            masses: Sequence[tuple[float, Place]] = (), sensors: Sequence[Added] = (),
+            actuators: Sequence[Added] = ()) -> ChangedModel:
     """The model of the changed rig, with the same free parameters.
 
     shifts : known changes of parameters of the rig, in their units (isolator1.p_z and so on). Raises InputError for

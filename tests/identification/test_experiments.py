@@ -15,7 +15,7 @@ from avis_ctrl.identification.experiment_plan import (
     predicted,
 )
 from avis_ctrl.identification.experiments import (
-    AddedSensor,
+    Added,
     Drive,
     Noise,
     changed,
@@ -67,7 +67,7 @@ def test_the_added_mass_is_that_of_a_body_with_it(avis):
 
 def test_derivatives_of_a_changed_rig(avis):
     model = ResponseModel.of(avis, ["mass", "J1", "isolator1.k_x", "actuator.Ay1", "sensor.Sy1"])
-    new = AddedSensor("new", (0.0, 0.1, 0.2), (1.0, 0.0, 0.0))
+    new = Added("new", (0.0, 0.1, 0.2), (1.0, 0.0, 0.0))
     other = changed(model, {"isolator1.p_z": 0.05}, [(50.0, CORNER)], [new])
     omega = np.linspace(5, 100, 7)
     U = np.broadcast_to(np.eye(11, dtype=complex), (7, 11, 11))
