@@ -139,16 +139,12 @@ def _consistency(found: Identification, result: EkfResult) -> Table:
 
 def _hidden(result: EkfResult) -> tuple[str, ...]:
     s = result.settings
-    said = ["Measurement noise: " + ("the sensor noise and converter of the rig file." if s.R is None else
-                                     f"set by hand, R = {s.R}; a value above the real sensor noise widens every band."),
-            "Process noise: " + ("the rig file's ambient floor motion, through the isolators. It does not hold for a "
-                                 "record with stronger floor motion." if s.Q is None else f"set by hand, Q = {s.Q}."),
+    said = ["Measurement noise: the sensor noise and converter of the rig file.",
+            "Process noise: the rig file's ambient floor motion, through the isolators. It does not hold for a record "
+            "with stronger floor motion.",
             f"Prior: standard deviation {100 * s.prior_share:g} % of each starting value. A parameter that the data do "
-            "not determine keeps this band; the band then depends on the prior only, not on the rig."]
-    said.append("Each record starts again from the prior covariance: the last record alone determines the bands."
-                if s.reset else "The covariance is kept from record to record"
-                + (f", after {s.warm_up} record{'s' * (s.warm_up > 1)} of warm-up for the linearisation."
-                   if s.warm_up else "."))
+            "not determine keeps this band; the band then depends on the prior only, not on the rig.",
+            f"The covariance is kept from record to record, after {s.warm_up} record of warm-up for the linearisation."]
     held = [name for name, count in zip(result.names, result.guarded, strict=True) if count]
     if held:
         said.append(f"The lower limit of the parameters was reached by {words.joined(held)}.")
