@@ -32,7 +32,7 @@ from avis_ctrl.gap.result import (
     missed,
 )
 from avis_ctrl.gap.score import EvidenceScore
-from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, search, without_effect
+from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, outliers, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
@@ -48,15 +48,12 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """base : the rig re-identified. tolerant : with every tolerance. steps : of the search."""
+    """base : the rig re-identified. tolerant : with every tolerance. steps : of the search. best : with all effects."""
 
     base: Fitted
     tolerant: Fitted
     steps: tuple[Step, ...]
-
-    @property
-    def best(self) -> Fitted:
-        return self.steps[-1].fitted if self.steps else self.tolerant
+    best: Fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +99,8 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         progress("noise estimated again, with the effects that were found")
         prepared = with_noise_beside(prepared, fits.best.model, each)
         fits = _refitted(fits, prepared, known, progress, each, settings)
+    more, best = outliers(fits.best, prepared.data(prepared.fitted, settings.lines), known, settings, progress, each)
+    fits = replace(fits, steps=(*fits.steps, *more), best=best)
     progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
@@ -121,7 +120,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
                     nominal=replace(nominal, names=tolerances.names), corners_differ=True)
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    return _searched(Fits(base, tolerant, ()), data, effects, progress, each, settings)
+    return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings)
 
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Each,
@@ -146,7 +145,7 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
         return rise < settings.trace * ground and rise < settings.minor * before
     steps = search(fits.tolerant, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough,
                    fits.steps)
-    return replace(fits, steps=tuple(steps))
+    return replace(fits, steps=tuple(steps), best=steps[-1].fitted if steps else fits.tolerant)
 
 
 def _left(model, data: Data) -> float:

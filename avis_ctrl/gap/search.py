@@ -25,7 +25,7 @@ from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
@@ -180,6 +180,32 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
     if steps:
         more([one for one in effects if one.name in BEYOND], lambda step: False)
     return steps
+
+
+def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
+             progress: Progress = lambda text: None, each: Each = one_by_one) -> tuple[list[Step], Fitted]:
+    """Values of the rig file beyond their tolerance that stand out of the others, where these moved by much less than
+    their tolerances; and the last fit, with the tolerances as stated.
+
+    The priors are as narrow as the values are spread, before and with each effect alike.
+    """
+    rows, size = spread(now, settings)
+    if size > settings.narrow:
+        return [], now
+    progress(f"search for values that stand out of the others, which moved by {size:.2f} tolerances")
+    steps: list[Step] = []
+    narrow: Fitted | None = _with_spread(now, rows, size, data, settings)
+    while narrow is not None and len(now.labels) + len(steps) < settings.longest:
+        step = _step(narrow, data, [one for one in effects if one.name in BEYOND], settings, each)
+        steps += [] if step is None else [step]
+        narrow = None if step is None else step.fitted
+    return steps, _with_spread(steps[-1].fitted, rows, 1 / size, data, settings) if steps else now
+
+
+def _with_spread(fitted: Fitted, rows: Sequence[int], size: float, data: Data, settings: GapSettings) -> Fitted:
+    """The fit with some priors narrower by a factor."""
+    priors = fitted.priors.scaled(rows, size)
+    return fit(fitted.model, priors, priors.z(fitted.priors.values(fitted.z)), data, fitted.variances, settings)
 
 
 def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:

@@ -21,6 +21,12 @@ class GapSettings(FitSettings):
     beyond_tolerance : prior standard deviation of a value that may be beyond its tolerance, in tolerances: a gain 10 %
         off, a sensor tilted by 3 degrees, a centre of mass by 10 mm; what is further off shows all the same.
     beyond_least : tolerances by which a value must differ from the rig file's to be beyond its tolerance.
+    determined : part of a tolerance's prior variance that the data must take away for the value to be one that they
+        determine [1].
+    least_spread : smallest spread of these values, in tolerances, that is believed [1]: there are some tens of them,
+        and the model errs by as much.
+    narrow : spread below which values are searched for that stand out of it [1]: an outlier gains log evidence of half
+        its square over the spread's.
     held : standard deviation, over its tolerance, of a value that is beyond it [1]: the effect alone has it then.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
@@ -72,6 +78,9 @@ class GapSettings(FitSettings):
     turning_percent: float = 50.0
     beyond_tolerance: float = 10.0
     beyond_least: float = 3.0
+    determined: float = 0.5
+    least_spread: float = 0.2
+    narrow: float = 0.7
     held: float = 1e-3
     effect_sizes: float = 100.0
     shape_spread: float = 1.0

@@ -12,7 +12,7 @@ from avis_ctrl.gap.effects.payload import PRODUCTS
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.likelihood import Fitted
-from avis_ctrl.identification.priors import Priors, Tolerance
+from avis_ctrl.identification.priors import Priors, Tolerance, re_identified
 from avis_ctrl.rigs.instruments import Tolerances
 
 # Effects that are one value of the rig file gone beyond its tolerance: the tolerance of each of their parameters, in
@@ -49,6 +49,23 @@ def held(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
 def released(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
     """Priors without an effect of `BEYOND`: the inverse of `held`."""
     return priors.scaled(tolerances_behind(effect, priors.names), 1 / settings.held)
+
+
+def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
+    """How far the values of the rig file that the data determine have moved, in tolerances: r.m.s. over what the data
+    leave of their prior (D. MacKay, Neural Computation 4 (1992) 415-447), at most 1; and their indices.
+
+    A table may be built better than its tolerances say. A value of three tolerances is an outlier there.
+    """
+    own = {k for one in fitted.model.effects for k in tolerances_behind(one, fitted.priors.names)}
+    theta = set(re_identified(fitted.model.rig, settings).names)
+    determined = 1 - np.diag(fitted.covariance)
+    rows = [k for k, name in enumerate(fitted.priors.names) if "@" not in name and name not in theta and k not in own
+            and determined[k] > settings.determined]
+    if not rows:
+        return [], 1.0
+    size = np.sqrt(np.sum(fitted.z[rows] ** 2) / np.sum(determined[rows]))
+    return rows, float(np.clip(size, settings.least_spread, 1.0))
 
 
 def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings: GapSettings) -> tuple[Tolerance, ...]:

@@ -17,7 +17,7 @@ from avis_ctrl.gap.probability import odds_against
 from avis_ctrl.gap.search import with_effect, without_effect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap.tolerances import moved, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
 from avis_ctrl.gap.validation import halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
@@ -186,6 +186,27 @@ def test_variances_are_the_most_likely_ones():
                         options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 4000})
         own = [found.path[band][c], *(found.distortion[level, band][c] for level in levels)]
         assert_allclose(np.log(own), best.x, atol=0.02)
+
+
+def test_spread_of_the_values_that_the_data_determine():
+    """Values drawn with a third of their tolerances; of those that the data do not determine nothing is known."""
+    priors, rng = with_tolerances(bare(), TOLERANCES), np.random.default_rng(2)
+    count = len(priors.names)
+    known = rng.random(count) < 0.6
+    variance = np.where(known, 0.05, 0.9)
+    z = np.where(known, 0.3 * rng.standard_normal(count), 0.1 * rng.standard_normal(count))
+    theta = len(re_identified(RIG).names)
+    z[:theta], variance[:theta] = 3.0, 1e-6
+    model = SimpleNamespace(rig=RIG, effects=())
+    found = SimpleNamespace(model=model, priors=priors, z=z, covariance=np.diag(variance))
+    rows, size = spread(found, GapSettings())
+    assert rows == np.flatnonzero(known & (np.arange(count) >= theta)).tolist()
+    assert size == pytest.approx(0.3, rel=0.3)
+    assert spread(replace_z(found, 5 * z), GapSettings())[1] == 1.0
+
+
+def replace_z(found, z):
+    return SimpleNamespace(**{**vars(found), "z": z})
 
 
 def test_a_parameter_that_moves_with_the_band_refutes_its_law():
