@@ -148,14 +148,15 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Each = one_by_one,
-           enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
+           enough: Callable[[Step], bool] = lambda step: False, known: Sequence[Step] = ()) -> list[Step]:
     """Effects in the order in which they are found; last of all the values of the rig file that are beyond their
     tolerance, which show in how far one of them had to move, and hardly in what remains.
 
-    enough : whether the search may end with a step, because what it found takes next to nothing.
+    enough : whether the search may end with a step, because what it found takes next to nothing. known : steps that it
+    continues.
     The last step has the fit with everything that was found.
     """
-    steps: list[Step] = []
+    steps = list(known)
 
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
         while len(steps) < settings.longest:
@@ -218,7 +219,6 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     rest = without_effect(best, step.label, data, settings)
     if rest is None:
         return step
-    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     begun = without_path_errors(rest, data, settings)
     known = {name_of(label) for label in best.labels}
     tried, mine = {step.label: best.bare()}, step.tried[step.label].log_evidence
@@ -226,7 +226,7 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     for label, fitted in step.tried.items():
         if name_of(label) in known or mine - fitted.log_evidence > later:
             continue
-        one = with_effect(begun, fitted.model.effects[-1], data, quick)
+        one = with_effect(begun, fitted.model.effects[-1], data, settings.quick)
         if one is not None:
             tried[label] = one.bare()
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
@@ -254,6 +254,15 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     return Step(now.bare(), full, tried, len(found))
 
 
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """An effect by a fit of its own parameters: gain of log evidence, and fall of the sum of squares."""
+
+    effect: ActiveEffect
+    gain: float
+    fall: float
+
+
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
            ) -> dict[str, Fitted]:
     """Fits of candidates by label: at first of each effect's own parameters, the others moving along to first order;
@@ -261,39 +270,46 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     physics forbids, or to one within its tolerance."""
     if not chosen:
         return {}
-    profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
-                                                            iterations=settings.quick_iterations)
+    profile = Profile(now, data, settings)
 
-    def fitted(one: ActiveEffect, iterations: int) -> tuple[ActiveEffect, float] | None:
+    def fitted(one: ActiveEffect, iterations: int) -> _Begun | None:
         try:
             at = _without_tolerances_behind(now, one)
             model = now.model.at(now.priors.values(at)).only(one)
             own = _priors_of(one, model, settings)
-            z, gain = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
+            z, gain, fall = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
         except (AvisError, np.linalg.LinAlgError, FloatingPointError):
             return None
-        return one.at(own.values(z).tolist()), gain
+        return _Begun(one.at(own.values(z).tolist()), gain, fall)
 
-    def begun(one: Candidate) -> tuple[ActiveEffect, float] | None:
+    def begun(one: Candidate) -> tuple[Candidate, _Begun | None]:
         if at_full_strength(one.effect):
-            return one.effect, 0.0
+            return one, None
         starts = [one.effect, *one.others]
         if len(starts) > 1:
             ends = [end for start in starts if (end := fitted(start, settings.first_iterations)) is not None]
-            starts = [max(ends, key=lambda end: end[1])[0]] if ends else []
-        return fitted(starts[0], settings.rough_iterations) if starts else None
+            starts = [max(ends, key=lambda end: end.gain).effect] if ends else []
+        return one, fitted(starts[0], settings.rough_iterations) if starts else None
 
     def ended(one: ActiveEffect) -> Fitted | None:
-        return _small(with_effect(now, one, data, quick))
-    made = [one for one in each(begun, chosen) if one is not None]
-    if not made:
-        return {}
-    most = max(gain for _, gain in made)
-    near = [one for one, gain in made if gain >= settings.not_far_behind * most or at_full_strength(one)]
+        return _small(with_effect(now, one, data, settings.quick))
+    made = each(begun, chosen)
+    most = max((end.gain for _, end in made if end is not None), default=0.0)
+    near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
+    # Where the other parameters must move by more than to first order, as beside a heavy sprung mass, only a fit of all
+    # parameters shows what an effect can do.
+    near += [one.effect for one, end in made if at_full_strength(one.effect)
+             or (one.fall >= 2 * settings.not_far_behind * most
+             and (end is None or end.fall < settings.kept_promise * one.fall))]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
-    return {one.labels[-1]: one for one in further if not implausible(one)
-            and not within_tolerance(one.model.effects[-1], stated, settings)}
+    found: dict[str, Fitted] = {}
+    for one in further:
+        label = one.labels[-1]
+        if not implausible(one) and not within_tolerance(one.model.effects[-1], stated, settings) and (
+                label not in found or one.log_evidence > found[label].log_evidence):
+            found[label] = one
+    return found
 
 
 def at_full_strength(one: ActiveEffect) -> bool:

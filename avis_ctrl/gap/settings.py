@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avis_ctrl.identification.fit_settings import FitSettings
 
@@ -35,7 +35,10 @@ class GapSettings(FitSettings):
         that begins half its width away needs more than a few.
     not_far_behind : fraction of the best candidate's gain of log evidence by that fit with which another one is fitted
         on.
-    quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
+    kept_promise : fraction of the fall of the sum of squares that the score test promises, below which a fit of a
+        candidate's own parameters has failed [1]: the fit of all parameters then begins at the seed, too.
+    quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates, or gives
+        the residual of a stage.
     longest : most effects that are named together.
     revisions : how often an effect may be replaced by a rival that is better beside what was found after it; twice, for
         a pair that was named wrong both times.
@@ -78,6 +81,7 @@ class GapSettings(FitSettings):
     first_iterations: int = 4
     rough_iterations: int = 16
     not_far_behind: float = 0.3
+    kept_promise: float = 0.5
     quick_rounds: int = 4
     quick_iterations: int = 4
     longest: int = 5
@@ -99,6 +103,11 @@ class GapSettings(FitSettings):
     explained: float = 0.9
     known_noise: float = 2.25
     shown_runners_up: int = 12
+
+    @property
+    def quick(self) -> GapSettings:
+        """Of a fit that only compares candidates, or only gives a figure."""
+        return replace(self, rounds=self.quick_rounds, iterations=self.quick_iterations)
 
 
 SETTINGS = GapSettings()
