@@ -96,6 +96,17 @@ def _orders(console, orders) -> None:
     console.print(table)
 
 
+def _anti_windup(choice) -> str:
+    """What was chosen, and the recovery at the highest level with and without it."""
+    with_it, without = (1e3 * one[-1, 0] for one in (choice.chosen, choice.without))
+    after = f"after floor motion that demands {choice.levels[-1]:g} times the drives' range"
+    if choice.corner_Hz is None:
+        return (f"Anti-windup: none, because each one tried slows the recovery at some level of the floor; {after} "
+                f"the payload moves with {without:.3g} mm/s r.m.s.")
+    return (f"Anti-windup: lag of {choice.corner_Hz:g} Hz, gain {choice.gain:g}; {after} the payload moves with "
+            f"{with_it:.3g} mm/s r.m.s., {without:.3g} mm/s without it.")
+
+
 def _summary(console, made) -> None:
     from math import log10
 
@@ -117,5 +128,6 @@ def _summary(console, made) -> None:
     for name, value, unit in rows:
         table.add_row(name, "not measured" if value is None else f"{value:.4g}{unit}")
     console.print(table)
+    console.print(_anti_windup(made.anti_windup))
     for reason in made.certificate.reasons:
         console.print(f"Not proved: {reason}")

@@ -28,6 +28,7 @@ typedef {real} real_t;
 
 typedef struct {{
     real_t x[{room}];  /* states of the linear controller */
+    real_t excess[AVIS_CONTROLLER_OUTPUTS]; /* what the limits cut off, passed through a lag */
     real_t gain;    /* 0: drives at zero, 1: the linear controller */
     uint32_t wait;  /* samples of valid inputs to come before the gain rises */
 }} avis_controller_t;
@@ -54,6 +55,9 @@ void avis_controller_init(avis_controller_t *c)
 {{
     for (int i = 0; i < NX; i++) {{
         c->x[i] = {zero};
+    }}
+    for (int i = 0; i < NU; i++) {{
+        c->excess[i] = {zero};
     }}
     c->gain = {zero};
     c->wait = WAIT;
@@ -91,8 +95,7 @@ static void move_gain(avis_controller_t *c, int valid)
 
 void avis_controller_step(avis_controller_t *c, const real_t y[], real_t u[])
 {{
-    real_t v[NY], cut[NU], next[{room}];
-    int limited = 0;
+    real_t v[NY], next[{room}];
 
     move_gain(c, read_inputs(y, v));
     for (int i = 0; i < NU; i++) {{
@@ -103,10 +106,9 @@ void avis_controller_step(avis_controller_t *c, const real_t y[], real_t u[])
         for (int j = 0; j < NY; j++) {{
             sum += D[i][j] * v[j];
         }}
-        sum *= c->gain;
+        sum = c->gain * (sum - c->excess[i]);
         u[i] = sum > LIMIT[i] ? LIMIT[i] : (sum < -LIMIT[i] ? -LIMIT[i] : sum);
-        cut[i] = u[i] - sum;
-        limited = limited || sum > LIMIT[i] || sum < -LIMIT[i];
+        c->excess[i] = KEEP * c->excess[i] + FEED * (sum - u[i]); /* anti-windup */
     }}
     for (int i = 0; i < NX; i++) {{
         real_t sum = {zero};
@@ -115,11 +117,6 @@ void avis_controller_step(avis_controller_t *c, const real_t y[], real_t u[])
         }}
         for (int j = 0; j < NY; j++) {{
             sum += B[i][j] * v[j];
-        }}
-        if (limited) {{ /* anti-windup */
-            for (int j = 0; j < NU; j++) {{
-                sum += L[i][j] * cut[j];
-            }}
         }}
         next[i] = sum;
     }}
@@ -169,7 +166,7 @@ def c_files(controller: SampledController, guard: Protection, provenance: Proven
         return f"static const int {name}[{values.size}] = {{{', '.join(map(str, values))}}};\n"
 
     shown = {name: values if values.size else np.zeros((1, max(values.shape[1], 1)))
-             for name, values in {**controller.matrices(), "L": guard.anti_windup}.items()}
+             for name, values in controller.matrices().items()}
     shown["C"] = K.C if n_x else np.zeros((n_u, 1))
     most = float(np.finfo(controller.dtype).max)
     constants = "".join([
@@ -177,6 +174,7 @@ def c_files(controller: SampledController, guard: Protection, provenance: Proven
         places("FROM", first if n_x else np.zeros(1, int)), places("TO", last if n_x else np.zeros(1, int)),
         vector("LIMIT", controller.limits_V), vector("INPUT_LIMIT", np.minimum(guard.input_limit_V, most)),
         f"static const real_t RISE = {number(guard.rise)}, FALL = {number(guard.fall)};\n",
+        f"static const real_t KEEP = {number(guard.anti_windup.keep)}, FEED = {number(guard.anti_windup.feed)};\n",
         f"static const uint32_t WAIT = {guard.wait}u;\n"])
     common = {"comment": provenance.comment(), "n_x": n_x, "n_y": n_y, "n_u": n_u, "room": max(n_x, 1),
               "zero": number(0.0), "one": number(1.0), "real": "float" if single else "double",

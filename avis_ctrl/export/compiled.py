@@ -54,7 +54,8 @@ class CompiledController:
         real = ctypes.c_float if controller.arithmetic == "float32" else ctypes.c_double
 
         class State(ctypes.Structure):
-            _fields_ = (("x", real * max(controller.system.nstates, 1)), ("gain", real), ("wait", ctypes.c_uint32))
+            _fields_ = (("x", real * max(controller.system.nstates, 1)), ("excess", real * controller.system.noutputs),
+                        ("gain", real), ("wait", ctypes.c_uint32))
 
         with tempfile.TemporaryDirectory() as folder:
             write_together(Path(folder), {name: text.encode() for name, text in files.items()})

@@ -14,8 +14,9 @@ import scipy.io
 
 import avis_ctrl
 from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.export.anti_windup import Choice, choose_anti_windup
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
-from avis_ctrl.export.certificate import Certificate, Progress, certify
+from avis_ctrl.export.certificate import Certificate, Progress, certify, shipped_loop
 from avis_ctrl.export.compiled import compiler
 from avis_ctrl.export.design_folder import Added, DesignFolder
 from avis_ctrl.export.protection import protection
@@ -35,12 +36,13 @@ FORMATS = ("c", "mat", "json")
 
 @dataclass(frozen=True, eq=False)
 class Package:
-    """What an export writes: contents by file name, the certificate last. replay : of the worst plant through the
-    compiled code; None without gcc."""
+    """What an export writes: contents by file name, the certificate last. anti_windup : which, and why. replay : of the
+    worst plant through the compiled code; None without gcc."""
 
     controller: SampledController
     certificate: Certificate
     contents: dict[str, bytes]
+    anti_windup: Choice
     replay: Replay | None = None
 
 
@@ -63,7 +65,9 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     """
     text = folder.sampled(name, arithmetic).as_bytes()
     controller = parse_controller(text)  # the numbers as the file has them
-    guard = protection(controller, folder.rig)
+    progress("anti-windup: the table with its drives at their limits, with and without")
+    choice = choose_anti_windup(shipped_loop(folder, controller), tuple(folder.design.keep))
+    guard = protection(controller, folder.rig, choice.law)
     plain = c_files(controller, guard, Provenance(()))
     certificate = certify(folder, controller, plain, progress)
     if not certificate.content["stable"]:
@@ -83,6 +87,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
+    content["anti_windup"] = choice.as_dict()
     if name in folder.added:
         contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name].K))
     if "c" in formats:
@@ -95,7 +100,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
         contents[MAT] = _mat(controller)
     content["files"] = {name: _sha256(data) for name, data in contents.items()}
     contents[CERTIFICATE] = as_json(content)
-    return Package(controller, certificate, contents, replay)
+    return Package(controller, certificate, contents, choice, replay)
 
 
 def _sha256(data: bytes) -> str:

@@ -19,7 +19,7 @@ An anti-alias filter is known and the same in all channels: |G| is bounded witho
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
@@ -34,10 +34,11 @@ from avis_ctrl.rigs.actuator import pade_delay
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import Filter, conditioning
-from avis_ctrl.robust.mu_peak import worst_case_gain
+from avis_ctrl.robust.mu_peak import MuPeak, stability_bound, worst_case_gain
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
 from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.plant import DesignPlant, build_plant
+from avis_ctrl.study.workers import each
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -255,20 +256,35 @@ class SampledAxes:
 
     def passive_above(self) -> float:
         """Bound of payload over floor velocity above half the sample rate, where no controller acts."""
-        return self._proved("floor", "velocity", None)
+        return self._high_bounds["floor", "velocity"].gain
 
     def _high_gain(self, source: str, target: str, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound of the gain over the uncertainty set and over intervals above half the rate."""
-        bound = self._high_bound(source, target)
+        bound = self._high_bounds[source, target]
         size = roots_jet(bound.zeros(), bound.poles(), bound.gain, centre, half).size
         if target == "seen" and (lags := self.folder.rig.electronics.low_pass()):
             size = size * roots_jet((), lags, float(np.prod(np.abs(lags))), centre, half).size
         return size
 
-    @cache  # noqa: B019 (one object per export)
+    @cached_property
+    def _high_bounds(self) -> dict[tuple[str, str], Rational]:
+        """`_high_bound` of the four gains that are needed; of the floor's own motion a constant."""
+        pairs = [("force", "seen"), ("force", "velocity"), ("floor", "seen"), ("floor", "velocity")]
+        self._stability  # noqa: B018 (computed once, before the processes part)
+        return dict(zip(pairs, each(lambda pair: self._high_bound(*pair), pairs), strict=True))
+
+    @cached_property
+    def _stability(self) -> MuPeak:
+        """Robust stability of the table without control."""
+        part, whole = self._part("force", "seen")
+        blocks = BlockStructure(whole.blocks[:-1])
+        return stability_bound(part.select(range(blocks.n_z), range(blocks.n_w)), blocks)
+
     def _high_bound(self, source: str, target: str) -> Rational:
         """A function whose magnitude the worst-case gain does not exceed above half the rate: fitted to values, then
         raised to what `worst_case_gain` proves between them."""
+        if (source, target) == ("floor", "velocity"):
+            return Rational(self._proved(source, target, None))
         part, whole = self._part(source, target)
         gains = skewed_upper_bound(part.frequency_response(self.high_grid)[:, None], whole).beta
         if not np.all(np.isfinite(gains)):
@@ -283,7 +299,8 @@ class SampledAxes:
         n_z, blocks = part.noutputs - whole.blocks[-1].cols, BlockStructure(whole.blocks[:-1])
         if weight is not None:
             part = append(gain(np.eye(n_z)), *[weight.inverse().system()] * (part.noutputs - n_z)) @ part
-        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=SLACK)
+        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=SLACK, robust=self._stability,
+                                points=self.settings.points)
         if not (found.guaranteed and np.isfinite(found.upper)):
             raise ComputationError("the table's gain above half the sample rate is not proved", measured=found.covers)
         return found.upper

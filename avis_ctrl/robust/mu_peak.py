@@ -151,6 +151,25 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
         return replace(_in_rad_s(system, part, replace(found, delta=None)), omega=robust.omega, delta=robust.delta)
 
 
+def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> MuPeak:
+    """Bounds of mu at all frequencies, no closer than it takes to prove robust stability: with mu < 1 the upper bound
+    is just below 1, and there is no lower one. For several `worst_case_gain` of one loop.
+
+    Raises
+    ------
+    InputError, ComputationError : as mu_peak.
+    """
+    system, structure = _checked(N, blocks, SLACK)
+    with one_thread():
+        part = _prepared(system, structure)
+        done = _stable_cover(part.N, part.structure)
+        if not done.gaps and done.level < 1.0:
+            none = np.zeros(0)
+            return MuPeak(done.level, 0.0, 0.0, None, True, _in_words(done, ALL_FREQUENCIES, system.dt), none, none,
+                          none)
+        return _in_rad_s(system, part, _mu_peak(part.N, part.structure, ALL_FREQUENCIES, SLACK, dt=system.dt))
+
+
 def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
              slack: float) -> tuple[StateSpace, BlockStructure]:
     """N as a stable system of this package, and its blocks."""
@@ -356,9 +375,14 @@ def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -
     """Whether mu < 1 is proved at all frequencies; a cover of all of them with performance proves it on its own."""
     if band == ALL_FREQUENCIES:
         return True
-    first = first_frequencies(N, ALL_FREQUENCIES, 0)
-    done = _cover_mu(N, structure, 1.0 - 1e-6, ALL_FREQUENCIES, first, accuracy=1e-4, slack=0.0)
+    done = _stable_cover(N, structure)
     return not done.gaps and done.level < 1.0
+
+
+def _stable_cover(N: StateSpace, structure: BlockStructure) -> Cover:
+    """All frequencies covered at a level just below 1, or the attempt."""
+    first = first_frequencies(N, ALL_FREQUENCIES, 0)
+    return _cover_mu(N, structure, 1.0 - 1e-6, ALL_FREQUENCIES, first, accuracy=1e-4, slack=0.0)
 
 
 def _in_words(done: Cover, band: Interval, dt: float) -> str:

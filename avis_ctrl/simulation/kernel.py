@@ -34,7 +34,7 @@ class Work(NamedTuple):
 
     x : state of the linear part. u, w, w_end : held volts, floor velocity at the start and end of the step.
     N, N_before : excess acceleration now and a step ago.
-    line : (delay + 1, n_u) voltages on their way, by the step of their arrival.
+    line : (delay + 1, n_u) voltages on their way, by the step of their arrival. excess : (n_u,) of the anti-windup.
     advance_in, observe_in, sense_in, control_in : what each matrix of the step is multiplied with; the last keeps
         the controller's state. observed, sensed, controlled : what comes out.
     """
@@ -46,6 +46,7 @@ class Work(NamedTuple):
     N: np.ndarray
     N_before: np.ndarray
     line: np.ndarray
+    excess: np.ndarray
     advance_in: np.ndarray
     observe_in: np.ndarray
     sense_in: np.ndarray
@@ -62,8 +63,8 @@ def workspace(arrays: StepArrays, state: np.ndarray, delay: int) -> Work:
     w, w_end, N, N_before = np.zeros((4, 6))
     advance_in, observe_in, sense_in, control_in = (np.zeros(matrix.shape[1]) for matrix in matrices)
     observed, sensed, controlled = (np.zeros(matrix.shape[0]) for matrix in matrices[1:])
-    return Work(state, np.zeros(n_u), w, w_end, N, N_before, np.zeros((delay + 1, n_u)), advance_in, observe_in,
-                sense_in, control_in, observed, sensed, controlled)
+    return Work(state, np.zeros(n_u), w, w_end, N, N_before, np.zeros((delay + 1, n_u)), np.zeros(n_u), advance_in,
+                observe_in, sense_in, control_in, observed, sensed, controlled)
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
@@ -131,13 +132,18 @@ def _control(arrays, work):
 
 
 @njit(cache=True)
-def _demand(work, step, drive, limit_V, demanded_row):
-    """Puts the limited voltages, the controller's and `drive` (n_u,), on their way; without delay they act at once."""
+def _demand(work, step, drive, limit_V, windup, demanded_row):
+    """Puts the limited voltages, the controller's and `drive` (n_u,), on their way; without delay they act at once.
+
+    The controller limits its own voltages; anti-windup (keep, feed) takes off what it cut off before.
+    """
     n_u, delay = work.u.shape[0], work.line.shape[0] - 1
     n_c = work.controlled.shape[0] - n_u
     slot = (step + delay) % (delay + 1)
     for i in range(n_u):
-        demanded_row[i] = work.controlled[n_c + i] + drive[i]
+        own = work.controlled[n_c + i] - work.excess[i]
+        work.excess[i] = windup[0] * work.excess[i] + windup[1] * (own - min(max(own, -limit_V[i]), limit_V[i]))
+        demanded_row[i] = own + drive[i]
         work.line[slot, i] = min(max(demanded_row[i], -limit_V[i]), limit_V[i])
         if delay == 0:
             work.u[i] = work.line[slot, i]
@@ -159,21 +165,22 @@ def _advance(arrays, work):
 
 @njit(cache=True)
 def _gone(x, far):
-    """Whether the table has left the range in which it can move; written so that what is not finite has left it."""
+    """Whether the table has left the range in which it can move on the floor; written so that what is not finite has
+    left it."""
     inside = True
     for i in range(3):
-        inside = inside and abs(x[i]) < far[0] and abs(x[3 + i]) < far[1]
+        inside = inside and abs(x[i] - x[12 + i]) < far[0] and abs(x[3 + i] - x[15 + i]) < far[1]
     return not inside
 
 
 @njit(cache=True)
-def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, far, records):
+def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, windup, far, records):
     """Steps through the control periods; returns how many were completed when the table left its range, or all.
 
     floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V on top of the controller's.
     substeps : steps a period. nonlinear : the table's; acceleration : whether sensors see it, which needs N first.
-    adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. far : (m, rad) beyond
-    which the table has diverged.
+    adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. windup : (keep, feed) of the
+    controller's anti-windup. far : (m, rad) from the floor, beyond which the table has diverged.
     """
     step = 0
     for k in range(floor.shape[0] - 1):
@@ -184,7 +191,7 @@ def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, ad
             if j == 0:
                 _sense(arrays, work, noise[k], adc, records.sensed[k])
                 _control(arrays, work)
-                _demand(work, step, drive[k], limit_V, records.demanded[k])
+                _demand(work, step, drive[k], limit_V, windup, records.demanded[k])
                 _put(records.volts[k], 0, work.u)
                 _put(records.q[k], 0, work.x[:6])
                 _put(records.q_dot[k], 0, work.x[6:12])
@@ -199,9 +206,9 @@ def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, ad
     return floor.shape[0] - 1
 
 
-def run_stepwise(code, arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, far,
+def run_stepwise(code, arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, windup, far,
                  records):
-    """`run` with a controller that is called once a sample: code (n_s,) -> (n_u,) volts."""
+    """`run` with a controller that is called once a sample, anti-windup included: code (n_s,) -> (n_u,) volts."""
     n_s, n_u, step = work.sensed.shape[0], work.u.shape[0], 0
     for k in range(floor.shape[0] - 1):
         for j in range(substeps):
@@ -211,7 +218,7 @@ def run_stepwise(code, arrays, work, floor, noise, drive, substeps, nonlinear, a
             if j == 0:
                 _sense(arrays, work, noise[k], adc, records.sensed[k])
                 work.controlled[work.controlled.shape[0] - n_u:] = code(work.control_in[-n_s:])
-                _demand(work, step, drive[k], limit_V, records.demanded[k])
+                _demand(work, step, drive[k], limit_V, windup, records.demanded[k])
                 records.volts[k], records.q[k], records.q_dot[k] = work.u, work.x[:6], work.x[6:12]
             if nonlinear and not acceleration:
                 _excess(arrays, work)

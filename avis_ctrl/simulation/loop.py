@@ -14,10 +14,10 @@ from avis_ctrl.rigs.floor_spectrum import realise
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation import kernel
 from avis_ctrl.simulation.discrete import linear_part, rest_state, step_arrays
-from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, SampledLoop, lever_arms
 
 Code = Callable[[np.ndarray], np.ndarray]
-# No isolated table moves so far between its stops: beyond, the loop has diverged [m, rad].
+# No isolated table moves so far from its floor, between its stops: beyond, the loop has diverged [m, rad].
 STOPS = np.array([0.02, 0.2])
 
 
@@ -139,8 +139,10 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
         work.u[:] = np.clip(rest.volts, -loop.limits_V, loop.limits_V)
         work.control_in[:rest.controller.size] = rest.controller
     run = kernel.run if code is None else partial(kernel.run_stepwise, code)
+    # Code that is called has its own.
+    windup = loop.anti_windup if code is None else NO_ANTI_WINDUP
     done = run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
-               "acceleration" in loop.sensors.quantities, adc, loop.limits_V, STOPS, records)
+               "acceleration" in loop.sensors.quantities, adc, loop.limits_V, windup, STOPS, records)
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
     time = (np.arange(samples)[kept] - settle) * loop.period_s

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -119,6 +119,28 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
                       np.array([one.flicker_rms_V for one in sensors]))
 
 
+class AntiWindup(NamedTuple):
+    """What the limits cut off, passed through a first-order lag and taken off the next demands of the same drive:
+
+        u = limit(v),  v = demand - b,  b+ = keep b + feed (v - u)
+
+    Low-order anti-windup that acts on the controller's output (Turner and Postlethwaite, Int. J. Control 77, 2004): the
+    states stay those of the linear controller. feed = 0 is none.
+    """
+
+    keep: float = 0.0
+    feed: float = 0.0
+
+    @staticmethod
+    def of(corner_Hz: float, gain: float, period_s: float) -> AntiWindup:
+        """gain : of the lag at zero frequency."""
+        keep = float(np.exp(-2 * np.pi * corner_Hz * period_s))
+        return AntiWindup(keep, gain * (1 - keep))
+
+
+NO_ANTI_WINDUP = AntiWindup()
+
+
 @dataclass(frozen=True, eq=False)
 class SampledLoop:
     """A table under digital control on a moving floor.
@@ -142,6 +164,7 @@ class SampledLoop:
     sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. By
         default each drive has its own limit; a given limit_V, other than the rig's largest, is for all drives.
     gravity : whether the proof masses of tilted sensors feel gravity (`Rig.tilt_rows`).
+    anti_windup : of the controller; none by default.
 
     Raises
     ------
@@ -164,6 +187,7 @@ class SampledLoop:
     gravity: bool = False
     name: str = "nominal"
     digital: StateSpace | None = None
+    anti_windup: AntiWindup = NO_ANTI_WINDUP
     substeps: int = field(init=False, default=1)
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ from avis_ctrl.lti import (
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_cover import cover
-from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.robust.mu_peak import mu_peak, stability_bound, worst_case_gain
 from avis_ctrl.robust.mu_realise import realise_delta
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
@@ -439,3 +439,8 @@ def test_a_known_robust_stability_changes_no_bound(rng):
     assert found.lower == found.upper == np.inf
     singular = np.eye(2) - large.select(range(2), range(2)).frequency_response(np.array([found.omega]))[0] @ found.delta
     assert np.linalg.norm(found.delta, 2) <= 1 and np.linalg.svd(singular)[1][-1] < 1e-6
+    # The quicker proof says as much: where the peak of mu is below 1 and where it is not.
+    quick, failing = stability_bound(inner, blocks), stability_bound(large.select(range(2), range(2)), blocks)
+    assert quick.guaranteed and robust.lower <= quick.upper < 1
+    assert worst_case_gain(N, blocks, robust=quick).upper == pytest.approx(worst_case_gain(N, blocks).upper, rel=2e-3)
+    assert failing.lower == pytest.approx(unstable.lower, rel=1e-3) and failing.lower > 1
