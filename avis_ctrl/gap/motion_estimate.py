@@ -74,7 +74,7 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
         volts, deflection, y = known[id(source)]
         h = record.header
         found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],
-                                     *mount_rows(model), h.level_V, begin, actuators=model.actuators,
+                                     *mount_rows(model), begin, actuators=model.actuators,
                                      sensors=model.sensors.names, y=y[:stop])
     return found
 
@@ -172,8 +172,7 @@ def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.nd
 
 def _fade(frequency: np.ndarray) -> np.ndarray:
     """(n,) one between `low_Hz` and `high_Hz`, zero outside."""
-    up = np.clip((frequency - SETTINGS.low_Hz[0]) / (SETTINGS.low_Hz[1] - SETTINGS.low_Hz[0]), 0, 1)
-    down = np.clip((SETTINGS.high_Hz[1] - frequency) / (SETTINGS.high_Hz[1] - SETTINGS.high_Hz[0]), 0, 1)
+    up, down = np.interp(frequency, SETTINGS.low_Hz, (0.0, 1.0)), np.interp(frequency, SETTINGS.high_Hz, (1.0, 0.0))
     return np.sin(np.pi / 2 * up) ** 2 * np.sin(np.pi / 2 * down) ** 2
 
 

@@ -111,6 +111,9 @@ class Operators:
     def sensor(self, name: str) -> int:
         return self.base.sensors.names.index(name)
 
+    def actuator(self, name: str) -> int:
+        return self.base.actuators.index(name)
+
     def borne(self, M: np.ndarray) -> np.ndarray:
         """(n, 6, 6) force per displacement of the payload that mounts and motors bear, and their reaction a chassis:
         its inertia, and what hangs on it or holds it beside them."""

@@ -34,7 +34,7 @@ def record(name, level):
     rng = np.random.default_rng([5, int(name)])
     volts, slow = level * rng.standard_normal((SAMPLES, 8)), rng.standard_normal((SAMPLES, 18))
     slow = np.apply_along_axis(lambda x: np.convolve(x, np.ones(20) / 5, "same"), 0, slow)
-    return RecordMotion(name, RATE, 10.0 * int(name), (0.0, 60.0), volts, 1e-5 * slow[:, :12], *mount_rows(BARE), level,
+    return RecordMotion(name, RATE, 10.0 * int(name), (0.0, 60.0), volts, 1e-5 * slow[:, :12], *mount_rows(BARE),
                         actuators=BARE.actuators, sensors=BARE.sensors.names, y=0.1 * slow[:, 12:])
 
 
