@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Effect
@@ -23,7 +23,7 @@ from avis_ctrl.gap.effects.mounts import campaign_clock
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import ResponseModel, sensor_model
 from avis_ctrl.rigs.avis import INERTIA
-from avis_ctrl.rigs.file_errors import read_json
+from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -32,11 +32,7 @@ FORMAT, VERSION = "avis-gap-model", 1
 Positive = Annotated[float, Field(gt=0)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-class EffectFile(_Part):
+class EffectFile(Section):
     """An effect in a file."""
 
     name: str
@@ -44,7 +40,7 @@ class EffectFile(_Part):
     values: dict[str, float]
 
 
-class ModelFile(_Part):
+class ModelFile(Section):
     """A model in a file.
 
     rig : text of a rig file. rig_values : parameters of the rig that no rig file may hold, such as an inertia that the
@@ -131,16 +127,8 @@ def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
         raise error.in_file(path) from None
 
 
-def _checked(content: Any) -> ModelFile:
-    if not isinstance(content, Mapping) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, Mapping) else type(content).__name__
-        raise InputError(f"expected {FORMAT}, the model of avis gap", field="format", value=found)
-    try:
-        checked = ModelFile.model_validate(dict(content))
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = "".join(f"[{one}]" if isinstance(one, int) else f".{one}" for one in first["loc"]).lstrip(".")
-        raise InputError(first["msg"], field=place or "model", value=_short(first.get("input"))) from None
+def _checked(content: Mapping[str, Any]) -> ModelFile:
+    checked = validated(ModelFile, content)
     if checked.campaign_s[0] >= checked.campaign_s[1]:
         raise InputError("expected the first time before the last one", field="campaign_s", value=checked.campaign_s)
     if len(checked.sensitivity) != len(checked.sensors):
@@ -151,11 +139,6 @@ def _checked(content: Any) -> ModelFile:
         if len(set(names)) != len(names):
             raise InputError("expected different names", field=field, value=names)
     return checked
-
-
-def _short(value: Any) -> Any:
-    text = repr(value)
-    return value if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _made(file: ModelFile) -> TableModel:
@@ -176,7 +159,7 @@ def _made(file: ModelFile) -> TableModel:
     base = ResponseModel(rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s,
                          file.amplifier_corner_Hz)
     model = TableModel(base)
-    for k, one in enumerate(file.effects):
+    for k, one in enumerate(file.effects, 1):
         model = model.with_effect(_effect(model, one, f"effects[{k}]"))
     _require_answer(model)
     return model

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.fft
 
-from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
-from avis_ctrl.gap.operators import mount_geometry
+from avis_ctrl.gap.line_response import LineResponse, line_response
+from avis_ctrl.gap.operators import Assembled, mount_geometry
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import TableModel
@@ -65,7 +65,7 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
     InputError : channels or rates that are not the model's, a record too long for one piece.
     """
     campaign_s = clock_of(whole or campaign)
-    linear = linear_part(model)
+    linear = model.linear
     sources = list({id(source): source for source, _, _ in map(origin, campaign.records)}.values())
     known = dict(zip(map(id, sources), each(lambda source: _in_time(source.load(), linear), sources), strict=True))
     found = {}
@@ -74,7 +74,7 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
         volts, deflection, y = known[id(source)]
         h = record.header
         found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],
-                                     *mount_rows(model), h.level_V, begin, actuators=model.actuators,
+                                     *mount_rows(model), begin, actuators=model.actuators,
                                      sensors=model.sensors.names, y=y[:stop])
     return found
 
@@ -109,13 +109,12 @@ def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray
     limit = linear.rig.limits_of(linear.actuators)
     u = np.clip(u, -limit, limit)
     lines = line_response(linear, h.samples, h.sample_rate_Hz)
-    x = lines.motion(lines.drive(u, floor))
-    deflection = lines.in_time(lines.deflection(x, floor))
+    predicted, deflection = lines.answer(u, floor)
     rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
     if not rows or not deflection.size:  # nothing measured, or a rig without mounts of their own
         return u, deflection, np.zeros((0, 0))
     seen = np.array([name in h.y_names for name in linear.sensors.names])
-    left = record.y[:, rows] - lines.in_time(lines.sensed(x, u, floor))[:, seen]
+    left = record.y[:, rows] - predicted[:, seen]
     left = left - left.mean(0)
     if np.any(left):
         deflection = deflection + _unmodelled(left, lines, seen)
@@ -134,10 +133,12 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
     frequency = lines.omega / (2 * np.pi)
     fade = _fade(frequency)
     at = np.flatnonzero(fade)
-    rows = (lines.rows if len(lines.rows) == 1 else lines.rows[at])[:, seen]
+    if "corrected" not in lines.kept:
+        lines.kept["corrected"] = lines.at(at)
+    table: Assembled = lines.kept["corrected"]
     # A force on the payload, as much moment as its size makes of it.
-    size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(lines.G[:, 3:N_Q] ** 2, axis=0))])
-    H = lines.sense[at][:, seen, None] * (rows @ lines.compliance[at, :, :N_Q]) * size
+    size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(table.G[:, 3:N_Q] ** 2, axis=0))])
+    H = table.left[:, seen, :N_Q] * size
 
     def in_time(spectrum: np.ndarray) -> np.ndarray:
         whole = np.zeros((len(frequency), spectrum.shape[1]), complex)
@@ -154,11 +155,8 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
             response = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
             continued += SETTINGS.relaxation * (response[:len(continued)] - continued)
             continued[inside] = left
-    x = (lines.compliance[at, :, :N_Q] @ (size * e)[:, :, None])
-    d = x[:, :, 0] @ lines.G.T
-    if lines.recoil is not None:
-        d = d + (lines.recoil[at] @ x)[:, :, 0] @ lines.G_c.T
-    return in_time(d)[inside]
+    x = table.inverse[:, :, :N_Q] @ (size * e)[:, :, None]
+    return in_time(table.deflection(x, np.zeros((len(x), 3, 1)))[:, :, 0])[inside]
 
 
 def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.ndarray) -> np.ndarray:
@@ -174,8 +172,7 @@ def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.nd
 
 def _fade(frequency: np.ndarray) -> np.ndarray:
     """(n,) one between `low_Hz` and `high_Hz`, zero outside."""
-    up = np.clip((frequency - SETTINGS.low_Hz[0]) / (SETTINGS.low_Hz[1] - SETTINGS.low_Hz[0]), 0, 1)
-    down = np.clip((SETTINGS.high_Hz[1] - frequency) / (SETTINGS.high_Hz[1] - SETTINGS.high_Hz[0]), 0, 1)
+    up, down = np.interp(frequency, SETTINGS.low_Hz, (0.0, 1.0)), np.interp(frequency, SETTINGS.high_Hz, (1.0, 0.0))
     return np.sin(np.pi / 2 * up) ** 2 * np.sin(np.pi / 2 * down) ** 2
 
 

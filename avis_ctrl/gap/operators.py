@@ -12,9 +12,8 @@ The chassis follows the floor displacement w through H_w and recoils with B: zer
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -101,7 +100,7 @@ class Operators:
         self.internal_omega, self.internal_damping = np.full(n_g, np.inf), np.zeros(n_g)
         self.payload_share = np.full(n_g, 0.5)
         self.rows: np.ndarray = base.matrices.R[None]
-        self.sense = chain_response(base, omega).copy()
+        self.sense = base.sensors.sense(omega)
         self.sensor_gain = np.ones(len(base.sensors.names))
         self.drive: np.ndarray = np.ones((1, len(base.actuators)), complex)
         self.delay_s, self.amplifier_corner_Hz = base.delay_s, base.amplifier_corner_Hz
@@ -129,46 +128,6 @@ class Operators:
         if grounded is not None:
             F = np.einsum("nm,mi,mj->nij", grounded, rows, rows[:, :3])
             self.extra_floor = F if self.extra_floor is None else self.extra_floor + F
-
-    def volts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) commanded volts to acting ones, without the factors of the drives, and (n, n_y) aliases by sensor."""
-        base, corner = self.base, self.amplifier_corner_Hz
-        key = ("volts", base.period_s, self.delay_s, _sensors_of(base), corner, *_of(self.omega))
-        known = _kept.get(key)
-        if known is None:
-            a, folded = replace(base, delay_s=self.delay_s, amplifier_corner_Hz=corner).drive(self.omega)
-            known = _keep(key, (a[:, 0, 0], folded[:, :, 0]))
-        return known
-
-
-# What a fit asks for again and again on the same lines; the oldest go first.
-_kept: dict[tuple, Any] = {}
-
-
-def _of(omega: np.ndarray) -> tuple[int, float, float, float]:
-    return len(omega), float(omega[0]), float(omega[-1]), float(omega.sum())
-
-
-def _keep(key: tuple, value: Any, most: int = 64) -> Any:
-    while len(_kept) >= most:
-        _kept.pop(next(iter(_kept)), None)
-    _kept[key] = value
-    return value
-
-
-def _sensors_of(base: ResponseModel) -> tuple:
-    """What tells the chains of sensors apart."""
-    known = {id(chain): b"" if chain is None else b"".join(part.tobytes() for part in (chain.A, chain.B, chain.C,
-                                                                                       chain.D))
-             for chain in base.sensors.chains}
-    return base.sensors.motions, base.sensors.suspensions, tuple(known[id(chain)] for chain in base.sensors.chains)
-
-
-def chain_response(base: ResponseModel, omega: np.ndarray) -> np.ndarray:
-    """(n, n_y) of each sensor's chain of unit sensitivity, from displacement; not to be written to."""
-    key = ("chain", _sensors_of(base), *_of(omega))
-    known = _kept.get(key)
-    return _keep(key, base.sensors.sense(omega)) if known is None else known
 
 
 _geometry: list[tuple[Rig, MountGeometry]] = []
@@ -217,11 +176,21 @@ class Assembled:
         if ops.recoil is not None:
             D[:, :, :N_Q] += (G.T @ (self.z_pf[:, :, None] * (mounts.chassis @ ops.recoil))) @ ops.borne(M)
         self.D, self.M, self.G, self.T, self.rows = D, M, G, T, rows
-        self.hold, self.folded = ops.volts()
+        self.hold, self.folded = base.sensors.driven(ops.omega, base.period_s, ops.delay_s, ops.amplifier_corner_Hz)
 
     @cached_property
     def inverse(self) -> np.ndarray:
         return np.linalg.inv(self.D)
+
+    @cached_property
+    def left(self) -> np.ndarray:
+        """(n, n_y, n_q) y by a force on the coordinates."""
+        return self.gain * self.ops.sense[:, :, None] * (self.rows @ self.inverse)
+
+    @property
+    def gain(self) -> np.ndarray:
+        """(n_y, 1) sensitivities as effects leave them."""
+        return (self.ops.base.sensors.sensitivity * self.ops.sensor_gain)[:, None]
 
     @property
     def n_q(self) -> int:
@@ -293,6 +262,10 @@ class Assembled:
                 moved = moved + self.ops.recoil @ (self.ops.extra_floor @ w)
             return moved
         return np.concatenate([w, np.zeros_like(w)], axis=1)
+
+    def deflection(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """(n, n_g, m) of the mounts, payload less chassis."""
+        return self.G @ x - self.ops.mounts.chassis @ self.chassis(x, w)
 
     def chassis(self, x: np.ndarray, w: np.ndarray, inner: np.ndarray | None = None) -> np.ndarray:
         """(n, 6, m) chassis displacement, its recoil included, and what it starts with (`forces_of_states`)."""

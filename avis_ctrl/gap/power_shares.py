@@ -19,15 +19,17 @@ left, nonlinear terms of the model taken off, at the lowest level: whatever is m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from scipy import stats
+from scipy.linalg import orth
 
 from avis_ctrl.gap.result import PowerShares
 from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.identification.campaign_fit import of_one_level
 from avis_ctrl.identification.prediction_error import PredictionError
 from avis_ctrl.measurement.campaign import RecordHeader
@@ -40,7 +42,6 @@ class PowerSettings:
     bands_per_octave : windows to the octave.
     least_lines : lines of a window for each unknown of its regression: with fewer, leverage leaves no residual.
     linear_lines : the same from which the error may be linear over the window.
-    driven : of the strongest line's power, below which the drives leave a line alone [1].
     most_leverage : leverage from which on a line says nothing of the noise [1].
     alarm : chance that an error of the model is seen in a window of noise [1].
     scatter : chance that nonlinearity is seen in a band of noise [1].
@@ -54,7 +55,6 @@ class PowerSettings:
     bands_per_octave: int = 3
     least_lines: int = 3
     linear_lines: int = 8
-    driven: float = 1e-6
     most_leverage: float = 0.9
     alarm: float = 1e-3
     scatter: float = 0.05
@@ -162,7 +162,6 @@ def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeade
 
 def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
     """Lines that the drives excite, of several records."""
-    linear = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
     n_a = len(model.actuators)
     known: dict[bytes, np.ndarray] = {}
     made = []
@@ -170,7 +169,7 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
         block = e.block
         key = block.omega.tobytes()
         if key not in known:
-            known[key] = linear.response(block.omega)
+            known[key] = model.response(block.omega)
         columns = known[key] * block.U[:, None, :, 0]
         answered = (block.Y - e.plain)[:, :, 0]
         left = e.error[:, :, 0]
@@ -179,7 +178,7 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
         noise = np.real(np.einsum("nkk->nk", block.noise[:, 0]))
         every = Lines(block.omega / (2 * np.pi), answered + left, left, answered + left - columns.sum(axis=2), columns,
                       noise)
-        made.append(every.some(power > SETTINGS.driven * power.max(initial=0.0)))
+        made.append(every.some(power > FIT.silent_line ** 2 * power.max(initial=0.0)))
     joined = Lines(*(np.concatenate([getattr(one, field) for one in made]) for field in Lines.__dataclass_fields__))
     return joined.some(np.argsort(joined.frequency_Hz, kind="stable"))
 
@@ -296,7 +295,4 @@ def _leverage(Q: np.ndarray) -> np.ndarray:
 
 def _basis(A: np.ndarray) -> np.ndarray:
     """Orthonormal basis of the columns' span, each column alike, without directions that are round-off."""
-    if not A.size:
-        return np.zeros((len(A), 0), complex)
-    U, s, _ = np.linalg.svd(A / np.linalg.norm(A, axis=0), full_matrices=False)
-    return U[:, s > 1e-10 * s[0]]
+    return orth(A / np.linalg.norm(A, axis=0), rcond=1e-10) if A.size else np.zeros((len(A), 0), complex)

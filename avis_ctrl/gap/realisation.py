@@ -19,6 +19,7 @@ from avis_ctrl.gap.effects.sensors import suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
 from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.identification.response import FLOOR
 from avis_ctrl.identification.sample_and_hold import hold
 from avis_ctrl.lti.connect import connect
 from avis_ctrl.lti.rational import cascade, second_order_roots
@@ -27,7 +28,6 @@ from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
 from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 
-FLOOR = ("vx", "vy", "vz")
 # Effects that act through rig parameters, sensors or drives, and on signals alone.
 _ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
               "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay", "base_compliance"}
@@ -217,13 +217,11 @@ def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
     return found
 
 
-def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: int | None = None, when: float = 0.0,
-            check_Hz: np.ndarray | None = None) -> Realised:
-    """One state space of a model, drives and sensors included; coordinates not kept are locked at rest.
+def realise(model: TableModel, pade_order: int | None = None, when: float = 0.0) -> Realised:
+    """One state space of a model, drives and sensors included.
 
-    pade_order : of delay and hold (1-10); by default what keeps the delay's error below 1e-3 up to the highest of
-    check_Hz (by default that of the settings), or 10. The error is measured where all six coordinates are kept, nan
-    otherwise: `TableModel.response` knows no locked ones.
+    pade_order : of delay and hold (1-10); by default what keeps the delay's error below 1e-3 up to the highest of the
+    settings' `check_Hz`, or 10. when : as in `with_effects`.
 
     Raises
     ------
@@ -231,38 +229,27 @@ def realise(model: TableModel, keep: Sequence[str] = COORDINATES, pade_order: in
     """
     if model.sensors.motion != "velocity":
         raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
-    omega = 2 * np.pi * (np.geomspace(*SETTINGS.check_Hz) if check_Hz is None else np.asarray(check_Hz, float))
+    omega = 2 * np.pi * np.geomspace(*SETTINGS.check_Hz)
     order = pade_order or sufficient_order(loop_lag(model)[0], float(omega.max()), 1e-3, 10)[0]
-    effective = model.effective
-    rig = uncertain_rig(effective.rig, [], keep).system
-    names = [edge_name(name) for name in keep]
-    table = ReducedTable(model, tuple(keep), when)
-    inner = with_effects(rig, model, keep, when)
-    parts = {"table": inner, "chains": _chains(table, names), "loop": _loop(model, order)}
-    floor = [f"floor_{a}_dot" for a in names]
-    place = np.zeros((len(names), 3))
-    for k, name in enumerate(keep):
-        if name in "xyz":
-            place[k, "xyz".index(name)] = 1.0
-    parts["floor"] = gain(place, FLOOR, floor)
-    parts["no force"] = gain(np.zeros((len(names), 3)), FLOOR, [f"force_{a}" for a in names])
+    effective, names = model.effective, [edge_name(name) for name in COORDINATES]
+    parts = {"table": with_effects(uncertain_rig(effective.rig, [], COORDINATES).system, model, COORDINATES, when),
+             "chains": _chains(ReducedTable(model, COORDINATES, when), names), "loop": _loop(model, order),
+             "floor": gain(np.eye(len(names), 3), FLOOR, [f"floor_{a}_dot" for a in names]),
+             "no force": gain(np.zeros((len(names), 3)), FLOOR, [f"force_{a}" for a in names])}
     unused = [name for name in effective.rig.equations_of_motion().actuators if name not in model.actuators]
     if unused:
         parts["at rest"] = gain(np.zeros((len(unused), 3)), FLOOR, unused)
     system = connect(parts, [*(f"{name}_command" for name in model.actuators), *FLOOR],
                      [*(f"{a}_dot" for a in names), *model.sensors.names]
                      ).renamed({f"{name}_command": name for name in model.actuators})
-    linear = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
-    if set(keep) != set(COORDINATES):
-        error, folded = float("nan"), float("nan")
-    elif len(linear.effects) == len(model.effects):
-        sensors = list(model.sensors.names)
-        asked, without = model.response(omega), _without_aliases(model, omega)
-        error = _distance(system.select(sensors, None).frequency_response(omega), without, len(model.actuators))
-        folded = _distance(asked, without, len(model.actuators))
-    else:
-        same = realise(linear, keep, pade_order, when, check_Hz)
+    if model.nonlinear:
+        same = realise(model.linear, pade_order, when)
         error, folded = same.error, same.aliases
+    else:
+        sensors, n_u = list(model.sensors.names), len(model.actuators)
+        asked, without = model.response(omega), _without_aliases(model, omega)
+        error = _distance(system.select(sensors, None).frequency_response(omega), without, n_u)
+        folded = _distance(asked, without, n_u)
     return Realised(system, omega, error, folded, notes_on(model))
 
 

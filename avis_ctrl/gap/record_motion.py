@@ -76,7 +76,6 @@ class RecordMotion:
     stiffness: np.ndarray
     vertical: np.ndarray
     driven_rows: np.ndarray
-    level_V: float = 0.0
     before: int = 0
     large_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     turned_force: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))

@@ -80,69 +80,50 @@ def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:
     return np.geomspace(low, high * (1 + 1e-9), count + 1)
 
 
+def _banded(e: PredictionError, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By band, over the noise: power (n_bands, n_y) of a record's residual, number of lines (n_bands, 1), and the part
+    of the power that goes with each input (n_bands, n_y, n_in)."""
+    assert e.block.noise is not None
+    white, U = e.error[:, :, 0] / np.sqrt(np.real(np.einsum("nkk->nk", e.block.noise[:, 0]))), e.block.U[:, :, 0]
+    inside = (np.digitize(e.block.omega / (2 * np.pi), edges) - 1)[:, None] == np.arange(len(edges) - 1)
+    along = np.abs(np.einsum("nb,nk,ni->bki", inside, white, np.conj(U), optimize=True)) ** 2
+    strength = (inside.T @ np.abs(U) ** 2)[:, None]
+    return (inside.T @ np.abs(white) ** 2, np.sum(inside, axis=0)[:, None],
+            np.divide(along, strength, out=np.zeros(along.shape), where=strength > 0))
+
+
 def places(left: ModelResidual) -> tuple[Where, ...]:
     """Bands, outputs and the input that goes with each, where the residual exceeds the noise significantly."""
     edges = edges_of(left.errors)
-    model_inputs = left.errors[0].block.U.shape[1]
-    rows = []
-    for low, high in pairwise(edges):
-        for k, output in enumerate(left.outputs):
-            power, lines, found = 0.0, 0, np.zeros(model_inputs)
-            for e in left.errors:
-                f = e.block.omega / (2 * np.pi)
-                band = (f >= low) & (f < high)
-                sigma2 = _own_noise(e, k)[band]
-                error = e.error[band, k, 0] / np.sqrt(sigma2)
-                U = e.block.U[band, :, 0]
-                power += float(np.sum(np.abs(error) ** 2))
-                lines += len(error)
-                strength = np.sum(np.abs(U) ** 2, axis=0)
-                along = np.abs(np.sum(error[:, None] * np.conj(U), axis=0)) ** 2
-                found += np.divide(along, strength, out=np.zeros(model_inputs), where=strength > 0)
-            if lines:
-                rows.append((low, high, output, power, lines, found))
+    power, lines, found = (np.sum(parts, axis=0) for parts in zip(*(_banded(e, edges) for e in left.errors),
+                                                                  strict=True))
     dof = min(e.block.dof for e in left.errors)
-    count = max(len(rows), 1)
-    excess_all = sum(max(power - lines, 0.0) for *_, power, lines, _ in rows) or 1.0
+    excess, count = np.maximum(power - lines, 0.0), max(np.count_nonzero(lines) * power.shape[1], 1)
     made = []
-    for low, high, output, power, lines, found in rows:
-        ratio = power / lines
+    for b, (low, high) in enumerate(pairwise(edges.tolist())):
+        n = int(lines[b, 0])
         # At most a third of the records is held out: the noise of a band is known from twice as many lines or more.
-        known = min(dof * max(lines / 60, 1), max(dof, 2 * lines))
-        p = float(stats.f.sf(ratio, 2 * lines, 2 * known) if np.isfinite(dof)
-                  else stats.chi2.sf(2 * power, 2 * lines))
-        if min(p * count, 1.0) < SETTINGS.place_alarm:
-            best = int(np.argmax(found))
-            made.append(Where(float(low), float(high), left.inputs[best] if found[best] > 0.1 * power else "", output,
-                              max(power - lines, 0.0) / excess_all, ratio, min(p * count, 1.0)))
+        known = min(dof * max(n / 60, 1), max(dof, 2 * n))
+        for k, output in enumerate(left.outputs if n else ()):
+            p = count * float(stats.f.sf(power[b, k] / n, 2 * n, 2 * known) if np.isfinite(dof)
+                              else stats.chi2.sf(2 * power[b, k], 2 * n))
+            if p < SETTINGS.place_alarm:
+                best = int(np.argmax(found[b, k]))
+                made.append(Where(low, high, left.inputs[best] if found[b, k, best] > 0.1 * power[b, k] else "", output,
+                                  float(excess[b, k] / excess.sum()), float(power[b, k] / n), p))
     return tuple(sorted(made, key=lambda w: -w.share)[:SETTINGS.most_places])
-
-
-def _own_noise(e: PredictionError, k: int) -> np.ndarray:
-    assert e.block.noise is not None
-    return np.real(np.broadcast_to(e.block.noise, (len(e.block.omega), *e.block.noise.shape[1:]))[:, 0, k, k])
 
 
 def heat_map(before: ModelResidual, after: ModelResidual) -> HeatMap:
     """Residual power over noise power by band, held-out record and output."""
     edges = edges_of(before.errors)
+
+    def ratios(left: ModelResidual) -> np.ndarray:
+        banded = [_banded(e, edges) for e in left.errors]
+        with np.errstate(invalid="ignore"):  # a band without lines has no ratio
+            return np.hstack([power / lines for power, lines, _ in banded])
     columns = tuple(f"{e.block.name}: {output}" for e in before.errors for output in before.outputs)
-    return HeatMap(edges, columns, _ratios(before, edges), _ratios(after, edges))
-
-
-def _ratios(left: ModelResidual, edges: np.ndarray) -> np.ndarray:
-    found = np.full((len(edges) - 1, sum(e.block.Y.shape[1] for e in left.errors)), np.nan)
-    column = 0
-    for e in left.errors:
-        f = e.block.omega / (2 * np.pi)
-        band = np.digitize(f, edges) - 1
-        for k in range(e.block.Y.shape[1]):
-            ratio = np.abs(e.error[:, k, 0]) ** 2 / _own_noise(e, k)
-            for b in range(len(edges) - 1):
-                if np.any(band == b):
-                    found[b, column] = float(np.mean(ratio[band == b]))
-            column += 1
-    return found
+    return HeatMap(edges, columns, ratios(before), ratios(after))
 
 
 def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None

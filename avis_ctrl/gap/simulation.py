@@ -17,7 +17,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.line_response import LineResponse, line_response, linear_part
+from avis_ctrl.gap.line_response import LineResponse, line_response
 from avis_ctrl.gap.motion_estimate import mount_rows, with_large_motion
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -68,24 +68,19 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     ComputationError : a motion that grows without bound, or a response that does not settle.
     """
     u, floor = _checked(model, u, floor)
-    lines = line_response(linear_part(model), len(u), sample_rate_Hz)
-    record = RecordMotion("", sample_rate_Hz, start_s, campaign_s, u, np.zeros((len(u), len(lines.G))),
-                          *mount_rows(model))
-    acting = u
+    lines = line_response(model.linear, len(u), sample_rate_Hz)
+    y, deflection = lines.answer(u, floor)
+    record = RecordMotion("", sample_rate_Hz, start_s, campaign_s, u, deflection, *mount_rows(model))
     effects = [one for one in model.effects if one.effect.nonlinear]
-    x = lines.motion(lines.drive(u, floor))
-    if effects:
-        record.deflection[:] = lines.in_time(lines.deflection(x, floor))
-        for one in effects:
-            volts = one.effect.volts(record, one.place, one.by_name)
-            acting = acting if volts is None else acting + (volts - record.volts)
-        if acting is not u:
-            x = lines.motion(lines.drive(acting, floor))
-            record.deflection[:] = lines.in_time(lines.deflection(x, floor))
+    changed = [volts for one in effects if (volts := one.effect.volts(record, one.place, one.by_name)) is not None]
+    if changed:
+        acting = u + sum(volts - u for volts in changed)
+        y, deflection = lines.answer(acting, floor)
+        record = replace(record, volts=acting, deflection=deflection)
     pushing = [one for one in effects if one.effect.force(record, one.place, one.by_name) is not None]
-    if not pushing or not len(lines.G):  # a rig without mounts of its own has no motion by which forces could act
-        return Simulated(lines.in_time(lines.sensed(x, acting, floor)), lines.in_time(lines.deflection(x, floor)))
-    return _with_forces(model, lines, replace(record, volts=acting), x, floor, pushing)
+    if not pushing or not deflection.size:  # a rig without mounts of its own has no motion by which forces could act
+        return Simulated(y, deflection)
+    return _with_forces(model, lines, record, floor, pushing)
 
 
 def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -104,39 +99,27 @@ def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tupl
     return np.clip(u, -limit, limit), floor
 
 
-_responses: list[tuple[LineResponse, ForceResponse]] = []
-
-
-def _force_response(lines: LineResponse, mass: np.ndarray) -> ForceResponse:
-    """`ForceResponse`, the last one kept: records of one length share it."""
-    for known, found in _responses:
-        if known is lines:
-            return found
-    _responses.clear()
-    _responses.append((lines, ForceResponse(lines, mass)))
-    return _responses[0][1]
-
-
-def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x: np.ndarray,
-                 floor: np.ndarray | None, effects: Sequence[ActiveEffect]) -> Simulated:
+def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, floor: np.ndarray | None,
+                 effects: Sequence[ActiveEffect]) -> Simulated:
     """March, then let the forces act over the whole record. What enters the next pass: what a response before its
     cause leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
     weak = next((one for one in effects if isinstance(one.effect, LargeMotion)), None)
-    by_force = _force_response(lines, model.matrices.M)
+    if "forces" not in lines.kept:
+        lines.kept["forces"] = ForceResponse(lines)
+    by_force = lines.kept["forces"]
     # Free motion in coordinates of the response: any that give the deflection.
     to_z, n = np.linalg.pinv(by_force.shape), len(record.volts)
     defect, reading = float("nan"), None
     slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, by_force.shape.shape[1])), 0.0
-    linear = lines.deflection(x, floor)
+    linear = record.deflection.copy()
     for _ in range(SETTINGS.most_passes):
-        free = linear + by_force.whole(slow) @ by_force.shape.T
-        in_time = lines.in_time(free)
-        z_free = in_time @ to_z.T
-        record.deflection[:] = in_time
+        free = linear + lines.in_time(by_force.whole(slow) @ by_force.shape.T)
+        z_free = free @ to_z.T
+        record.deflection[:] = free
         push, left, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
         if marching:
-            z, push = march(by_force, z_free + correction, marching, record, in_time - z_free @ by_force.shape.T)
+            z, push = march(by_force, z_free + correction, marching, record, free - z_free @ by_force.shape.T)
             left = z_free + lines.in_time(by_force.whole(push)) - z
         if weak:
             known = with_large_motion({"": record}, model)[""]
@@ -146,11 +129,8 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, x
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
         defect = float(np.sqrt(np.mean(((left + missing) @ by_force.shape.T) ** 2))) / size
         if defect <= SETTINGS.defect:
-            z = by_force.whole(push + slow)
-            y = lines.sensed(x + z[:, :by_force.n_x], record.volts, floor)
-            if reading is not None:
-                y += lines.read_beside(reading)
-            return Simulated(lines.in_time(y), lines.in_time(linear + z @ by_force.shape.T), defect)
+            moved = by_force.whole(push + slow)[:, :by_force.n_x]
+            return Simulated(*lines.answer(record.volts, floor, moved, reading), defect)
         if not np.isfinite(defect):
             break
         correction = correction + left

@@ -13,7 +13,7 @@ from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.operators import Assembled, Operators
 from avis_ctrl.gap.record_motion import RecordMotion
-from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse, gain_of
+from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.structure import structural_null_space, structure_of
@@ -220,6 +220,11 @@ class TableModel:
     def nonlinear(self) -> bool:
         return any(one.effect.nonlinear for one in self.effects)
 
+    @property
+    def linear(self) -> TableModel:
+        """The model without effects that depend on amplitude or time."""
+        return replace(self, effects=tuple(one for one in self.effects if not one.effect.nonlinear))
+
     def operators(self, omega: np.ndarray) -> Operators:
         ops = Operators(self.effective, np.asarray(omega, float))
         for one in self.effects:
@@ -277,8 +282,7 @@ class TableModel:
         if not any(one.effect.holds_states for one in self.effects):
             return np.zeros((len(omega), n_y, 0), complex)
         made = self.assembled(omega)
-        seen = (gain_of(made) * made.ops.sense[:, :, None]) * (made.rows @ made.inverse)
-        return seen @ made.forces_of_states
+        return made.left @ made.forces_of_states
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -29,15 +28,11 @@ class Acting:
     inner: np.ndarray | None = None
 
 
-def gain_of(made: Assembled) -> np.ndarray:
-    return (made.ops.base.sensors.sensitivity * made.ops.sensor_gain)[:, None]
-
-
 class DrivenTable:
     """Forces (n, n_q, m) on an assembled table, and what it reads of a motion."""
 
     def __init__(self, made: Assembled, acting: Acting):
-        self.made, self.acting, self.gain = made, acting, gain_of(made)
+        self.made, self.acting, self.gain = made, acting, made.gain
         U, ops, n_u = acting.U, made.ops, len(made.ops.base.actuators)
         self.s = s = ops.s[:, None, None]
         commanded = U[:, :n_u]
@@ -87,10 +82,10 @@ class TableResponse(DrivenTable):
         self.x = made.inverse @ self.total
         self.Y = self.read(self.x)
 
-    @cached_property
+    @property
     def left(self) -> np.ndarray:
         """(n, n_y, n_q) y by a force on the coordinates."""
-        return self.gain * self.sense * (self.made.rows @ self.made.inverse)
+        return self.made.left
 
     def by_rig(self, model: ResponseModel, d: Matrices, more: int) -> np.ndarray:
         """(n_p + more, n, n_y, m) by the rig's free parameters, and zeros; d of all of them, zero for stiffness and

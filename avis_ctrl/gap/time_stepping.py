@@ -18,6 +18,7 @@ import scipy.fft
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.gap.effects.mounts import ContactFriction, Contacts, pushed
 from avis_ctrl.gap.line_response import LineResponse
+from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.response import N_Q
@@ -51,24 +52,20 @@ class ForceResponse:
     closed form for the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in the place of 1/s^2.
     """
 
-    def __init__(self, response: LineResponse, mass: np.ndarray):
-        self.response, self.n_x = response, response.G.shape[1]
-        period = 1 / response.sample_rate_Hz
-        theta = response.omega * period
-        self.hold = np.sinc(theta / (2 * np.pi)) ** 2
-        self.alias = period ** 2 * _folded(theta)
-        self.by_mass = np.linalg.inv(mass)
-        self.shape = response.G
-        by_force = response.compliance[:, :, :N_Q]
-        if response.recoil is not None:
-            by_force = np.concatenate([by_force, response.recoil @ by_force], axis=1)
-            self.shape = np.hstack([response.G, response.G_c])
+    def __init__(self, response: LineResponse):
+        self.response, table = response, response.parts[0]
+        self.n_x, self.shape, recoils = table.n_q, table.G, table.ops.recoil is not None
+        if recoils:
+            self.shape = np.hstack([table.G, table.ops.mounts.chassis])
+        theta = response.omega / response.sample_rate_Hz
+        alias, by_mass = _folded(theta) / response.sample_rate_Hz ** 2, np.linalg.inv(table.M)
+        hold = np.sinc(theta / (2 * np.pi))[:, None, None] ** 2
+        by_force = hold * np.concatenate([_by_force(part, recoils) for part in response.parts])
+        by_force[:, :N_Q] += alias[:, None, None] * by_mass
+        self.by_force = by_force
         impulse = np.empty((response.samples, by_force.shape[1], N_Q))
         for k in range(by_force.shape[1]):
-            column = self.hold[:, None] * by_force[:, k]
-            if k < N_Q:
-                column += self.alias[:, None] * self.by_mass[k]
-            impulse[:, k] = scipy.fft.irfft(column, response.padded, axis=0)[:response.samples]
+            impulse[:, k] = response.in_time(by_force[:, k])
         window = 1 << max(4, round(np.log2(SETTINGS.window_s * response.sample_rate_Hz)))
         self.own = scipy.fft.rfft(impulse[:window], 2 * window, axis=0)
         self.window, self.levels, length = window, [], window
@@ -78,12 +75,7 @@ class ForceResponse:
 
     def whole(self, force: np.ndarray) -> np.ndarray:
         """(n, c) spectrum of the motion by a force (samples, 6)."""
-        F = self.response.spectrum(force)
-        z = (self.response.compliance[:, :, :N_Q] @ (self.hold[:, None] * F)[:, :, None])[:, :, 0]
-        if self.response.recoil is not None:
-            z = np.hstack([z, (self.response.recoil @ z[:, :, None])[:, :, 0]])
-        z[:, :N_Q] += self.alias[:, None] * (F @ self.by_mass)
-        return z
+        return (self.by_force @ self.response.spectrum(force)[:, :, None])[:, :, 0]
 
     def after(self, force: np.ndarray, level: int) -> np.ndarray:
         """(B, c) what a force over B = window 2^level samples leaves in the B samples after it."""
@@ -95,6 +87,12 @@ class ForceResponse:
         """(length, c) of a force at the first samples of a window, in it."""
         spectrum = scipy.fft.rfft(force, 2 * self.window, axis=0)
         return scipy.fft.irfft((self.own @ spectrum[:, :, None])[:, :, 0], 2 * self.window, axis=0)[:length]
+
+
+def _by_force(table: Assembled, recoils: bool) -> np.ndarray:
+    """(n, c, 6) motion by a force on the payload: of the table, and of a chassis towards it."""
+    x = table.inverse[:, :, :N_Q]
+    return np.concatenate([x, -table.chassis(x, np.zeros((len(x), 3, N_Q)))], axis=1) if recoils else x
 
 
 def _folded(theta: np.ndarray) -> np.ndarray:

@@ -23,7 +23,8 @@ from avis_ctrl.gap import (
 )
 from avis_ctrl.gap.axis import settings as axis
 from avis_ctrl.gap.effects import base, chassis
-from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines, record_residual
+from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines
+from avis_ctrl.identification import campaign_fit
 
 
 def tuning_values() -> dict[str, dict[str, Any]]:
@@ -35,6 +36,6 @@ def tuning_values() -> dict[str, dict[str, Any]]:
         "motion in a record": motion_estimate.SETTINGS, "spectra of motion": record_motion.SETTINGS,
         "lines of a record": line_response.SETTINGS, "time stepping": time_stepping.SETTINGS,
         "simulation": simulation.SETTINGS, "realisation": state_space.SETTINGS, "converter": converter.SETTINGS,
-        "hum": hum.SETTINGS, "driven lines": record_residual.SETTINGS, "noise level": noise_level.SETTINGS,
+        "hum": hum.SETTINGS, "records": campaign_fit.SETTINGS, "noise level": noise_level.SETTINGS,
         "quiet lines": quiet_lines.SETTINGS, "chassis": chassis.SETTINGS, "single axis": axis.SETTINGS}
     return {name: asdict(one) for name, one in parts.items()}

@@ -49,6 +49,13 @@ def _chain_response(chain: StateSpace | None, motion: Motion, lines: bytes) -> n
     return (1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]) * (1j * omega) ** _POWER[motion]
 
 
+@lru_cache(maxsize=64)
+def _aliases(lines: bytes, period_s: float, delay_s: float, motion: Motion, corner_Hz: float | None,
+             low_pass: tuple[complex, ...]) -> np.ndarray:
+    """(n,) `aliases`, not to be written to."""
+    return aliases(np.frombuffer(lines), period_s, delay_s, motion, corner_Hz, low_pass)
+
+
 def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
                ) -> Callable[[Model, np.ndarray], Value]:
     """A method of lines omega that keeps the `most` results it found last, not to be written to: a fit needs them again
@@ -162,12 +169,17 @@ class SensorModel:
         return np.stack([_chain_response(chain, motion, lines) * self._detuned(s, k) for k, (chain, motion) in
                          enumerate(zip(self.chains, self.motions, strict=True))], axis=1)
 
-    def folded(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None) -> np.ndarray:
-        """(n, n_y) `aliases` of each sensor's motion, which pass its chain far above its corners: its gain is that of
-        the anti-alias filter alone."""
-        own = {motion: aliases(omega, period_s, delay_s, motion, corner_Hz, self.low_pass)
-               for motion in dict.fromkeys(self.motions)}
-        return np.stack([own[motion] for motion in self.motions], axis=1)
+    def driven(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) commanded to acting volts: hold, delay and amplifier; and (n, n_y) `aliases` of each sensor's motion,
+        which pass its chain far above its corners: its gain is that of the anti-alias filter alone."""
+        omega = np.asarray(omega, float)
+        lag = 1 + 1j * omega / (2 * np.pi * corner_Hz) if corner_Hz else 1.0
+        if not period_s:
+            return np.exp(-1j * omega * delay_s) / lag, np.zeros((len(omega), len(self.motions)), complex)
+        lines = omega.tobytes()
+        return hold(omega, period_s, delay_s) / lag, np.stack(
+            [_aliases(lines, period_s, delay_s, motion, corner_Hz, self.low_pass) for motion in self.motions], axis=1)
 
 
 def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) -> SensorModel:
@@ -573,14 +585,7 @@ class ResponseModel:
 
     def drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Voltage commanded to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1)."""
-        corner = self.amplifier_corner_Hz
-        if self.period_s:
-            a = hold(omega, self.period_s, self.delay_s)
-            folded = self.sensors.folded(omega, self.period_s, self.delay_s, corner)
-        else:
-            a, folded = np.exp(-1j * omega * self.delay_s), np.zeros((len(omega), 1), complex)
-        if corner:
-            a = a / (1 + 1j * omega / (2 * np.pi * corner))
+        a, folded = self.sensors.driven(omega, self.period_s, self.delay_s, self.amplifier_corner_Hz)
         return a[:, None, None], folded[:, :, None]
 
 

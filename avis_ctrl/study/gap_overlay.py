@@ -76,7 +76,7 @@ def selections(campaign: Campaign) -> list[Campaign]:
 
 
 def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock: tuple[float, float]) -> GapOverlay:
-    linear = replace(updated, effects=tuple(one for one in updated.effects if not one.effect.nonlinear))
+    linear = updated.linear
     loaded = replace(records, records=tuple(one.load() for one in records.records))
     beside = None if (measured := _best_linear(loaded)) else _less(loaded, _simulated(loaded, linear, clock))
     if measured is None:

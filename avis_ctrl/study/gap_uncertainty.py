@@ -15,7 +15,7 @@ with probability p or more, however correlated (Sidak 1967), where the errors of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -252,7 +252,7 @@ def _allowed(design: Design, omega: np.ndarray, settings: FitUncertaintySettings
 def _seen(model: TableModel, names: Sequence[str], wiring: Wiring, omega: np.ndarray) -> np.ndarray:
     """(n_p, n, k, k) relative change of the response from forces asked to velocities seen, on six coordinates, by some
     parameters of a model per their units; zero by those of effects that depend on amplitude."""
-    model = replace(model, effects=tuple(one for one in model.effects if not one.effect.nonlinear))
+    model = model.linear
     sensors = list(model.sensors.names)
     A = np.zeros((len(omega), len(model.inputs), wiring.allocation.shape[1]), complex)
     A[:, [model.inputs.index(name) for name in wiring.actuators]] = wiring.allocation

@@ -17,7 +17,7 @@ from avis_ctrl.gap.tuning_values import tuning_values
 FOLDER = Path(avis_ctrl.gap.__file__).parent
 FILES = sorted(FOLDER.rglob("*.py"))
 # What no tuning can change: physics, mathematics, names, tables.
-NO_TUNING = {"ADDED", "ALL", "AT_REST", "BEYOND", "BY_PHYSICS", "COUNTS", "DECAY", "FASTER", "FILES", "FLOOR",
+NO_TUNING = {"ADDED", "ALL", "AT_REST", "BEYOND", "BY_PHYSICS", "COUNTS", "DECAY", "FASTER", "FILES",
              "FORMAT", "HANN_COST", "HANN_SHARED", "HIGHER", "MAINS_HZ", "MOUNT", "PROBLEMS",
              "PRODUCTS", "RAYLEIGH", "RELEASED", "REST", "SETTINGS", "SLOW", "SWEEP", "SYMMETRIC",
              "THREE_AXES", "TOGETHER",

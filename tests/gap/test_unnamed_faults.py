@@ -1,4 +1,4 @@
-"""Faults that the library has no name for: their first order against differences, and whose name they take away."""
+"""Faults that the library has no name for: how they act, where their fit begins, and whose name they take away."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.unnamed.base import FirstOrder
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.motion_estimate import mount_rows
 from avis_ctrl.gap.record_motion import RecordMotion
@@ -35,7 +34,7 @@ def record(name, level):
     rng = np.random.default_rng([5, int(name)])
     volts, slow = level * rng.standard_normal((SAMPLES, 8)), rng.standard_normal((SAMPLES, 18))
     slow = np.apply_along_axis(lambda x: np.convolve(x, np.ones(20) / 5, "same"), 0, slow)
-    return RecordMotion(name, RATE, 10.0 * int(name), (0.0, 60.0), volts, 1e-5 * slow[:, :12], *mount_rows(BARE), level,
+    return RecordMotion(name, RATE, 10.0 * int(name), (0.0, 60.0), volts, 1e-5 * slow[:, :12], *mount_rows(BARE),
                         actuators=BARE.actuators, sensors=BARE.sensors.names, y=0.1 * slow[:, 12:])
 
 
@@ -59,18 +58,67 @@ def test_none_of_them_is_in_the_library():
     assert not set(unnamed_faults()) & set(library())
 
 
-@pytest.mark.parametrize("name", [name for name, one in unnamed_faults().items() if isinstance(one, FirstOrder)])
-def test_first_order_is_the_slope_of_the_whole_model(name):
+FILTERS = {  # effect, place, values, factor on the channel by s, volts or outputs
+    "sensor_late": ("Sz2", (2e-3, 5e-3), lambda s: np.exp(-2e-3 * s) / (1 + 5e-3 * s)),
+    "motor_late": ("Az2", (2e-3, 5e-3), lambda s: np.exp(-2e-3 * s) / (1 + 5e-3 * s)),
+    "sensor_resonance": ("Sz2", (0.1, 30.0, 0.02),
+                         lambda s: 1 + 0.1 * s ** 2 / (s ** 2 + 2 * 0.02 * 60 * np.pi * s + (60 * np.pi) ** 2))}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_fault_of_one_channel_is_a_factor_on_it_alone(name):
+    place, values, factor = FILTERS[name]
+    found = MODEL.with_effect(active(unnamed_faults()[name], MODEL, place, values)).response(OMEGA)
+    expected, f = MODEL.response(OMEGA), factor(1j * OMEGA)[:, None]
+    if place in MODEL.actuators:
+        expected[:, :, MODEL.actuators.index(place)] *= f
+    else:
+        expected[:, MODEL.sensors.names.index(place)] *= f
+    # Aliases of the motors pass no filter of the sensors.
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+
+
+ADDITIONS = {  # place, strength, (volts, outputs) that are added to a record of volts u and outputs y at times t
+    "sensor_quadratic": ("Sz1", 0.02, lambda u, y, t: (0, only(1, (y[:, 1] - y[:, 1].mean()) ** 2, 6))),
+    "sensor_cubic": ("Sz1", 0.02, lambda u, y, t: (0, only(1, (y[:, 1] - y[:, 1].mean()) ** 3, 6))),
+    "drive_crosstalk": ("Ay1/Ax2", 0.3, lambda u, y, t: (only(0, u[:, 2], 8), 0)),
+    "drive_quadratic": ("Ay1", 0.3, lambda u, y, t: (only(0, u[:, 0] ** 2, 8), 0)),
+    "drive_absolute": ("all motors", 0.3, lambda u, y, t: (u * np.abs(u), 0)),
+    "drive_cubic": ("Ay1", 0.3, lambda u, y, t: (only(0, u[:, 0] ** 3, 8), 0)),
+    "force_drift": ("all motors", 0.3, lambda u, y, t: (u * ((t - 30.0) / 60.0)[:, None], 0))}
+
+
+def only(k, samples, channels):
+    found = np.zeros((len(samples), channels))
+    found[:, k] = samples
+    return found
+
+
+@pytest.mark.parametrize("name", ADDITIONS)
+def test_a_fault_that_adds_a_signal(name):
+    place, strength, law = ADDITIONS[name]
+    record = MOTION["01"]
+    volts, output = law(record.volts, record.y, record.time_s)
+    one = active(unnamed_faults()[name], MODEL, place, (strength,))
+    added = one.effect.spectra(record, place, one.by_name, OMEGA)
+    for found, samples in ((added.volts, volts), (added.output, output)):
+        if found is None:
+            assert np.all(samples == 0)
+        else:
+            lines = np.fft.rfft(strength * samples, axis=0)[LINES] / np.sqrt(SAMPLES)
+            np.testing.assert_allclose(found, lines, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["sensor_late", "motor_late"])
+def test_what_is_late_begins_with_half_of_it_as_delay_and_as_lag(name):
     effect = unnamed_faults()[name]
-    score = Score(MODEL, [block(MODEL, "00")])
-    for place in (effect.places(MODEL)[0], effect.places(MODEL)[-1]):
-        point = effect.starts(MODEL, place)[0]
-        one = active(effect, MODEL, place, point)
-        by_differences = score.of_effect(one)
-        closed = score.directions([effect.first_order(part, place, point) for part in score.parts])
-        size = np.linalg.norm(by_differences, axis=1)
-        assert np.all(size > 0)
-        assert np.linalg.norm(by_differences - closed, axis=1) == pytest.approx(0 * size, abs=2e-2 * size.max())
+    place = effect.places(MODEL)[1]
+    truth = MODEL.with_effect(active(effect, MODEL, place, (1e-4, 3e-4)))
+    score = Score(MODEL, [block(truth, "00", 1e-4)])
+    (seed,) = effect.seeds(score, place)
+    assert seed.values == pytest.approx((2e-4, 2e-4), rel=0.1)
+    early = Score(truth, [block(MODEL, "00", 1e-4)])
+    assert effect.seeds(early, place) == []
 
 
 def searched(truth, *names):

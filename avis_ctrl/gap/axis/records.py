@@ -16,13 +16,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from scipy import fft, signal
 from scipy.interpolate import BSpline
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
+from avis_ctrl.gap.dahl import dahl
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import bands
@@ -54,21 +54,8 @@ class Motion:
         return np.sign(self.v)
 
     def dahl(self, distance: float) -> np.ndarray:
-        """Friction of size one that is a spring before it slips (P. R. Dahl, 1968): dz/dq = (1 - z sign v)/distance.
-        """
-        return _dahl(self.q, distance)
-
-
-@numba.njit(cache=True)
-def _dahl(q, distance):  # pragma: no cover
-    found, z = np.empty_like(q), 0.0
-    found[0] = 0.0
-    for i in range(1, len(q)):
-        step = q[i] - q[i - 1]
-        way = 1.0 if step > 0 else -1.0
-        z = way + (z - way) * np.exp(-abs(step) / distance)
-        found[i] = z
-    return found
+        """(n,) friction of size one that is a spring before it slips."""
+        return dahl(self.q[:, None], self.q[:1], distance, np.zeros(1))[:, 0] / distance
 
 
 def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarray]:

@@ -34,9 +34,7 @@ class ActuatorGain(Effect):
         return (EffectParameter("gain", "1", "force constant over that of the rig file", 1.0, 0.05, 10.0, 1.0),)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        drive = ops.drive.copy()
-        drive[:, ops.actuator(place)] *= values["gain"]
-        ops.drive = drive
+        ops.drive = ops.drive * np.where(np.array(ops.base.actuators) == place, values["gain"], 1)
 
 
 @register

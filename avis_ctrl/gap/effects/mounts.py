@@ -6,8 +6,8 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numba import njit
 
+from avis_ctrl.gap.dahl import dahl
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import (
     Added,
@@ -243,18 +243,12 @@ class CubicStiffness(OfMounts):
     name = "cubic_stiffness"
     title = "the mounts stiffen with amplitude"
     looks_like = "vertical resonances rise with level, and third harmonics appear"
-    at = ("isolators z", "isolators z/polynomial")
+    at: tuple[str, ...] = ("isolators z", "isolators z/polynomial")
     nonlinear = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        force, rms = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)), largest_rms(model)
-
-        def of_power(n: int, words: str) -> EffectParameter:
-            size = force / rms ** (n - 1)
-            return EffectParameter(f"k{n}_N_per_m{n}", f"N/m^{n}", f"{words} stiffness, mean of the mounts", 0.0,
-                                   -1e4 * size, 1e4 * size, size)
-        others = (of_power(2, "quadratic"), of_power(5, "quintic")) if "/" in place else ()
-        return (of_power(3, "cubic"), *others,
+        others = (stiffness(model, 2, "quadratic"), stiffness(model, 5, "quintic")) if "/" in place else ()
+        return (stiffness(model, 3, "cubic"), *others,
                 *uneven(range(1, int(np.sum(vertical(model.rig)))), "that of mount {} over the mean, less one"))
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
@@ -269,6 +263,13 @@ class CubicStiffness(OfMounts):
 
     def implausible(self, values: Values, std: Values) -> str:
         return "mounts that soften with amplitude" if values["k3_N_per_m3"] < 0 else ""
+
+
+def stiffness(model: Table, n: int, words: str) -> EffectParameter:
+    """Of a force in the n-th power of the deflection."""
+    size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** (n - 1)
+    return EffectParameter(f"k{n}_N_per_m{n}", f"N/m^{n}", f"{words} stiffness, mean of the mounts", 0.0, -1e4 * size,
+                           1e4 * size, size)
 
 
 def powers(values: Values) -> list[tuple[int, str]]:
@@ -358,25 +359,6 @@ class Contacts:
 def pushed(f: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
     """(n, 6) generalized force on the payload by friction over stiffness, (n, m), in time or on lines."""
     return -f @ (contacts(values)[:, None] * record.rows[record.driven_rows])
-
-
-@njit(cache=True)
-def dahl(deflection, last, slip, state):
-    """(samples, m) friction force over stiffness [m] for a deflection (samples, m), exact between samples.
-
-    While the motion keeps its direction, f -> +-slip as exp(-|dx|/slip). last, state : (m,) before the first sample.
-    """
-    n, m = deflection.shape
-    out = np.empty((n, m))
-    for j in range(m):
-        f, before = state[j], last[j]
-        for k in range(n):
-            step = deflection[k, j] - before
-            before = deflection[k, j]
-            end = slip if step > 0 else -slip
-            f = end + (f - end) * np.exp(-abs(step) / slip)
-            out[k, j] = f
-    return out
 
 
 @register

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize, stats
+from scipy.signal.windows import hann
 
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.signals.record_residual import RecordResidual, check_common
+from avis_ctrl.gap.signals.record_residual import RecordResidual
 
 MAINS_HZ = (50.0, 60.0)
 # int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
@@ -111,12 +112,7 @@ def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
 
     Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
     neighbours are not driven is passed over. Costs a transform of each record and some 10 ms.
-
-    Raises
-    ------
-    InputError : no residual, records of different channels.
     """
-    first = check_common(left)
     scores = [_scores(left, nominal) for nominal in MAINS_HZ]
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
     each = [one.p for one in scores]
@@ -136,7 +132,7 @@ def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
     hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
     frequency = _refined(left, frequency.value, hits)
     lines = _lines(left, frequency.value, hits, there.ratio[0])
-    return _finding(left, best.nominal_Hz, frequency, lines, chance, first.y_unit)
+    return _finding(left, best.nominal_Hz, frequency, lines, chance, left[0].header.y_unit)
 
 
 def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
@@ -242,7 +238,7 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
     pieces = []
     for one in left:
         n = one.header.samples
-        window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n)
+        window = hann(n, sym=False)
         for k, j in hits:
             k = int(k) + 1
             # Shifted to zero frequency and averaged down to about 60 values: the fine search is cheap there.

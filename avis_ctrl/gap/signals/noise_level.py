@@ -28,7 +28,7 @@ from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.signals.hum import HumFinding, polluted
 from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
-from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual, check_common
+from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual
 from avis_ctrl.rigs.rig import Rig
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
@@ -149,9 +149,9 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
 
     Raises
     ------
-    InputError : no residual, a rig file without [ambient], too few quiet lines for the sensors' noise.
+    InputError : a rig file without [ambient], too few quiet lines for the sensors' noise.
     """
-    first = check_common(left)
+    first = left[0].header
     ambient = getattr(rig, "ambient", None)
     if ambient is None:
         raise InputError("the rig file does not say what is normal on site", field="ambient")

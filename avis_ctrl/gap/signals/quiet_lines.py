@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from avis_ctrl.gap.signals.record_residual import RecordResidual
 
@@ -127,7 +128,7 @@ def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narr
         # Lines of machines or mains would be spread over their window.
         lines_of_noise &= line <= SETTINGS.outlier * np.median(line, axis=2, keepdims=True)
         power = np.sum(line * lines_of_noise, axis=2) / np.maximum(np.sum(share * lines_of_noise, axis=2), 1e-3 * width)
-        size = np.sqrt(_running_mean(power, SETTINGS.smoothed)) + 1e-300
+        size = np.sqrt(uniform_filter1d(power, SETTINGS.smoothed, axis=0, mode="nearest")) + 1e-300
     made = []
     for k, one in enumerate(left):
         good = (share[:, k] > SETTINGS.least_left) & keep[k][at] & lines_of_noise[:, k]
@@ -156,11 +157,3 @@ def _hann_covariance(Q: np.ndarray) -> np.ndarray:
         out[:, :, lag:] += rho * Q[:, :, :-lag]
         out[:, :, :-lag] += rho * Q[:, :, lag:]
     return out
-
-
-def _running_mean(power: np.ndarray, width: int) -> np.ndarray:
-    """(n, m) over `width` rows, fewer at the ends."""
-    total = np.concatenate([np.zeros((1, power.shape[1])), np.cumsum(power, axis=0)])
-    row = np.arange(len(power))
-    low, high = np.maximum(row - width // 2, 0), np.minimum(row + width // 2 + 1, len(power))
-    return (total[high] - total[low]) / (high - low)[:, None]

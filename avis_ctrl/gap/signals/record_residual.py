@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.fft
+from scipy.signal.windows import hann
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 
 # Variance of a mean of |e|^2 over neighbouring lines of a Hann window, by that of independent lines: the correlation
@@ -17,43 +18,16 @@ from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 HANN_SHARED = 1 + 2 * (4 / 9 + 1 / 36)
 
 
-@dataclass(frozen=True)
-class LineSettings:
-    """Of the lines of a record.
-
-    driven : of the power of its largest line, above which a line of u counts as driven [1]: far above round-off,
-        and below what any drive's spectrum leaves out on purpose.
-    """
-
-    driven: float = 1e-6
-
-
-SETTINGS = LineSettings()
-
-
 @dataclass(frozen=True, eq=False)
 class RecordResidual:
     """y minus a model's prediction in one record.
 
     header : of the record. u : (samples, n_u) commanded volts. e : (samples, n_y), unit of y.
-
-    Raises
-    ------
-    InputError : shapes that do not belong to the header, numbers that are not finite.
     """
 
     header: RecordHeader
     u: np.ndarray
     e: np.ndarray
-
-    def __post_init__(self) -> None:
-        wanted = (self.header.samples, len(self.header.y_names))
-        if np.shape(self.e) != wanted or not np.all(np.isfinite(self.e)):
-            raise InputError(f"expected finite numbers of shape {wanted}, as y has them", value=np.shape(self.e),
-                             field=f"record {self.header.name}: residual")
-        if len(self.u) != self.header.samples:
-            raise InputError(f"expected {self.header.samples} samples", value=len(self.u),
-                             field=f"record {self.header.name}: u")
 
     @cached_property
     def frequency_Hz(self) -> np.ndarray:
@@ -72,9 +46,9 @@ class RecordResidual:
 
     @cached_property
     def driven(self) -> np.ndarray:
-        """(n,) lines in which u holds more than a millionth of the power of its largest line."""
+        """(n,) lines that u does not leave silent."""
         power = np.sum(np.abs(self.U) ** 2, axis=1)
-        return power > SETTINGS.driven * power.max() if power.max() > 0 else np.zeros(len(power), bool)
+        return power > FIT.silent_line ** 2 * power.max() if power.max() > 0 else np.zeros(len(power), bool)
 
     @property
     def silent(self) -> bool:
@@ -90,35 +64,11 @@ class RecordResidual:
 
     def _spectrum(self, x: np.ndarray) -> np.ndarray:
         n = self.header.samples
-        window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(n) / n)
-        return scipy.fft.rfft((x - x.mean(0)) * window[:, None], axis=0) / np.sqrt(n * 3 / 8)
+        return scipy.fft.rfft((x - x.mean(0)) * hann(n, sym=False)[:, None], axis=0) / np.sqrt(n * 3 / 8)
 
 
 def record_residuals(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[RecordResidual, ...]:
-    """Of the records that a prediction (samples, n_y) is given for, by record name; memory holds all of them.
-
-    Raises
-    ------
-    InputError : a name that the campaign does not have, a prediction of another shape, none at all.
-    """
-    if not predicted:
-        raise InputError("expected the prediction of one record at least", field="predicted")
-    found = []
-    for name, y in predicted.items():
-        record = campaign.named(name).load()
-        if np.shape(y) != record.y.shape:
-            raise InputError(f"expected shape {record.y.shape}", field=f"record {name}: prediction", value=np.shape(y))
-        found.append(RecordResidual(record.header, record.u, record.y - y))
-    return tuple(found)
-
-
-def check_common(left: Sequence[RecordResidual]) -> RecordHeader:
-    """The first header; InputError where there is none or channels or rates differ."""
-    if not left:
-        raise InputError("expected the residual of one record at least", field="residuals")
-    first = left[0].header
-    for one in left[1:]:
-        if (one.header.y_names, one.header.sample_rate_Hz) != (first.y_names, first.sample_rate_Hz):
-            raise InputError(f"expected channels and sample rate of record {first.name}",
-                             field=f"record {one.header.name}")
-    return first
+    """Of the records that a prediction (samples, n_y) is given for, by record name; memory holds all of them."""
+    records = (campaign.named(name).load() for name in predicted)
+    return tuple(RecordResidual(record.header, record.u, record.y - predicted[record.header.name])
+                 for record in records)

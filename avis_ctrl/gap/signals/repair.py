@@ -15,7 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.converter import ConverterFinding, nominal_converter
-from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -52,12 +52,10 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
 
     Raises
     ------
-    InputError : y not in V, predictions of another shape or of records that the campaign does not have.
+    InputError : y not in V.
     """
     if campaign.y_unit != "V":
         raise InputError("expected V: the converter clips in its own unit", field="unit of y", value=campaign.y_unit)
-    for name in predicted or {}:
-        campaign.named(name)
     names = campaign.y_names
     limits = channel_limits(rig, names, findings)
     low, high = (np.array([limits[name][k] for name in names]) for k in (0, 1))
@@ -71,16 +69,8 @@ def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | N
         at += np.count_nonzero(top | bottom, axis=0)
         samples += len(y)
         if predicted is not None and record.header.name in predicted:
-            model = _checked(record, predicted[record.header.name])
+            model = predicted[record.header.name]
             y = np.where((top & (model > y)) | (bottom & (model < y)), model, y)
         limits_V = rig.limits_of(record.header.u_names)
         records.append(replace(record, u=np.clip(record.u, -limits_V, limits_V), y=y))
     return Repaired(replace(campaign, records=tuple(records)), dict(zip(names, (at / samples).tolist(), strict=True)))
-
-
-def _checked(record: Record, model: np.ndarray) -> np.ndarray:
-    model = np.asarray(model, float)
-    if model.shape != record.y.shape or not np.all(np.isfinite(model)):
-        raise InputError(f"expected finite numbers of shape {record.y.shape}", value=model.shape,
-                         field=f"record {record.header.name}: prediction")
-    return model

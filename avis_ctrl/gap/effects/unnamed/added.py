@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Added, EffectParameter, Table, Values
 from avis_ctrl.gap.effects.mounts import largest_rms
-from avis_ctrl.gap.effects.unnamed.base import FirstOrder, at, by_volts, motion, pairs
+from avis_ctrl.gap.effects.unnamed.base import UnnamedFault, pairs
 from avis_ctrl.gap.record_motion import RecordMotion
-from avis_ctrl.gap.score import Part
 
 ALL = "all motors"
 
 
 @dataclass(frozen=True)
-class AddedSignal(FirstOrder):
+class AddedSignal(UnnamedFault):
     """A row of `ADDED`.
 
     where : places on a table. parameter : the strength. signal : (samples, channels) on all channels for a strength of
-    one; None for a class of its own.
+    one; None for a class of its own. to : what it is added to.
     """
 
     name: str
@@ -32,6 +30,7 @@ class AddedSignal(FirstOrder):
     where: Callable[[Table], tuple[str, ...]]
     parameter: Callable[[Table], EffectParameter]
     signal: Callable[[RecordMotion], np.ndarray] | None = None
+    to: Literal["volts", "output"] = "volts"
     nonlinear = True
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -44,59 +43,26 @@ class AddedSignal(FirstOrder):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (self.parameter(model),)
 
-    @abstractmethod
-    def channels(self, record: RecordMotion) -> tuple[str, ...]: ...
-
-    def unit(self, record: RecordMotion, place: str, omega: np.ndarray) -> np.ndarray:
-        """(n, channels) on lines omega for a strength of one."""
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        """In one channel, or in all where the place is none of them."""
         assert self.signal is not None
-        signal = self.signal
-        return at(record.kept(self.name, omega, lambda: signal(record)), self.channels(record), place)
-
-
-class AddedVolts(AddedSignal):
-    """Volts beside the commanded ones."""
-
-    def channels(self, record: RecordMotion) -> tuple[str, ...]:
-        return record.actuators
-
-    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
+        signal, names = self.signal, record.actuators if self.to == "volts" else record.sensors
+        own = np.array(names) == place if place in names else 1.0
         (strength,) = values.values()
-        return Added(volts=strength * self.unit(record, place, omega))
-
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        return (by_volts(part) @ self.unit(motion(part), place, part.block.omega)[:, :, None])[None]
+        return Added(**{self.to: strength * own * record.kept(self.name, omega, lambda: signal(record))})
 
 
-class AddedOutput(AddedSignal):
-    """Outputs beside what the sensors read, made of the record's own y."""
-
-    def channels(self, record: RecordMotion) -> tuple[str, ...]:
-        return record.sensors
-
-    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
-        (strength,) = values.values()
-        return Added(output=strength * self.unit(record, place, omega))
-
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        return self.unit(motion(part), place, part.block.omega)[None, :, :, None]
-
-
-class DriveCrosstalk(AddedVolts):
+class DriveCrosstalk(AddedSignal):
     """One motor gets a share of another one's voltage."""
 
-    def unit(self, record: RecordMotion, place: str, omega: np.ndarray) -> np.ndarray:
+    def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         k, i = (record.actuators.index(name) for name in place.split("/"))
-        out = np.zeros((len(omega), len(record.actuators)), complex)
-        out[:, k] = record.kept("volts", omega, lambda: record.volts)[:, i]
-        return out
-
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        k, i = (part.model.actuators.index(name) for name in place.split("/"))
-        return (by_volts(part)[:, :, k] * part.block.U[:, i])[None, :, :, None]
+        volts = np.zeros((len(omega), len(record.actuators)), complex)
+        volts[:, k] = values["share"] * record.kept("volts", omega, lambda: record.volts)[:, i]
+        return Added(volts=volts)
 
 
-class DeadZone(AddedVolts):
+class DeadZone(AddedSignal):
     """No force within +-w, sign(u) (|u| - w) beyond: u less u clipped at w."""
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
@@ -124,28 +90,28 @@ def _strength(unit: str, words: str, size: float) -> EffectParameter:
 
 
 def _force_law(name: str, title: str, term: str, unit: str, power: int, law: Callable[[np.ndarray], np.ndarray]
-               ) -> AddedVolts:
+               ) -> AddedSignal:
     """Force of one motor, or of all, that is not in proportion to its voltage."""
-    return AddedVolts(name, title, f"the force of {{place}} not in proportion to voltage, with a term in {term}",
+    return AddedSignal(name, title, f"the force of {{place}} not in proportion to voltage, with a term in {term}",
                       _motors, lambda model: _strength(unit, term, 0.01 / largest_volts(model) ** power),
                       lambda record: law(record.volts))
 
 
-def _by_deflection(name: str, title: str, words: str, unit: str, power: int) -> AddedVolts:
+def _by_deflection(name: str, title: str, words: str, unit: str, power: int) -> AddedSignal:
     """Force constants by a power of the motors' deflection."""
     def where(model: Table) -> tuple[str, ...]:
         known = [one for one in model.motion.values() if len(one.driven_rows) == one.volts.shape[1]]
         return (ALL,) if known else ()
-    return AddedVolts(
+    return AddedSignal(
         name, title, words, where,
         lambda model: _strength(unit, "of the force constant by deflection", 0.01 / largest_rms(model) ** power),
         lambda record: record.volts * record.deflection[:, record.driven_rows] ** power)
 
 
-def _reading_law(name: str, title: str, words: str, parameter: EffectParameter, power: int) -> AddedOutput:
+def _reading_law(name: str, title: str, words: str, parameter: EffectParameter, power: int) -> AddedSignal:
     """One sensor whose reading holds a power of itself."""
-    return AddedOutput(name, title, words, lambda model: model.sensors.names if _read(model) else (),
-                       lambda model: parameter, lambda record: (record.y - record.y.mean(0)) ** power)
+    return AddedSignal(name, title, words, lambda model: model.sensors.names if _read(model) else (),
+                       lambda model: parameter, lambda record: (record.y - record.y.mean(0)) ** power, "output")
 
 
 def _dead_zone(model: Table) -> EffectParameter:
@@ -172,11 +138,11 @@ ADDED: dict[str, AddedSignal] = {one.name: one for one in (
     _reading_law("sensor_cubic", "a sensor that is not linear (cubic)",
                  "{place} not linear, with a term in the cube of its reading",
                  EffectParameter("per_unit_2", "1/[y]^2", "cubic share", 0.0, -1e9, 1e9, 1e-2), 3),
-    AddedOutput("clock_rate", "outputs and inputs run on clocks of different rate",
+    AddedSignal("clock_rate", "outputs and inputs run on clocks of different rate",
                 "outputs sampled by a clock of another rate than the inputs'",
                 lambda model: ("loop",) if _read(model) else (),
                 lambda model: EffectParameter("relative", "1", "rate of one clock over the other's, less one", 0.0,
-                                              -0.01, 0.01, 1e-6), _other_clock),
+                                              -0.01, 0.01, 1e-6), _other_clock, "output"),
     DriveCrosstalk("drive_crosstalk", "a fraction of one motor's voltage on another",
                    "a fraction of {source}'s voltage on {into}", lambda model: pairs(model.actuators),
                    lambda model: EffectParameter("share", "1", "fraction of the other's "
@@ -185,13 +151,12 @@ ADDED: dict[str, AddedSignal] = {one.name: one for one in (
     _force_law("drive_absolute", "a force constant that depends on the voltage", "u|u|", "1/V", 1,
                lambda u: u * np.abs(u)),
     _force_law("drive_cubic", "a force constant that depends on the voltage", "u^3", "1/V^2", 2, lambda u: u ** 3),
-    DeadZone("dead_zone", "a dead zone of the drives", "a dead zone of {place}", _motors, _dead_zone,
-             lambda record: -np.sign(record.volts)),
+    DeadZone("dead_zone", "a dead zone of the drives", "a dead zone of {place}", _motors, _dead_zone),
     _by_deflection("force_by_deflection", "a force constant that depends on deflection",
                    "a force constant of the motors that depends on their deflection", "1/m", 1),
     _by_deflection("force_by_square", "a force constant that falls off with deflection",
                    "a force constant of the motors that depends on the square of their deflection", "1/m^2", 2),
-    AddedVolts("force_drift", "force constants that drift over the campaign",
+    AddedSignal("force_drift", "force constants that drift over the campaign",
                "force constants that drift over the campaign", lambda model: (ALL,),
                lambda model: EffectParameter("relative_change", "1", "of every force constant over the campaign", 0.0,
                                              -0.9, 0.9, 0.01), _drift))}

@@ -6,9 +6,8 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
 from avis_ctrl.gap.effects.sensors import receptance
-from avis_ctrl.gap.effects.unnamed.base import FirstOrder, Late, by_volts, pairs
+from avis_ctrl.gap.effects.unnamed.base import Late, UnnamedFault, pairs
 from avis_ctrl.gap.operators import Operators
-from avis_ctrl.gap.score import Part
 
 
 def mix(ops: Operators, into: str, shares: Values) -> None:
@@ -21,19 +20,7 @@ def mix(ops: Operators, into: str, shares: Values) -> None:
     ops.rows = rows
 
 
-def only(part: Part, place: str, column: np.ndarray) -> np.ndarray:
-    """(1, n, n_y, m): column (n, m) in the channel of a sensor, nothing in the others."""
-    out = np.zeros((1, *part.response.Y.shape), complex)
-    out[0, :, part.model.sensors.names.index(place)] = column
-    return out
-
-
-def read(part: Part, place: str) -> np.ndarray:
-    """(n, m) y of a sensor."""
-    return part.response.Y[:, part.model.sensors.names.index(place)]
-
-
-class SensorCrosstalk(FirstOrder):
+class SensorCrosstalk(UnnamedFault):
     """One output holds a share of another output's signal."""
 
     name = "sensor_crosstalk"
@@ -50,12 +37,8 @@ class SensorCrosstalk(FirstOrder):
         into, source = place.split("/")
         mix(ops, into, {source: values["share"]})
 
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        into, source = place.split("/")
-        return only(part, into, read(part, source))
 
-
-class SensorCrosstalkOfAll(FirstOrder):
+class SensorCrosstalkOfAll(UnnamedFault):
     """One output holds shares of all others: a common ground, or a sensor somewhere else on the payload."""
 
     name = "sensor_crosstalk_of_all"
@@ -72,10 +55,6 @@ class SensorCrosstalkOfAll(FirstOrder):
     def change(self, ops: Operators, place: str, values: Values) -> None:
         mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
 
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        return np.concatenate([only(part, place, read(part, name)) for name in part.model.sensors.names
-                               if name != place])
-
 
 class SensorLate(Late):
     """One output is later than the others: a low pass, a delay of its own."""
@@ -90,9 +69,6 @@ class SensorLate(Late):
     def change(self, ops: Operators, place: str, values: Values) -> None:
         ops.sense[:, ops.sensor(place)] *= self.factor(ops.s, values)
 
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        return np.repeat(only(part, place, -part.s[:, 0] * read(part, place)), 2, axis=0)
-
 
 class MotorLate(Late):
     """One motor is later than the others: a lag or a delay of its own amplifier."""
@@ -104,17 +80,10 @@ class MotorLate(Late):
         return model.actuators
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        drive = np.array(np.broadcast_to(ops.drive, (len(ops.omega), ops.drive.shape[1])))
-        drive[:, ops.actuator(place)] *= self.factor(ops.s, values)
-        ops.drive = drive
-
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        k = part.model.actuators.index(place)
-        dY = by_volts(part)[:, :, k] * (-part.s[:, 0] * part.block.U[:, k])
-        return np.repeat(dY[None, :, :, None], 2, axis=0)
+        ops.drive = ops.drive * np.where(np.array(ops.base.actuators) == place, self.factor(ops.s, values)[:, None], 1)
 
 
-class SensorResonance(FirstOrder):
+class SensorResonance(UnnamedFault):
     """One output holds a resonance of its sensor's holder: times 1 + share s^2/(s^2 + 2 zeta w s + w^2)."""
 
     name = "sensor_resonance"
@@ -133,7 +102,3 @@ class SensorResonance(FirstOrder):
     def change(self, ops: Operators, place: str, values: Values) -> None:
         shape = ops.s ** 2 * receptance(ops.s, values["frequency_Hz"], values["damping"])
         ops.sense[:, ops.sensor(place)] *= 1 + values["share"] * shape
-
-    def first_order(self, part: Part, place: str, point: np.ndarray) -> np.ndarray:
-        s = part.s[:, 0]
-        return only(part, place, s ** 2 * receptance(s, float(point[1]), float(point[2])) * read(part, place))

@@ -6,8 +6,7 @@ alone the nearest would win, and be named in the place of the fault. Here stands
 the library, in few parameters: where one of these explains the data better, nothing is named, and the verdict says in
 words what the table behaves like. None of them is ever named or part of a model that is handed out.
 
-They act as all effects do. Those at one sensor or one motor are many and simple: what they do to first order is known
-without the table's being assembled anew (`first_order`).
+They act as all effects do.
 """
 
 from __future__ import annotations

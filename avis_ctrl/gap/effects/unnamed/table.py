@@ -5,29 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table, Values
-from avis_ctrl.gap.effects.mounts import OfMounts, largest_rms
+from avis_ctrl.gap.effects.mounts import CubicStiffness, OfMounts, largest_rms, stiffness
 from avis_ctrl.gap.effects.unnamed.base import UnnamedFault
-from avis_ctrl.gap.operators import Operators, mount_geometry
+from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 
 
-class QuadraticStiffness(UnnamedFault, OfMounts):
+class QuadraticStiffness(UnnamedFault, CubicStiffness):
     """Force -k2 d^2 at every vertical mount: an air spring is stiffer in than out."""
 
     name = "quadratic_stiffness"
     title = "mounts of unlike stiffness up and down"
     words = "vertical mounts with a term in the square of their deflection"
-    nonlinear = True
-    strength = "k2_N_per_m2"
+    at = ("isolators z",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model)
-        return (EffectParameter("k2_N_per_m2", "N/m^2", "quadratic stiffness of each mount", 0.0, -1e4 * size,
-                                1e4 * size, size),)
+        return (stiffness(model, 2, "quadratic"),)
 
-    def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        up = record.vertical
-        return -values["k2_N_per_m2"] * (record.deflection[:, up] ** 2 @ record.rows[up])
+    def implausible(self, values: Values, std: Values) -> str:
+        return ""
 
 
 class QuadraticDrag(UnnamedFault, OfMounts):
