@@ -1,11 +1,12 @@
 """Which anti-windup the code has, if any: chosen by simulation of the nonlinear table, each against none.
 
 No anti-windup is best for every controller: what the limits cut off may be what the table should not get anyway, and a
-law that takes it back then prolongs the recovery. The circle criterion, by which an L2 gain could be guaranteed, does
-not hold for these controllers even without anti-windup: at the upper crossover the phase of I - L passes 90 degrees.
+law that reacts to it then prolongs the recovery. The circle criterion, by which these laws could guarantee an L2 gain,
+is not met even without anti-windup: at the upper crossover an eigenvalue of I - L has a phase beyond 90 degrees.
 So the choice is made by comparison: the floor moves as at the site, but so far that the linear loop would demand
 several times the drives' range, then it rests. A law is kept only if at no level of the floor the table recovers more
-slowly than without it; of those kept, the best is exported, and none if none is better. Random motion averages over the
+slowly than without it; of those kept, the one with the smallest geometric mean of all figures is exported, and none if
+none is better. Random motion averages over the
 instants at which it may end; after a single sine the recovery depends on that instant more than on the law.
 """
 
@@ -90,9 +91,14 @@ def choose_anti_windup(loop: SampledLoop, axes: tuple[str, ...],
                 if np.any(found[-1] > (1 + settings.alike) * without[k]):
                     break
             else:
-                if np.prod(found) < np.prod(best.chosen):
+                if _mean(found) < min(_mean(best.chosen), (1 - settings.alike) * _mean(without)):
                     best = Choice(law, corner, gain, settings.levels, without, np.array(found))
     return best
+
+
+def _mean(figures: Any) -> float:
+    """Geometric mean."""
+    return float(np.exp(np.mean(np.log(figures))))
 
 
 def _floors(loop: SampledLoop, settings: AntiWindupSettings) -> np.ndarray:

@@ -16,7 +16,7 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
-from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_beside, with_second_order
+from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
 from avis_ctrl.gap.probability import odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import (
@@ -97,7 +97,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     if prepared.local_noise and residual.noise_nrmse ** 2 > settings.within_noise * residual.nrmse ** 2:
         # A local model takes distortion for noise; the model with its effects may predict it.
         progress("noise estimated again, with the effects that were found")
-        prepared = with_noise_beside(prepared, fits.best.model, each)
+        prepared = with_noise_from(prepared, fits.best.model, each)
         fits = _refitted(fits, prepared, known, progress, each, settings)
     more, best = outliers(fits.best, prepared.data(prepared.fitted, settings.lines), known, settings, progress, each)
     fits = replace(fits, steps=(*fits.steps, *more), best=best)
@@ -125,27 +125,24 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Each,
               settings: GapSettings) -> Fits:
-    """The fits that follow from a new estimate of the noise: the last model again, and what is found beside it."""
+    """The fits that follow from a new estimate of the noise: the last model again, and what is found beside it. The
+    effects that were found are judged by the noise with which they were found."""
     data, best = prepared.data(prepared.fitted, settings.lines), fits.best
     best = fit(best.model, best.priors, best.z, data, best.variances, settings)
-    if not fits.steps:
-        return _searched(replace(fits, tolerant=best), data, effects, progress, each, settings)
-    last = replace(fits.steps[-1], fitted=best)
-    return _searched(replace(fits, steps=(*fits.steps[:-1], last)), data, effects, progress, each, settings)
+    return _searched(replace(fits, best=best), data, effects, progress, each, settings)
 
 
 def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Each, settings: GapSettings
               ) -> Fits:
-    """With the effects that the search finds."""
+    """With the effects that the search finds beside those of the best fit."""
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
 
     def enough(step: Step) -> bool:
         """What was found takes next to nothing of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
-    steps = search(fits.tolerant, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough,
-                   fits.steps)
-    return replace(fits, steps=tuple(steps), best=steps[-1].fitted if steps else fits.tolerant)
+    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
+    return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
 def _left(model, data: Data) -> float:
@@ -194,7 +191,7 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
     absent = {name: p.none for name, p in zip(one.names, one.parameters, strict=True) if p.linear}
     for half in halves(best, _judged(one), settings, absent=absent):
         if half.change > settings.law_change:
-            return f"{half.words} gives a value of one of its parameters that differs by {100 * half.change:.0f} %"
+            return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
     return ""
 
 

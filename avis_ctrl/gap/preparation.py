@@ -118,7 +118,7 @@ def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each:
                   prepared.clipped, progress, each, settings)
 
 
-def with_noise_beside(prepared: Prepared, model: TableModel, each: Each) -> Prepared:
+def with_noise_from(prepared: Prepared, model: TableModel, each: Each) -> Prepared:
     """The same with noise from what a better model leaves of the records."""
     groups = [list(prepared.fitted), list(prepared.held_out), list(prepared.unmasked)]
     left = left_by(prepared.campaign, model, each)

@@ -148,18 +148,18 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Each = one_by_one,
-           enough: Callable[[Step], bool] = lambda step: False, known: Sequence[Step] = ()) -> list[Step]:
+           enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
     """Effects in the order in which they are found; last of all the values of the rig file that are beyond their
     tolerance, which show in how far one of them had to move, and hardly in what remains.
 
-    enough : whether the search may end with a step, because what it found takes next to nothing. known : steps that it
-    continues.
+    base : the fit that it begins with; it may have effects already. enough : whether the search may end with a step,
+    because what it found takes next to nothing.
     The last step has the fit with everything that was found.
     """
-    steps = list(known)
+    steps: list[Step] = []
 
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
-        while len(steps) < settings.longest:
+        while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(steps) + 1}")
             step = _step(now, data, effects, settings, each)
@@ -184,7 +184,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
 
 def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
              progress: Progress = lambda text: None, each: Each = one_by_one) -> tuple[list[Step], Fitted]:
-    """Values of the rig file beyond their tolerance that stand out of the others, where these moved by much less than
+    """Values of the rig file beyond their tolerance that stand out from the others, where these moved by much less than
     their tolerances; and the last fit, with the tolerances as stated.
 
     The priors are as narrow as the values are spread, before and with each effect alike.
@@ -192,7 +192,7 @@ def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSe
     rows, size = spread(now, settings)
     if size > settings.narrow:
         return [], now
-    progress(f"search for values that stand out of the others, which moved by {size:.2f} tolerances")
+    progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
     narrow: Fitted | None = _with_spread(now, rows, size, data, settings)
     while narrow is not None and len(now.labels) + len(steps) < settings.longest:
@@ -326,7 +326,7 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     # parameters shows what an effect can do.
     near += [one.effect for one, end in made if at_full_strength(one.effect)
              or (one.fall >= 2 * settings.not_far_behind * most
-             and (end is None or end.fall < settings.kept_promise * one.fall))]
+             and (end is None or end.fall < settings.least_promised * one.fall))]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
     found: dict[str, Fitted] = {}

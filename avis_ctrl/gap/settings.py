@@ -25,8 +25,8 @@ class GapSettings(FitSettings):
         determine [1].
     least_spread : smallest spread of these values, in tolerances, that is believed [1]: there are some tens of them,
         and the model errs by as much.
-    narrow : spread below which values are searched for that stand out of it [1]: an outlier gains log evidence of half
-        its square over the spread's.
+    narrow : spread below which values are searched for that stand out from it [1]: an outlier gains log evidence of
+        half its square over the spread's.
     held : standard deviation, over its tolerance, of a value that is beyond it [1]: the effect alone has it then.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
         costs some nats and bends nothing.
@@ -41,7 +41,7 @@ class GapSettings(FitSettings):
         that begins half its width away needs more than a few.
     not_far_behind : fraction of the best candidate's gain of log evidence by that fit with which another one is fitted
         on.
-    kept_promise : fraction of the fall of the sum of squares that the score test promises, below which a fit of a
+    least_promised : fraction of the fall of the sum of squares that the score test promises, below which a fit of a
         candidate's own parameters has failed [1]: the fit of all parameters then begins at the seed, too.
     quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates, or gives
         the residual of a stage.
@@ -90,7 +90,7 @@ class GapSettings(FitSettings):
     first_iterations: int = 4
     rough_iterations: int = 16
     not_far_behind: float = 0.3
-    kept_promise: float = 0.5
+    least_promised: float = 0.5
     quick_rounds: int = 4
     quick_iterations: int = 4
     longest: int = 5

@@ -52,8 +52,9 @@ def released(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Pri
 
 
 def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
-    """How far the values of the rig file that the data determine have moved, in tolerances: r.m.s. over what the data
-    leave of their prior (D. MacKay, Neural Computation 4 (1992) 415-447), at most 1; and their indices.
+    """Indices of the values of the rig file that the data determine, and how far these have moved, in tolerances: root
+    of the sum of z^2 over the sum of what the data take from their prior variance (D. MacKay, Neural Computation 4
+    (1992) 415-447), at most 1.
 
     A table may be built better than its tolerances say. A value of three tolerances is an outlier there.
     """

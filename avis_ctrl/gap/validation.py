@@ -70,12 +70,15 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
     stiffness at low level, a small difference between mounts) may move without changing the response there.
 
     parts : other halves, in words and rows of the residual. absent : values at which linear parameters of the effect do
-    not act, by name; with them, the change of the response is compared with the effect's own part of it.
+    not act, by name: changes are relative to the departure from them, and the change of the response is compared with
+    the effect's own part of it.
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
     slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
     root = np.linalg.cholesky(fitted.covariance[np.ix_(rows, rows)])
-    effect = _departure(fitted, absent or {})
+    absent = absent or {}
+    effect = _departure(fitted, absent)
+    away = np.abs(values - [absent.get(fitted.priors.names[row], 0.0) for row in rows])
     found = []
     if parts is None:
         parts = [(words, np.concatenate([fitted.rows[group] for group in groups]))
@@ -92,7 +95,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
         chi2 = float(np.sum(along ** 2 / (size[known] - 1)))
         difference, variance = into @ along, into ** 2 @ (size[known] - 1)
         p = np.minimum(len(rows) * stats.chi2.sf(difference ** 2 / np.maximum(variance, 1e-300), 1), 1.0)
-        change = np.abs(difference * slope) / np.maximum(np.abs(values), 1e-300)
+        change = np.abs(difference * slope) / np.maximum(away, 1e-300)
         largest = float(change.max(initial=0.0, where=p < settings.law_p_value))
         if len(effect):
             moved, own = difference @ J[rows], effect @ J
