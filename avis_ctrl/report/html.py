@@ -12,13 +12,15 @@ from avis_ctrl.report import plotly_backend
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.formulas import formula_images
 from avis_ctrl.report.pieces import Document, Formula
+from avis_ctrl.report.words import typeset
 
 
 def render(document: Document) -> bytes:
     """The document as HTML; everything that is text is escaped by the template engine."""
     files = resources.files("avis_ctrl.report")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True,
-                                     undefined=jinja2.StrictUndefined)
+                                     undefined=jinja2.StrictUndefined,
+                                     finalize=lambda value: typeset(value) if type(value) is str else value)
     template = environment.from_string((files / "report.html.j2").read_text(encoding="utf-8"))
     formulas = [p for section in document.sections for p in section.flat() if isinstance(p, Formula)]
     graphs = {f.name: plotly_backend.graph(f) for f in document.figures() if isinstance(f, Figure)}

@@ -47,6 +47,15 @@ def test_what_is_not_finite_is_said_in_words() -> None:
     assert np.isnan(decibels([0.0, np.inf, np.nan])).all()
 
 
+@pytest.mark.parametrize(("typed", "printed"), [
+    ("-17.2 % at -3 deg", "−17.2 % at −3 deg"), ("log evidence 4.14e+03 behind", "log evidence 4140 behind"),
+    ("1.853e+04 N s/m", "18530 N s/m"), ("5.814e+05 rad/s", "5.814e5 rad/s"), ("below 3.1e-05 s", "below 3.1e−5 s"),
+    ("41860 +- 160 N/m", "41860 ± 160 N/m"), ("2026-11-25, pages 71-109", "2026-11-25, pages 71-109"),
+    ("run1e-3.h5", "run1e-3.h5"), ("avis gap --design", "avis gap --design")])
+def test_signs_and_powers_are_typeset_and_names_are_not(typed, printed):
+    assert words.typeset(typed) == printed
+
+
 @pytest.mark.parametrize("name", ["avis", "halcyonics"])
 def test_rig_drawing_names_every_point(name: str) -> None:
     rig = load_rig(name)

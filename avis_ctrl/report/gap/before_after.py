@@ -28,7 +28,7 @@ def before_after(found: Found) -> Section:
     if gap.heat is not None and gap.heat.before.size:
         pieces.append(spectrum(gap.heat, bool(gap.effects)))
     if gap.stages:
-        pieces += [ladder(gap), _stages(gap)]
+        pieces.append(_stages(gap))
     seen = gap_overlay(found.measured, gap.baseline, gap.updated)
     pieces += [Paragraph(seen, "note")] if isinstance(seen, str) else responses(seen, bool(gap.effects))
     return Section("The gap before and after" if gap.effects else "The gap", "before_after", tuple(pieces))

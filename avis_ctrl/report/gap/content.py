@@ -8,14 +8,22 @@ from avis_ctrl.report.gap.controller import controller
 from avis_ctrl.report.gap.dependence import dependence
 from avis_ctrl.report.gap.effects import parameters
 from avis_ctrl.report.gap.finding import Found
-from avis_ctrl.report.gap.measurement import measurement
 from avis_ctrl.report.gap.method import method
 from avis_ctrl.report.gap.opening import opening
 from avis_ctrl.report.gap.places import places
 from avis_ctrl.report.gap.remaining import remaining
 from avis_ctrl.report.identification.gates import gates_of
-from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.pieces import Document, Section
+from avis_ctrl.report.records import records, remarks
 from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
+
+
+def measurement(found: Found) -> Section:
+    """The records, and how they were divided."""
+    use = {one.name: "held out" if one.held_out else "fitted" for one in found.gap.records}
+    how = found.gap.held_out.rstrip(".")
+    return Section("Measurement", "measurement", (records(found.measured, use, f"Held out: {how}" if how else ""),
+                                                  *remarks(found.measured)))
 
 
 def document(found: Found) -> Document:

@@ -20,7 +20,7 @@ def remaining(found: Found) -> Section:
         pieces.append(table_of(gap.remaining, "Where the residual of the updated model lies, on held-out data. "))
     if gap.detectable:
         pieces += [Heading("Detection limits"), detectable(gap)]
-    pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(found))]
+    pieces += [Heading("What to measure next"), Paragraph(next_step(found))]
     return Section("Residual, and what to measure next", "remaining", tuple(pieces))
 
 
@@ -67,8 +67,11 @@ def _left(gap: Gap) -> str:
             f"{wording.percent(left.share)} of that of the re-identified model. {level} {places}")
 
 
-def _nothing(found: Found) -> str:
+def next_step(found: Found) -> str:
+    """The experiment that would tell more, or that none is needed."""
     gap = found.gap
+    if gap.next_experiment:
+        return wording.said(gap.next_experiment)
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
         return "No further measurement was found that would distinguish the effects that these data confuse."
     if gap.verdict in ("partly explained", "unexplained"):

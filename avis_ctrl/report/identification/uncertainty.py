@@ -39,7 +39,7 @@ def _directions(made: InDesign, found: Identification) -> Table:
     for one, effect in zip(made.directions, made.found.effect, strict=True):
         share = sorted(((100 * change / abs(values[name]), name) if values.get(name) else (np.inf, name)
                         for name, change in one.changes), key=lambda pair: -abs(pair[0]))
-        shown = ", ".join(f"{name} {part:+.2g} %".replace("-", "−") if np.isfinite(part) else name
+        shown = ", ".join(f"{name} {part:+.2g} %" if np.isfinite(part) else name
                           for part, name in share[:MOST_NAMED])
         more = f", and {len(share) - MOST_NAMED} parameters by less" if len(share) > MOST_NAMED else ""
         rows.append((one.name, f"{words.number(100 * effect, 2)} %", shown + more))
@@ -71,4 +71,4 @@ def _spread(made: InDesign) -> Figure:
                     Style("#222222", "solid", 2.0)))
     assumed = f" {made.assumption}" if made.assumption else ""
     return Figure("spread", f"Relative spread of the response, largest singular value: {weight.meaning}.{assumed}",
-                  (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative error [%]", "log"), curves),), height=1.3)
+                  (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative error [%]", "log"), curves),), height=1.1)

@@ -55,7 +55,7 @@ def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, 
     order = np.argsort(passive.frequencies)
     curves.append(Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive",
                         STYLES["passive"]))
-    curves.append(level(0.01, 1000.0, 1.0, "1", STYLES["limit"]))
+    curves.append(level(0.01, 1000.0, 1.0, "mu = 1"))
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
     top = min(max(finite) * 1.3, 30.0)
     panel = Panel(hertz(0.01, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))

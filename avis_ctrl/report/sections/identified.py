@@ -63,7 +63,7 @@ def _directions(result: DesignResult, found: InDesign) -> Table:
                  f"{name} {change:+.2g} {words.unit(units[name])}" for name, change in sizes[:SHOWN]]
         more = f" and {len(sizes) - SHOWN} parameters by less" if len(sizes) > SHOWN else ""
         rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %",
-                     (", ".join(shown) + more).replace("-", "−")))
+                     ", ".join(shown) + more))
     return table("Directions of the identified parameters: each is one real number between −1 and 1 that changes all "
                  "of them together. The effect is the largest relative change of the response at 1.",
                  ("direction", "effect", "change at +1"), rows, "lrl")

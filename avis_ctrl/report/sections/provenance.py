@@ -12,6 +12,9 @@ from avis_ctrl.study.design_result import DesignResult
 NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs_sha256": "SHA-256 of the inputs",
          "measurement_sha256": "SHA-256 of the measurement", "seconds": "seconds of computing", "python": "Python"}
 
+# Values that a row has room for.
+MOST = 12
+
 
 def provenance(result: DesignResult) -> Section:
     """The provenance of a design."""
@@ -27,6 +30,8 @@ def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
 
 
 def _said(value: Any) -> str:
+    if isinstance(value, Mapping) and len(value) > MOST:
+        return "listed in the JSON file of results"
     if isinstance(value, Mapping):
         return "; ".join(f"{key} ({_said(one)})" if isinstance(one, Mapping) else f"{key} {_said(one)}"
                          for key, one in value.items())

@@ -39,7 +39,7 @@ def _parameters(one: Rig) -> list[Piece]:
         if match := _NUMBERED.fullmatch(name):
             rows = grouped.setdefault(match["group"], {})
             rows.setdefault(match["rest"], {})[int(match["number"])] = p
-        else:
+        elif not name.startswith("actuator."):  # the table of drives has the force constants
             plain.append((name, _value(p.value), words.unit(p.unit), p.description))
     found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
     for group, rows in grouped.items():

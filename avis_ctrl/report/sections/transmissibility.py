@@ -30,7 +30,7 @@ def _against_skyhook(result: DesignResult) -> Table:
 
 
 def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
-    """The limit of the design, with its steps [dB]."""
+    """The target of the synthesis, with its steps [dB]."""
     limits = result.design.transmissibility
     f = omega / (2 * np.pi)
     inside = (f >= limits.band_Hz[0]) & (f <= limits.band_Hz[1])
@@ -45,7 +45,7 @@ def left_out(result: DesignResult) -> str:
 
 def _limit(result: DesignResult) -> Curve:
     omega = 2 * np.pi * np.geomspace(0.1, 200.0, 2000)
-    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "required bound", STYLES["limit"])
+    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "target of the synthesis", STYLES["limit"])
 
 
 def _sigma(c: ControllerResult) -> Curve:

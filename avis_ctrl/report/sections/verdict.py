@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 
 import numpy as np
@@ -22,7 +21,7 @@ def verdict(result: DesignResult) -> Section:
     met = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
                  "singular value from floor to payload, rotations as displacement of the edge.",
                  ("requirement", "verdict", "result", "limit"), rows, "lcrr")] if rows else []
-    return Section("Summary", "verdict", (_sentence(result), _asked(result), *met, certificate(result),
+    return Section("Summary", "verdict", (_sentence(result), _asked(result, bool(met)), *met, certificate(result),
                                           summary_figure(result)), alone=True)
 
 
@@ -31,20 +30,21 @@ def _sentence(result: DesignResult) -> Paragraph:
     if not result.stable:
         return Paragraph(first_sentence(result), "verdict", False)
     said = f"{first_sentence(result)} {_achieved(result)}"
-    return Paragraph(re.sub(r"(?<= )-(?=\d)", "−", said), "verdict", good)
+    return Paragraph(said, "verdict", good)
 
 
-def _asked(result: DesignResult) -> Paragraph:
-    """The task in two sentences."""
+def _asked(result: DesignResult, judged: bool) -> Paragraph:
+    """The task; judged : a table of requirements follows."""
     design, uncertain = result.design, result.design.uncertainty.parameters_percent
     low, high = design.transmissibility.band_Hz
     spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
     members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
     return Paragraph(
         f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
-        f"{result.rig.name}, stable and within the bounds for {members}: "
-        f"transmissibility at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and at most "
-        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies.".replace(" -", " −"))
+        f"{result.rig.name}, stable for {members}. Its target, the weight of the synthesis, is a transmissibility of "
+        f"at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and of at most "
+        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
+        + (" The result is judged by the requirements of the design file:" if judged else ""))
 
 
 def _achieved(result: DesignResult) -> str:
