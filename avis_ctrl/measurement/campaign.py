@@ -159,8 +159,9 @@ class Record(RecordSource):
                                  "channels", field=f"record {h.name}: {field}", value=array.shape)
             if not np.all(np.isfinite(array)):
                 row, column = np.argwhere(~np.isfinite(array))[0]
-                raise InputError(f"expected finite numbers; {np.count_nonzero(~np.isfinite(array))} are not, the first "
-                                 f"at sample {row} of channel {names[column]}", field=f"record {h.name}: {field}",
+                raise InputError("expected finite numbers; NaN or infinite: "
+                                 f"{np.count_nonzero(~np.isfinite(array))}, the first at sample {row} "
+                                 f"of channel {names[column]}", field=f"record {h.name}: {field}",
                                  value=float(array[row, column]))
             object.__setattr__(self, field, array)
         if self.floor is None and h.floor_names:

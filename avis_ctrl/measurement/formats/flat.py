@@ -164,7 +164,8 @@ def flat_record(name: str, parts: Mapping[str, tuple[Sequence[str], Sequence[str
         text = ", ".join(f"{role} has {count}" for role, count in lengths.items())
         raise InputError(f"expected equally many samples; {text}", field=where)
     if not channels["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError("expected at least one input; only a record of excitation 'rest' or 'floor' does without",
+        raise InputError("expected at least one input, a column u or u_...; where it has another name, columns says so "
+                         "(u=NAME); only a record with excitation 'rest' or 'floor' has none",
                          field=f"{where}: u")
     rms = root_mean_square(arrays["u"]) if arrays["u"].size else None
     header, assumed = flat_header(name, lengths["y"], rate_Hz, start_s, channels, units, rms, hints)

@@ -59,7 +59,8 @@ def read(path: str | Path, rig: str | None = None) -> Campaign:
         stated = check_root(file)
         group = member(file, "records")
         if group is None:
-            raise InputError(f"missing; the file holds {listed(file)}", field="/records")
+            raise InputError(f"missing; expected a group with one group per record; the file holds {listed(file)}",
+                             field="/records")
         if not isinstance(group, h5py.Group):
             raise InputError("expected a group, found a data set", field="/records")
         records = tuple(_record(group, name, str(path)) for name in _in_order(group))
@@ -81,7 +82,8 @@ def check_root(file: h5py.File) -> str:
         raise InputError(f"expected {FORMAT!r}", field="attribute format", value=stated)
     version = as_number(require(found, "version", "attributes of the file", f"{VERSION}"), "attribute version")
     if version != VERSION:
-        raise InputError(f"this release reads version {VERSION}", field="attribute version", value=version)
+        raise InputError(f"expected {VERSION}, the version that this release reads", field="attribute version",
+                         value=version)
     return as_text(require(found, "rig", "attributes of the file", "the name of the rig"), "attribute rig")
 
 
@@ -108,7 +110,8 @@ def _record(group: h5py.Group, name: str, path: str) -> StoredRecord:
         if dataset is None:
             if role == "floor":
                 continue
-            raise InputError(f"missing; the record holds {listed(record)}", field=f"{where}: {role}")
+            raise InputError(f"missing; expected a data set (samples, channels); the record holds {listed(record)}",
+                             field=f"{where}: {role}")
         samples[role], count = _shape(dataset, f"{where}: {role}")
         stated = attributes(dataset, "names", "unit")
         channels[role] = as_names(require(stated, "names", f"{where}: {role}", "the channels' names"),
@@ -139,7 +142,8 @@ def _shape(dataset: Any, field: str) -> tuple[int, int]:
         raise InputError("expected shape (samples, channels)", field=field, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
-        raise InputError(f"expected shape (samples, channels); {samples} samples of {count} channels look transposed",
+        raise InputError(f"expected (samples, channels) with more samples than channels; {samples} samples of "
+                         f"{count} channels look transposed",
                          field=field, value=shape)
     return samples, count
 

@@ -76,7 +76,7 @@ def _check_version(tree: Mapping[str, Any]) -> None:
     if stated != FORMAT:
         raise InputError(f"expected {FORMAT!r}", field="format", value=stated)
     if "version" in tree and (version := as_number(plain(tree["version"]), "version")) != VERSION:
-        raise InputError(f"this release reads version {VERSION}", field="version", value=version)
+        raise InputError(f"expected {VERSION}, the version that this release reads", field="version", value=version)
 
 
 def _structs(tree: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -77,7 +77,8 @@ def read_frequency_response(path: str | Path, averages: float | None = None,
         check_root(file)
         group = member(file, "frf")
         if not isinstance(group, h5py.Group):
-            raise InputError(f"missing; the file holds {listed(file)}", field="/frf")
+            raise InputError(f"missing; expected a group with frequency responses; the file holds {listed(file)}",
+                             field="/frf")
         return _response(path, group, averages, relative_standard_deviation)
 
 

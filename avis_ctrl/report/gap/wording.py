@@ -10,6 +10,7 @@ from avis_ctrl.gap.effects.base import Effect, Reported
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
 from avis_ctrl.report import words
+from avis_ctrl.uncertain_value import with_prefix
 
 # What each verdict claims, and what it does not.
 CLAIMS = {
@@ -77,8 +78,9 @@ def percent(share: float, digits: int = 3) -> str:
 
 def quantity(one: Reported) -> str:
     """value ± standard deviation unit."""
-    value, sigma = words.with_std(one.value, one.std)
-    unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
+    size, std, unit = with_prefix(one.value, one.std, one.unit)
+    value, sigma = words.with_std(size, std)
+    unit = "" if unit in ("", "1") else f" {words.unit(unit)}"
     if not (np.isfinite(one.std) and one.std > 0):
         return f"{value}{unit} (no standard deviation)"
     return f"({value} ± {sigma}){unit}" if unit else f"{value} ± {sigma}"

@@ -110,4 +110,4 @@ def _changes(found: Identification) -> Figure:
                if known.any() else "Change of each parameter from its starting value; none is determined individually.")
     return Figure("changes", caption, (Panel(Axis("change from the start [%]"),
                                              Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
-                  height=max(0.5, 0.085 * n))
+                  height=max(0.5, 0.07 * n))

@@ -27,7 +27,7 @@ def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece
     moved = np.array([one.moved for one in found])
     far = int(np.sum(np.abs(moved) > shown.far))
     rms = words.number(float(np.sqrt(np.mean(moved ** 2))), 2)
-    rows = [(one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2g}")
+    rows = [(one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2f}")
             for one in found[:shown.rows]]
     return [
         Heading("Tolerances"),
