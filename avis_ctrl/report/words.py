@@ -18,7 +18,7 @@ _MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
 
 def typeset(text: str) -> str:
     """Text as printed: signs in place of their typed forms, and no power of ten for a number below 100 000."""
-    return _MINUS.sub("−", _POWER.sub(_power, text.replace(" +- ", " ± ").replace("sqrt(Hz)", "√Hz")))
+    return _MINUS.sub("−", _POWER.sub(_power, text.replace(" +- ", " ± ")))
 
 
 def _power(typed: re.Match[str]) -> str:

@@ -165,7 +165,9 @@ def test_sizes_are_rounded_to_their_deviation(found):
 
 @pytest.mark.parametrize(("one", "text"), [
     (Reported(92.0, 1.0, "Hz"), "(92.0 ± 1.0) Hz"), (Reported(0.93, 0.004, "1"), "0.9300 ± 0.0040"),
-    (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)")])
+    (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)"),
+    (Reported(0.00132638, 4.6e-7, "s"), "(1.32638 ± 0.00046) ms"), (Reported(0.0121, 0.0002, "m"),
+                                                                    "(0.01210 ± 0.00020) m")])
 def test_a_quantity_in_words(one, text):
     assert wording.quantity(one) == text
 

@@ -195,7 +195,7 @@ class Polarity:
             return [Finding(self.name, "ok" if why.startswith("no model") else "note",
                             f"Polarity was not compared with a model ({why}).", picture=picture)]
         r, c = faults.r, faults.c
-        picture = Picture("Correlation of each sensor with the model, sign as recorded", "sensor", "correlation [-]",
+        picture = Picture("Signed correlation with the model", "sensor", "correlation [-]",
                           (Series("sensors", np.arange(len(r)), r * faults.other, "bars"),),
                           (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)
         both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)

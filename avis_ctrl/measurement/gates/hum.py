@@ -132,7 +132,7 @@ class Hum(Gate):
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
         f, a = thinned(kept.f[1:], kept.asd[1:, j])
-        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/sqrt(Hz)]",
+        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/√Hz]",
                        (Series(name, f, a),), tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
 
 

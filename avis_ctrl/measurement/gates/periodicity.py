@@ -117,8 +117,8 @@ class Periodicity(Gate):
                 Finding(self.name, "note",
                         f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first "
                         f"differs from the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that "
-                        "includes the transient, as in avis identify, needs no change; otherwise drop the first "
-                        f"{periods} of each record.", (), tuple(late), float(most), 0.0, picture))
+                        "includes the transient, as in avis identify, needs no change; otherwise leave out the "
+                        f"beginning of each record, {periods}.", (), tuple(late), float(most), 0.0, picture))
         elif drops and not found:
             _, k, limit, picture = next(iter(drops.values()))
             assert k.T is not None

@@ -79,8 +79,8 @@ class SignalToNoise(Gate):
             return found or [Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
                                      picture=picture)]
         f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
-        advice = (f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic"
-                  " excitation would distinguish them; a higher level helps only against noise."
+        advice = (f". Causes are noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. "
+                  "A periodic excitation would distinguish them; a higher level helps only against noise."
                   if segment_s
                   else ". Such bands have little weight in a fit; excite them more if they are important.")
         bands = octaves(f)
@@ -99,9 +99,9 @@ class SignalToNoise(Gate):
                             (name,), value=float(dB[:, j].max()), limit=SETTINGS.poor_dB, picture=picture))
             elif dB[weakest, j] < SETTINGS.low_dB:
                 weak = np.flatnonzero(dB[:, j] < SETTINGS.low_dB)
-                low = ", ".join(f"{middle[b]:.3g} Hz {round(float(dB[b, j]))} dB" for b in weak)
+                low = ", ".join(f"{round(float(dB[b, j]))} dB at {middle[b]:.3g} Hz" for b in weak)
                 found.append(
-                    Finding(self.name, "note", f"Channel {name!r} has little signal around {low}{advice}", (name,),
+                    Finding(self.name, "note", f"Channel {name!r} has little signal: {low}{advice}", (name,),
                             value=float(dB[weakest, j]), limit=SETTINGS.low_dB, picture=picture))
         if not found:
             b, j = divmod(int(np.argmin(dB)), dB.shape[1])
@@ -177,7 +177,7 @@ class Coherence(Gate):
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
-        picture = Picture(f"Multiple coherence at {top:.3g} V, thirds of octaves", "frequency [Hz]", "coherence [-]",
+        picture = Picture(f"Multiple coherence at {top:.3g} V, third octaves", "frequency [Hz]", "coherence [-]",
                           tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
                           (Limit("low", SETTINGS.low_coherence),), "log")
         below, excited = "", _lowest_driven(chosen)
@@ -194,7 +194,7 @@ class Coherence(Gate):
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         return [
             Finding(self.name, "ok",
-                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} "
+                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third-octave band from {best.f[0]:.3g} "
                     f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
                     f"Hz).{below}", value=float(mean[b, j]), limit=SETTINGS.low_coherence, picture=picture)]
 
@@ -207,12 +207,13 @@ class Coherence(Gate):
         for j in ordered[:4]:
             b = int(np.argmin(mean[:, j]))
             count = int(np.count_nonzero(mean[:, j] < SETTINGS.low_coherence))
-            said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in {count} bands)")
-        more = f" and {len(group) - 4} more channels" if len(group) > 4 else ""
+            said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in "
+                        f"{count} band{'s' * (count > 1)})")
+        more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
         return Finding(self.name, severity,
                        f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
-                       f"the {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that "
-                       "is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
+                       f"the {len(middle)} third-octave bands: {'; '.join(said)}{more}. Causes are noise, an input "
+                       "that is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
                        f"decays more slowly than the segments of {seconds:.3g} s. Longer records distinguish "
                        f"leakage from the other causes; a higher level reduces the influence of noise.{below}",
                        tuple(names[j] for j in ordered), value=float(mean[:, group].min()),

@@ -28,7 +28,7 @@ def gates_of(findings: Sequence[Finding]) -> Section:
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
     listed = [severity for _, severity, _ in together]
-    counts = ", ".join(f"{listed.count(s)} {s}" for s in reversed(SEVERITIES) if s in listed)
+    counts = ", ".join(f"{n} {s}{'s' * (n > 1 and s != 'ok')}" for s in reversed(SEVERITIES) if (n := listed.count(s)))
     pieces: list[Piece] = [
         table(f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
               "note is for information, a warning means less accurate results, a stop means wrong results.",
