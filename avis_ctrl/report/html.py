@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Sequence
 from importlib import resources
 
 import jinja2
+import typst
 from markupsafe import Markup
 
 from avis_ctrl.report import plotly_backend
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.formulas import formula_images
 from avis_ctrl.report.pieces import Document, Formula
 from avis_ctrl.report.words import typeset
+
+# A formula, set by Typst as a drawing of its own.
+PAGE = "#set page(width: auto, height: auto, margin: 2pt, fill: none)\n#set text(size: 11pt)\n"
 
 
 def render(document: Document) -> bytes:
@@ -37,3 +42,19 @@ def in_script(value: object) -> str:
     """JSON that no text inside can end the script element of."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def formula_images(formulas: Sequence[Formula]) -> list[str]:
+    """Each formula as SVG, one page each of one compilation."""
+    if not formulas:
+        return []
+    pages = "\n#pagebreak()\n".join(f"$ {one.typst} $" for one in formulas)
+    made = typst.compile((PAGE + pages).encode(), format="svg", ignore_system_fonts=True)
+    images = made if isinstance(made, list) else [made]
+    return [_own_names(image.decode(), k) for k, image in enumerate(images)]
+
+
+def _own_names(svg: str, number: int) -> str:
+    """Glyph names made different between the drawings of one page; the outer namespace declarations are needless."""
+    svg = re.sub(r'\b(id="|href="#)g', rf"\g<1>f{number}g", svg)
+    return re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")

@@ -21,7 +21,7 @@ from avis_ctrl.report import pdf as paper_of
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.identification.content import document
-from avis_ctrl.report.identification.gate_figures import figure_of
+from avis_ctrl.report.identification.gates import figure_of
 from avis_ctrl.report.identification.responses import strongest
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section, Table

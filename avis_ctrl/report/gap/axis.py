@@ -9,18 +9,18 @@ from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.opening import named
-from avis_ctrl.report.identification.gate_figures import figure_of
+from avis_ctrl.report.identification.gates import figure_of
 from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, Table, table
-from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
+from avis_ctrl.report.sections.provenance import document_of, provenance_table
 
 
 def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Document:
     """The report of a gap of one axis; source : name of the measurement."""
     told = {"seconds": round(gap.seconds, 2), **provenance}
-    return Document(f"Gap between a model of one axis and its measurement: {gap.kind}", f"Measurement: {source}",
-                    stamp_of(told), (_summary(gap), _model(gap), _remaining(gap),
-                                     provenance_table(told, "The same measurement, options and library versions give "
-                                                            "the same figures.")))
+    return document_of(
+        f"Gap between a model of one axis and its measurement: {gap.kind}", f"Measurement: {source}", told,
+        (_summary(gap), _model(gap), _remaining(gap),
+         provenance_table(told, "The same measurement, options and library versions give the same figures.")))
 
 
 def _summary(gap: AxisGap) -> Section:

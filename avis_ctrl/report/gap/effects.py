@@ -11,12 +11,12 @@ from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.gap.table_model import inseparable_parameters
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.tolerances import tolerances
+from avis_ctrl.study.gap import GapFinding
 
 
-def parameters(found: Found) -> Section:
+def parameters(found: GapFinding) -> Section:
     """Sizes with standard deviations, how each effect was confirmed, and the rig's parameters with and without."""
     gap = found.gap
     pieces: list[Piece] = []

@@ -9,9 +9,9 @@ from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import ladder
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.gap.remaining import next_step
 from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
 
 # Parameters of an effect that a row has room for; all of them stand in the section on parameters.
 MOST = 5
@@ -20,7 +20,7 @@ CHANCES = (" The probability takes into account the other candidates, the tolera
            "is stated.")
 
 
-def opening(found: Found) -> Section:
+def opening(found: GapFinding) -> Section:
     """Verdict, the gap in numbers, named effects."""
     gap = found.gap
     good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)

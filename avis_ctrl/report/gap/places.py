@@ -11,15 +11,15 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
 
 # Colours begin at half of the noise's power and end at ten times it or more.
 LOWEST, LEAST_TOP = 0.5, 10.0
 LETTERS = 20
 
 
-def places(found: Found) -> Section:
+def places(found: GapFinding) -> Section:
     """Heat map before and after, and the table of places before naming."""
     gap = found.gap
     pieces: list[Piece] = []

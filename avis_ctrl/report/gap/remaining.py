@@ -7,12 +7,12 @@ import numpy as np
 from avis_ctrl.gap.result import Detectable, Gap, spoken
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.gap.places import table_of
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
 
 
-def remaining(found: Found) -> Section:
+def remaining(found: GapFinding) -> Section:
     """Where the residual of the updated model lies, and the next experiment."""
     gap = found.gap
     pieces: list[Piece] = [Paragraph(_left(gap))]
@@ -67,7 +67,7 @@ def _left(gap: Gap) -> str:
             f"{wording.percent(left.share)} of that of the re-identified model. {level} {places}")
 
 
-def next_step(found: Found) -> str:
+def next_step(found: GapFinding) -> str:
     """The experiment that would tell more, or that none is needed."""
     gap = found.gap
     if gap.next_experiment:

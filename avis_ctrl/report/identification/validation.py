@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.identification.validation import HeldOut
 from avis_ctrl.identification.whiteness import Correlation, Whiteness
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, numbered
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, numbered, places
 from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.identification import Identification
 
@@ -54,14 +54,8 @@ def _records(found: Identification) -> Table:
                  rows, "lrrrrrcc")
 
 
-def _places(outputs: tuple[str, ...]) -> tuple[np.ndarray, Axis]:
-    x = np.arange(1, len(outputs) + 1, dtype=float)
-    return x, Axis("output", "linear", (0.4, len(outputs) + 0.6),
-                   tuple((float(p), name) for p, name in zip(x, outputs, strict=True)))
-
-
 def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
-    x, axis = _places(outputs)
+    x, axis = places(outputs, "output")
     low, high = one.output_chi2_interval.T
     curves = (Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=True, line=False, error=(high - low) / 2),
               Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False))
@@ -71,7 +65,7 @@ def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
 
 def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     """Normalised r.m.s. error of each output as bars."""
-    x, axis = _places(outputs)
+    x, axis = places(outputs, "output")
     values = [100 * v for v in (one.nrms_start, one.nrms, one.nrms_floor)]
     labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
     curves = tuple(Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)

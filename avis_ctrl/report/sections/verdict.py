@@ -8,9 +8,9 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table
-from avis_ctrl.report.sections.bounds import certificate
+from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
-from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 from avis_ctrl.study.verdict import all_axes, first_sentence
 
 
@@ -72,7 +72,7 @@ def comparison(result: DesignResult) -> Section:
         ("mu, lower bound", lambda c: words.bound(c.mu.lower, 4)),
         ("mu peaks at", lambda c: words.hertz(c.mu.omega)),
         ("stable, nominal", lambda c: Mark("yes", True) if c.stable else Mark("no", False)),
-        ("stable for the whole set", _robustly_stable),
+        ("stable for the whole set", stable_for_the_set),
         ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
         ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
         (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
@@ -102,13 +102,6 @@ def _remarks(result: DesignResult) -> list[Piece]:
     rows = [(r.name, r.note) for r in result.requirements if r.note]
     told: list[Piece] = [table("Notes to the requirements of the summary.", ("requirement", "note"), rows, "ll")]
     return [*(told if rows else []), *(Paragraph(note, "note") for note in result.notes)]
-
-
-def _robustly_stable(c: ControllerResult) -> Cell:
-    bound: Bound = c.stability
-    if not c.stable or bound.lower >= 1:
-        return Mark("no", False)
-    return Mark("yes", True) if bound.upper < 1 else Mark("not shown", False)
 
 
 def _settled(c: ControllerResult, text: str) -> str:
