@@ -168,7 +168,8 @@ def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Dat
                      for one in (step.fitted, step.before))
     if after <= before:
         return "held-out records are not more likely with it"
-    for half in halves(best, _judged(one), settings):
+    absent = {name: p.none for name, p in zip(one.names, one.parameters, strict=True) if p.linear}
+    for half in halves(best, _judged(one), settings, absent=absent):
         if half.change > settings.law_change:
             return f"{half.words} gives a value of one of its parameters that differs by {100 * half.change:.0f} %"
     return ""

@@ -254,6 +254,15 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     return Step(now.bare(), full, tried, len(found))
 
 
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """An effect by a fit of its own parameters: gain of log evidence, and fall of the sum of squares."""
+
+    effect: ActiveEffect
+    gain: float
+    fall: float
+
+
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
            ) -> dict[str, Fitted]:
     """Fits of candidates by label: at first of each effect's own parameters, the others moving along to first order;
@@ -264,36 +273,44 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
                                                             iterations=settings.quick_iterations)
 
-    def fitted(one: ActiveEffect, iterations: int) -> tuple[ActiveEffect, float] | None:
+    def fitted(one: ActiveEffect, iterations: int) -> _Begun | None:
         try:
             at = _without_tolerances_behind(now, one)
             model = now.model.at(now.priors.values(at)).only(one)
             own = _priors_of(one, model, settings)
-            z, gain = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
+            z, gain, fall = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
         except (AvisError, np.linalg.LinAlgError, FloatingPointError):
             return None
-        return one.at(own.values(z).tolist()), gain
+        return _Begun(one.at(own.values(z).tolist()), gain, fall)
 
-    def begun(one: Candidate) -> tuple[ActiveEffect, float] | None:
+    def begun(one: Candidate) -> tuple[Candidate, _Begun | None]:
         if at_full_strength(one.effect):
-            return one.effect, 0.0
+            return one, None
         starts = [one.effect, *one.others]
         if len(starts) > 1:
             ends = [end for start in starts if (end := fitted(start, settings.first_iterations)) is not None]
-            starts = [max(ends, key=lambda end: end[1])[0]] if ends else []
-        return fitted(starts[0], settings.rough_iterations) if starts else None
+            starts = [max(ends, key=lambda end: end.gain).effect] if ends else []
+        return one, fitted(starts[0], settings.rough_iterations) if starts else None
 
     def ended(one: ActiveEffect) -> Fitted | None:
         return _small(with_effect(now, one, data, quick))
-    made = [one for one in each(begun, chosen) if one is not None]
-    if not made:
-        return {}
-    most = max(gain for _, gain in made)
-    near = [one for one, gain in made if gain >= settings.not_far_behind * most or at_full_strength(one)]
+    made = each(begun, chosen)
+    most = max((end.gain for _, end in made if end is not None), default=0.0)
+    near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
+    # Where the other parameters must move by more than to first order, as beside a heavy sprung mass, only a fit of all
+    # parameters shows what an effect can do.
+    near += [one.effect for one, end in made if at_full_strength(one.effect)
+             or (one.fall >= 2 * settings.not_far_behind * most
+             and (end is None or end.fall < settings.kept_promise * one.fall))]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
-    return {one.labels[-1]: one for one in further if not implausible(one)
-            and not within_tolerance(one.model.effects[-1], stated, settings)}
+    found: dict[str, Fitted] = {}
+    for one in further:
+        label = one.labels[-1]
+        if not implausible(one) and not within_tolerance(one.model.effects[-1], stated, settings) and (
+                label not in found or one.log_evidence > found[label].log_evidence):
+            found[label] = one
+    return found
 
 
 def at_full_strength(one: ActiveEffect) -> bool:

@@ -35,6 +35,8 @@ class GapSettings(FitSettings):
         that begins half its width away needs more than a few.
     not_far_behind : fraction of the best candidate's gain of log evidence by that fit with which another one is fitted
         on.
+    kept_promise : fraction of the fall of the sum of squares that the score test promises, below which a fit of a
+        candidate's own parameters has failed [1]: the fit of all parameters then begins at the seed, too.
     quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
     longest : most effects that are named together.
     revisions : how often an effect may be replaced by a rival that is better beside what was found after it; twice, for
@@ -78,6 +80,7 @@ class GapSettings(FitSettings):
     first_iterations: int = 4
     rough_iterations: int = 16
     not_far_behind: float = 0.3
+    kept_promise: float = 0.5
     quick_rounds: int = 4
     quick_iterations: int = 4
     longest: int = 5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +45,8 @@ class Half:
     """An effect's parameters by half of the data.
 
     words : the half. chi2, dof : of the difference from the whole, and its degrees of freedom. change : the largest
-    relative change of a parameter that differs significantly by itself; 0 without any.
+    relative change of a parameter that differs significantly by itself, or the relative change of the effect's part of
+    the response where that is smaller; 0 without any.
     """
 
     words: str
@@ -59,17 +60,22 @@ class Half:
 
 
 def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
-           parts: Sequence[tuple[str, np.ndarray]] | None = None) -> list[Half]:
+           parts: Sequence[tuple[str, np.ndarray]] | None = None, absent: Mapping[str, float] | None = None
+           ) -> list[Half]:
     """An effect's parameters from halves of the data, one Gauss-Newton step from the whole: below and above the band's
     middle by information, and at low and high level.
 
     A parameter that moves with the band or the level refutes its law. Of a true law the difference has the covariance
-    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271). parts : other halves, in words and rows of the
-    residual.
+    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271). A parameter that hardly acts in a half (a quintic
+    stiffness at low level, a small difference between mounts) may move without changing the response there.
+
+    parts : other halves, in words and rows of the residual. absent : values at which linear parameters of the effect do
+    not act, by name; with them, the change of the response is compared with the effect's own part of it.
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
     slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
     root = np.linalg.cholesky(fitted.covariance[np.ix_(rows, rows)])
+    effect = _departure(fitted, absent or {})
     found = []
     if parts is None:
         parts = [(words, np.concatenate([fitted.rows[group] for group in groups]))
@@ -87,9 +93,21 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
         difference, variance = into @ along, into ** 2 @ (size[known] - 1)
         p = np.minimum(len(rows) * stats.chi2.sf(difference ** 2 / np.maximum(variance, 1e-300), 1), 1.0)
         change = np.abs(difference * slope) / np.maximum(np.abs(values), 1e-300)
-        found.append(Half(words, chi2, max(int(known.sum()), 1),
-                          float(change.max(initial=0.0, where=p < settings.law_p_value))))
+        largest = float(change.max(initial=0.0, where=p < settings.law_p_value))
+        if len(effect):
+            moved, own = difference @ J[rows], effect @ J
+            largest = min(largest, float(np.linalg.norm(moved) / max(np.linalg.norm(own), 1e-300)))
+        found.append(Half(words, chi2, max(int(known.sum()), 1), largest))
     return found
+
+
+def _departure(fitted: Fitted, absent: Mapping[str, float]) -> np.ndarray:
+    """(n,) standardised parameters less those at which an effect does not act; empty where there are none."""
+    rows = [fitted.priors.names.index(name) for name in absent if name in fitted.priors.names]
+    values = fitted.priors.values(fitted.z)
+    values[rows] = [value for name, value in absent.items() if name in fitted.priors.names]
+    found = fitted.z - fitted.priors.z(values)
+    return np.asarray(found) if rows and np.all(np.isfinite(found)) else np.empty(0)
 
 
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:

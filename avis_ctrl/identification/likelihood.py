@@ -287,8 +287,9 @@ class Profile:
         return self.fitted.weights.flatten(self.basis[:, :-len(self.fitted.z)]).T.copy()
 
     def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
-            ) -> tuple[np.ndarray, float]:
-        """z (k,) of the added parameters, the free ones of `model`, and the gain of log evidence with them.
+            ) -> tuple[np.ndarray, float, float]:
+        """z (k,) of the added parameters, the free ones of `model`; the gain of log evidence with them, and the fall of
+        the penalised sum of squares.
 
         at : (n,) standardised parameters of the fit in `model`; where the fit ended by default.
 
@@ -305,8 +306,10 @@ class Profile:
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
             return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
         end, _ = _descent(expand, expand(z), iterations, self.settings)
-        gain = 0.5 * (float(self.e @ self.e) - end.whole - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
-        return end.z, gain - _price_of_ends(end.model, self.data) + _price_of_ends(self.fitted.model, self.data)
+        fall = float(self.e @ self.e) - end.whole
+        gain = 0.5 * (fall - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
+        gain += _price_of_ends(self.fitted.model, self.data) - _price_of_ends(end.model, self.data)
+        return end.z, gain, fall
 
 
 def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:

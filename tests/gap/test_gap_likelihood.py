@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -192,6 +193,32 @@ def test_a_parameter_that_moves_with_the_band_refutes_its_law():
     assert min(one.p_value for one in good) > 1e-3
     assert max(one.change for one in bent) > 0.05 and min(one.p_value for one in bent) < 1e-4
     assert {one.words for one in bent} == {"the lower part of the band", "the upper part of the band"}
+
+
+def test_a_parameter_that_hardly_acts_in_a_half_may_move_there():
+    """a x + b x^5 with an error at small x that bends b alone; by least squares on the half and on the whole."""
+    rng, x = np.random.default_rng(3), np.concatenate([np.linspace(0.05, 0.4, 80), np.linspace(0.6, 1.0, 40)])
+    columns, std = np.stack([x, x ** 5]), 1e-4
+    bent = 0.02 * np.where(x < 0.5, x ** 5 - (x[:80] @ x[:80] ** 5) / (x[:80] @ x[:80]) * x, 0.0)
+    y = columns.T @ [1.0, 0.5] + 100 * bent + std * rng.standard_normal(len(x))
+    wide = Priors(("a", "b"), np.zeros(2), np.full(2, 1e3), np.zeros(2, bool))
+    J = columns * 1e3 / std
+    P = np.linalg.inv(J @ J.T + np.eye(2))
+    z = P @ J @ (y / std)
+    found = SimpleNamespace(priors=wide, z=z, covariance=P, J=J, e=y / std - J.T @ z, rows={})
+    low = np.arange(80)
+    settings = GapSettings(most_of_half=1e12)
+    parameter, = halves(found, ("a", "b"), settings, [("small", low)])
+    effect, = halves(found, ("a", "b"), settings, [("small", low)], {"a": 0.0, "b": 0.0})
+    whole, half = (np.linalg.lstsq(columns[:, at].T, y[at], rcond=None)[0] for at in (np.arange(len(x)), low))
+    change = np.abs(half / whole - 1)
+    assert parameter.change == pytest.approx(change.max(), rel=1e-3) and change.max() > 1
+    moved = columns[:, low].T @ (half - whole)
+    assert effect.change == pytest.approx(np.linalg.norm(moved) / np.linalg.norm(columns[:, low].T @ whole), rel=1e-3)
+    assert effect.change < 0.05
+    gain = found_at(bend=0.3)[0]  # of a logarithm, which never is zero
+    plain, same = (halves(gain, ("sensor.Sz1",), GapSettings(), absent=absent) for absent in (None, {"sensor.Sz1": 0.0}))
+    assert [one.change for one in plain] == [one.change for one in same]
 
 
 def test_standard_deviations_cover_what_octaves_differ_by():

@@ -140,7 +140,7 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
     # What shapes a force is often known from a part of the data alone.
     parameters = [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
-    found = halves(best, parameters, settings, parts(best, parameters))
+    found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
     return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
         others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
                 _widening(found, settings))
