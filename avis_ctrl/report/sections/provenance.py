@@ -34,7 +34,7 @@ def _said(value: Any) -> str:
         return "listed in the JSON file of results"
     if isinstance(value, Mapping):
         return "; ".join(f"{key} ({_said(one)})" if isinstance(one, Mapping) else f"{key} {_said(one)}"
-                         for key, one in value.items())
+                         for key, one in value.items() if one is not None)
     return words.number(value) if isinstance(value, float) else str(value)
 
 
