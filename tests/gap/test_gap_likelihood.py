@@ -217,7 +217,8 @@ def test_a_parameter_that_hardly_acts_in_a_half_may_move_there():
     assert effect.change == pytest.approx(np.linalg.norm(moved) / np.linalg.norm(columns[:, low].T @ whole), rel=1e-3)
     assert effect.change < 0.05
     gain = found_at(bend=0.3)[0]  # of a logarithm, which never is zero
-    plain, same = (halves(gain, ("sensor.Sz1",), GapSettings(), absent=absent) for absent in (None, {"sensor.Sz1": 0.0}))
+    plain, same = (halves(gain, ("sensor.Sz1",), GapSettings(), absent=absent)
+                   for absent in (None, {"sensor.Sz1": 0.0}))
     assert [one.change for one in plain] == [one.change for one in same]
 
 
