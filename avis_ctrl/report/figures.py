@@ -200,13 +200,6 @@ def level(low: float, high: float, value: float, label: str, style: Style = STYL
     return Curve(np.array([low, high]), np.array([value, value]), label, style)
 
 
-def decibels(magnitude: np.ndarray | Sequence[float]) -> np.ndarray:
-    """20 log10 |magnitude|; nan where it is zero or not finite."""
-    size = np.abs(np.asarray(magnitude))
-    known = np.isfinite(size) & (size > 0)
-    return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
-
-
 def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:
     """Labelled ticks of a logarithmic axis: decades, and 2 and 5 between them where there are few."""
     first, last = int(np.floor(np.log10(low) + 1e-9)), int(np.ceil(np.log10(high) - 1e-9))

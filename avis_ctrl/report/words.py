@@ -53,6 +53,13 @@ def bound(value: float, digits: int = 3) -> str:
     return "unstable" if np.isinf(value) else number(value, digits)
 
 
+def percent(share: float, digits: int = 3) -> str:
+    """A fraction in per cent; below a hundred-thousandth it is stated as that."""
+    if not np.isfinite(share):
+        return "not computed"
+    return "< 0.001 %" if 0 < share < 1e-5 else f"{number(100 * share, digits)} %"
+
+
 def decibel(gain: float) -> str:
     """A gain in dB, with its sign."""
     if np.isnan(gain):

@@ -26,7 +26,7 @@ def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Doc
 def _summary(gap: AxisGap) -> Section:
     first, *rest = gap.sentences
     good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)
-    rows = [(wording.titled(one.name), wording.percent(one.nrmse),
+    rows = [(wording.titled(one.name), words.percent(one.nrmse),
              "not computed" if one.chi2_per_dof is None else words.number(one.chi2_per_dof, 4)) for one in gap.stages]
     pieces: list[Piece] = [
         Paragraph(f"Verdict: {gap.verdict}. {first}", "verdict", good, gap.verdict == "partly explained"),
@@ -53,10 +53,10 @@ def _model(gap: AxisGap) -> Section:
 
 def _remaining(gap: AxisGap) -> Section:
     rows = [(f"{words.number(one['from_Hz'])} to {words.number(one['to_Hz'])} Hz", str(one["output"]),
-             wording.percent(one["share"])) for one in gap.where]
+             words.percent(one["share"])) for one in gap.where]
     return Section("What remains", "remaining", (
-        Paragraph(f"The residual on held-out data is {wording.percent(gap.stages[-1].nrmse)} of the signal, r.m.s.; "
-                  f"its power beyond noise is {wording.percent(gap.share_left)} of that of the base model."),
+        Paragraph(f"The residual on held-out data is {words.percent(gap.stages[-1].nrmse)} of the signal, r.m.s.; "
+                  f"its power beyond noise is {words.percent(gap.share_left)} of that of the base model."),
         table("Where most of the residual lies, as a fraction of its power.", ("band", "output", "fraction"), rows,
               "llr"),
         figure_of("lines", "Residual of the base model and of the updated model.", gap.pictures[1:2])))

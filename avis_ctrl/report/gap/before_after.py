@@ -92,10 +92,10 @@ def _stages(gap: Gap) -> Table:
     rows = []
     for k, one in enumerate(gap.stages):
         over = one.nrmse / gap.noise_nrmse if gap.noise_nrmse > 0 else np.nan
-        rows.append((rung(one.name, k), wording.percent(one.nrmse), words.number(over), words.number(
+        rows.append((rung(one.name, k), words.percent(one.nrmse), words.number(over), words.number(
             one.chi2_per_dof, 4)))
     if np.isfinite(gap.noise_nrmse):
-        rows.append(("noise alone", wording.percent(gap.noise_nrmse), "1", "1"))
+        rows.append(("noise alone", words.percent(gap.noise_nrmse), "1", "1"))
     return table("Each model is fitted to the same records; the figures are those of records or periods that no fit "
                  f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
                  "relative to that of the measured outputs.",

@@ -9,7 +9,6 @@ import numpy as np
 from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, steps
-from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
 from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
@@ -129,7 +128,7 @@ def _drawn(share: np.ndarray) -> np.ndarray:
 def _whole(one: PowerShares) -> Table:
     """Fractions of the power of all bands together."""
     keys = [key for key in LOOKS if key in one.whole]
-    rows = [(output, *(wording.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
+    rows = [(output, *(words.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
             for k, output in enumerate(one.outputs)]
     return table(f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
                  "lies at the resonances.", ("output", *(COLUMNS[key] for key in keys)), rows, "l" + "r" * len(keys))

@@ -60,10 +60,10 @@ def in_numbers(gap: Gap) -> str:
     """The gap before and after on held-out data, beside that of noise alone."""
     if not gap.stages:
         return ""
-    told = [f"{wording.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
+    told = [f"{words.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
     text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
     if np.isfinite(gap.noise_nrmse):
-        text += f"; that of the noise alone is estimated at {wording.percent(gap.noise_nrmse)}"
+        text += f"; that of the noise alone is estimated at {words.percent(gap.noise_nrmse)}"
     first, last = _reference(gap), gap.stages[-1].nrmse
     if gap.effects and first > 0 and last > 0:
         text += f". With the effect{'s' * (len(gap.effects) > 1)} the error is "
@@ -93,7 +93,7 @@ def _stage(name: str) -> str:
 def named(gap: Gap | AxisGap, remark: str) -> Table:
     """The named effects with their sizes; traces last. remark : on their probabilities."""
     rows = [(f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}", one.location,
-             wording.quantities(one.parameters, MOST), wording.percent(np.nan if one.share is None else one.share),
+             wording.quantities(one.parameters, MOST), words.percent(np.nan if one.share is None else one.share),
              wording.probability(one.probability),
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in (*gap.effects, *gap.traces)]

@@ -64,7 +64,7 @@ def _short(name: str) -> str:
 
 def table_of(listed: Sequence[Where], caption: str) -> Table:
     """Bands and paths with their fraction of the excess over noise."""
-    rows = [(wording.place(one), wording.percent(one.share), _stated(one.excess), _chance(one.p_value))
+    rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value))
             for one in listed]
     return table(f"{caption}Fraction: of the power beyond noise. Over noise: power of the residual relative to "
                  "that of the noise. p-value: of noise alone, over all places (family-wise).",

@@ -62,9 +62,9 @@ def _left(gap: Gap) -> str:
              None: "From these records it is not known whether it grows faster than the drives."}[left.grows_with_level]
     places = ("The table below lists where it lies." if gap.remaining else
               f"No band of any channel exceeds the estimated noise significantly{after}.")
-    return (f"On held-out records the residual of the updated model is {wording.percent(left.nrmse)} of the response, "
+    return (f"On held-out records the residual of the updated model is {words.percent(left.nrmse)} of the response, "
             f"r.m.s., which is {words.number(left.over_noise)} times the estimated noise. Its power beyond noise is "
-            f"{wording.percent(left.share)} of that of the re-identified model. {level} {places}")
+            f"{words.percent(left.share)} of that of the re-identified model. {level} {places}")
 
 
 def next_step(found: GapFinding) -> str:

@@ -32,9 +32,6 @@ CLAIMS = {
 RAISED = ("Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "
           "name for that. As a whole, the residual of the model{with_effects} on the held-out data is the measured "
           "noise.")
-PERCENT = 100.0
-# Fractions below this are stated as that.
-LEAST = 1e-5
 
 
 def claim(gap: Gap) -> str:
@@ -66,14 +63,7 @@ def probability(value: float) -> str:
         return "not computed"
     if value > 0.999:
         return "> 99.9 %"
-    return "< 0.1 %" if value < 0.001 else f"{words.number(PERCENT * value, 3)} %"
-
-
-def percent(share: float, digits: int = 3) -> str:
-    """A fraction in per cent."""
-    if not np.isfinite(share):
-        return "not computed"
-    return "< 0.001 %" if 0 < share < LEAST else f"{words.number(PERCENT * share, digits)} %"
+    return "< 0.1 %" if value < 0.001 else f"{words.number(100 * value)} %"
 
 
 def quantity(one: Reported) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import (
@@ -13,7 +14,6 @@ from avis_ctrl.report.figures import (
     Panel,
     Style,
     controller_style,
-    decibels,
     hertz,
     numbered,
 )
@@ -99,8 +99,8 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         S = np.linalg.inv(np.eye(L.shape[1]) - L)
         size = np.linalg.norm(S, ord=2, axis=(1, 2))
         peaks.append(f"{c.title} {words.decibel(float(size.max()))}")
-        loops.append(Curve(HZ, decibels(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
-        sensitivities.append(Curve(HZ, decibels(size), c.title, controller_style(c.name)))
+        loops.append(Curve(HZ, in_dB(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
+        sensitivities.append(Curve(HZ, in_dB(size), c.title, controller_style(c.name)))
     x = hertz(0.01, 500.0)
     return Figure("loops", "Largest singular value of the open loop G K at the measurement (left) and of the "
                   f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.block_diagram import block_diagram
 from avis_ctrl.report.families import EXTERNAL, Families
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, decibels, hertz, level, numbered
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, hertz, level, numbered
 from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.identified import identified
 from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
@@ -98,8 +99,8 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
     f = omega / (2 * np.pi)
     limit = result.plant.weights["transmissibility"].bound(omega)
     curves = (Curve(f, asked_dB(result, omega), "target of the synthesis", STYLES["limit"]),
-              Curve(f, decibels(limit), "1/|W_T|, the filter", STYLES["filter"]),
-              Curve(f, decibels(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
+              Curve(f, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
+              Curve(f, in_dB(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
               upper_bound(mu, "mu synthesis, upper bound over the set"))
     return Figure("weight_transmissibility", "The target of the synthesis, its realisation by a rational "
                   "filter, and the transmissibility achieved. The loop meets the target where its curves lie below "
