@@ -96,7 +96,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
         largest = float(change.max(initial=0.0, where=p < settings.law_p_value))
         if len(effect):
             moved, own = difference @ J[rows], effect @ J
-            largest = min(largest, float(np.linalg.norm(moved) / max(np.linalg.norm(own), 1e-300)))
+            largest = min(largest, float(np.linalg.norm(moved)) / max(float(np.linalg.norm(own)), 1e-300))
         found.append(Half(words, chi2, max(int(known.sum()), 1), largest))
     return found
 
