@@ -49,8 +49,8 @@ def flow(model: LinearModel, x: np.ndarray, s: np.ndarray, u: np.ndarray, h: flo
     sensitivity, Psi = np.zeros((2 * n, len(s))), np.zeros((2 * n, len(s)))
     for k in range(1, 5):
         slope = A @ term + (drive if k == 1 else 0)
-        moved = model.dM.transpose(2, 0, 1) @ slope[n:] + model.dC.transpose(2, 0, 1) @ term[n:] + \
-            model.dK.transpose(2, 0, 1) @ term[:n]
+        dM, dC, dK = (np.moveaxis(part, 2, 0) for part in model.slopes)
+        moved = dM @ slope[n:] + dC @ term[n:] + dK @ term[:n]
         sensitivity = A @ sensitivity
         sensitivity[n:] -= np.linalg.solve(M, moved.T) * model.values
         term, sensitivity, power = slope * h / k, sensitivity * h / k, A @ power * h / k
@@ -66,7 +66,7 @@ def by_filterpy(ours: ParameterFilter, u: np.ndarray, y: np.ndarray) -> tuple[np
     other.x, other.P = np.concatenate([ours.state.s, ours.state.x]), ours.covariance
     other.R, other.Q = np.diag(ours.R), np.zeros((n_p + 12, n_p + 12))
     noise = np.zeros((12, 12))
-    noise[6:, 6:] = ours.Q
+    noise[6:, 6:] = SOURCE_SETTINGS.Q * np.eye(6)
     root = noise_root(model.system(ours.theta)[0], noise, PERIOD_s)
     other.Q[n_p:, n_p:] = root.T @ root
     F, updating, began = np.eye(n_p + 12), 0.0, time.process_time()
@@ -85,16 +85,16 @@ def compare(rig: Rig, start: Rig, samples: int) -> None:
     """Both filters on the first samples of one record."""
     record = source_campaign(rig, sets=1, duration_s=samples * PERIOD_s).records[0].load()
     names = record.header.y_names
-    data = prefilter(record, sensor_inverse(start, names, "V"), start.loop_delay_s)
+    u, y = prefilter(record, sensor_inverse(start, names, "V"), start.loop_delay_s)
     R = measurement_variance(SOURCE_SETTINGS, start, names, "V")
     # The first, on ten samples, is for the compiler.
     for count in (10, samples):
         ours = ParameterFilter(linear_model(start, source_parameters(start)), SOURCE_SETTINGS, R, PERIOD_s)
-        ours.begin(data.y[0])
+        ours.begin(y[0])
         if count == samples:
-            theirs_s, theirs_variance, theirs, updating = by_filterpy(ours, data.u, data.y)
+            theirs_s, theirs_variance, theirs, updating = by_filterpy(ours, u, y)
         began = time.process_time()
-        ours.filter(data.u[:count], data.y[:count], count)
+        ours.filter(u[:count], y[:count], count)
         seconds = time.process_time() - began
     variance = np.diag(ours.covariance)[:len(ours.state.s)]
     print(f"{samples} samples, 12 + 26 states, 6 measurements")

@@ -6,7 +6,21 @@ import numpy as np
 
 from avis_ctrl.rigs.mounted_body import MountedBody
 from avis_ctrl.rigs.nonlinear import payload_acceleration, rig_arrays
-from avis_ctrl.rigs.rigid_body import body_rate_map, cross_matrix, rotation_matrix
+from avis_ctrl.rigs.rigid_body import cross_matrix
+
+
+def rotation_matrix(angles: np.ndarray) -> np.ndarray:
+    """Body to earth axes for the 3-2-1 angles (phi_x, phi_y, phi_z) [rad], (3, 3)."""
+    (c1, c2, c3), (s1, s2, s3) = np.cos(angles), np.sin(angles)
+    return np.array([[c3 * c2, s1 * s2 * c3 - c1 * s3, c1 * s2 * c3 + s1 * s3],
+                     [s3 * c2, s1 * s2 * s3 + c1 * c3, c1 * s2 * s3 - s1 * c3],
+                     [-s2, s1 * c2, c1 * c2]])
+
+
+def body_rate_map(angles: np.ndarray) -> np.ndarray:
+    """W, (3, 3), with angular velocity in body axes = W(angles) angles'."""
+    (c1, c2, _), (s1, s2, _) = np.cos(angles), np.sin(angles)
+    return np.array([[1.0, 0.0, -s2], [0.0, c1, s1 * c2], [0.0, -s1, c1 * c2]])
 
 
 class NonlinearRig:

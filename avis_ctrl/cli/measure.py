@@ -149,8 +149,7 @@ def convert(
 
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
-    from avis_ctrl.measurement.formats.hdf5 import write_campaign
-    from avis_ctrl.measurement.formats.stored_response import write_frequency_response
+    from avis_ctrl.measurement.formats.hdf5 import write_campaign, write_frequency_response
     from avis_ctrl.study.files import require_other
 
     require_other(out, source)

@@ -16,7 +16,7 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
-from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_second_order
+from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_beside, with_second_order
 from avis_ctrl.gap.probability import odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import (
@@ -96,6 +96,12 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         progress("clipped samples: replaced by the prediction of the model with its effects")
         prepared = mended_with(prepared, fits.best.model, progress, each, settings)
         fits = _fits(prepared, rig, known, progress, each, settings)
+    residual = ModelResidual.of(fits.best.model, prepared.held_out)
+    if prepared.local_noise and residual.noise_nrmse ** 2 > settings.within_noise * residual.nrmse ** 2:
+        # A local model takes distortion for noise; the model with its effects may predict it.
+        progress("noise estimated again, with the effects that were found")
+        prepared = with_noise_beside(prepared, fits.best.model, each)
+        fits = _refitted(fits, prepared, known, progress, each, settings)
     progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
@@ -115,14 +121,32 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
                     nominal=replace(nominal, names=tolerances.names), corners_differ=True)
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    ground, before = _excess(base, data), _excess(tolerant, data)
+    return _searched(Fits(base, tolerant, ()), data, effects, progress, each, settings)
+
+
+def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Each,
+              settings: GapSettings) -> Fits:
+    """The fits that follow from a new estimate of the noise: the last model again, and what is found beside it."""
+    data, best = prepared.data(prepared.fitted, settings.lines), fits.best
+    best = fit(best.model, best.priors, best.z, data, best.variances, settings)
+    if not fits.steps:
+        return _searched(replace(fits, tolerant=best), data, effects, progress, each, settings)
+    last = replace(fits.steps[-1], fitted=best)
+    return _searched(replace(fits, steps=(*fits.steps[:-1], last)), data, effects, progress, each, settings)
+
+
+def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Each, settings: GapSettings
+              ) -> Fits:
+    """With the effects that the search finds."""
+    ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
 
     def enough(step: Step) -> bool:
         """What was found takes next to nothing of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
-    steps = search(tolerant, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
-    return Fits(base, tolerant, tuple(steps))
+    steps = search(fits.tolerant, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough,
+                   fits.steps)
+    return replace(fits, steps=tuple(steps))
 
 
 def _left(model, data: Data) -> float:
@@ -241,7 +265,7 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
         if not before:
             break
         known = next((step.fitted for step in fits.steps if set(step.fitted.labels) == before), None)
-        one = known or without_effect(one, label, data, settings)
+        one = known or without_effect(one, label, data, settings.quick)
     return found[::-1]
 
 

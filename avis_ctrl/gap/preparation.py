@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.campaign_spectra import Halves, blocks_of, divide, with_noise
+from avis_ctrl.gap.campaign_spectra import Halves, all_silent, blocks_of, divide, with_noise
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
 from avis_ctrl.gap.parallel import Each, one_by_one
@@ -63,6 +63,11 @@ class Prepared:
     left: tuple[RecordResidual, ...]
     clipped: Campaign | None = None
 
+    @property
+    def local_noise(self) -> bool:
+        """Whether the noise is that of a local polynomial model of driven records, which holds their distortion."""
+        return not all_silent(self.halves.fitted, self.fitted)
+
     def data(self, blocks: Sequence[SpectralBlock], lines: int) -> Data:
         """Some lines of blocks, each with the level of its group of like records."""
         return Data.of(blocks, levels_of((*self.halves.fitted.records, *self.halves.held_out.records)), lines)
@@ -111,6 +116,14 @@ def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each:
     rough = replace(prepared.rough, effects=())
     return _ready(campaign, divide(campaign), prepared.nominal, rough, prepared.band_Hz, prepared.faults.converter,
                   prepared.clipped, progress, each, settings)
+
+
+def with_noise_beside(prepared: Prepared, model: TableModel, each: Each) -> Prepared:
+    """The same with noise from what a better model leaves of the records."""
+    groups = [list(prepared.fitted), list(prepared.held_out), list(prepared.unmasked)]
+    left = left_by(prepared.campaign, model, each)
+    (fitted, held_out, unmasked), how = _noise(groups, prepared.halves, left, prepared.rough, prepared.band_Hz)
+    return replace(prepared, fitted=tuple(fitted), held_out=tuple(held_out), unmasked=tuple(unmasked), noise=how)
 
 
 def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSettings) -> None:

@@ -148,14 +148,15 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Each = one_by_one,
-           enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
+           enough: Callable[[Step], bool] = lambda step: False, known: Sequence[Step] = ()) -> list[Step]:
     """Effects in the order in which they are found; last of all the values of the rig file that are beyond their
     tolerance, which show in how far one of them had to move, and hardly in what remains.
 
-    enough : whether the search may end with a step, because what it found takes next to nothing.
+    enough : whether the search may end with a step, because what it found takes next to nothing. known : steps that it
+    continues.
     The last step has the fit with everything that was found.
     """
-    steps: list[Step] = []
+    steps = list(known)
 
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
         while len(steps) < settings.longest:
@@ -218,7 +219,6 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     rest = without_effect(best, step.label, data, settings)
     if rest is None:
         return step
-    quick = replace(settings, rounds=settings.quick_rounds, iterations=settings.quick_iterations)
     begun = without_path_errors(rest, data, settings)
     known = {name_of(label) for label in best.labels}
     tried, mine = {step.label: best.bare()}, step.tried[step.label].log_evidence
@@ -226,7 +226,7 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     for label, fitted in step.tried.items():
         if name_of(label) in known or mine - fitted.log_evidence > later:
             continue
-        one = with_effect(begun, fitted.model.effects[-1], data, quick)
+        one = with_effect(begun, fitted.model.effects[-1], data, settings.quick)
         if one is not None:
             tried[label] = one.bare()
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
@@ -270,8 +270,7 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     physics forbids, or to one within its tolerance."""
     if not chosen:
         return {}
-    profile, quick = Profile(now, data, settings), replace(settings, rounds=settings.quick_rounds,
-                                                            iterations=settings.quick_iterations)
+    profile = Profile(now, data, settings)
 
     def fitted(one: ActiveEffect, iterations: int) -> _Begun | None:
         try:
@@ -293,7 +292,7 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
         return one, fitted(starts[0], settings.rough_iterations) if starts else None
 
     def ended(one: ActiveEffect) -> Fitted | None:
-        return _small(with_effect(now, one, data, quick))
+        return _small(with_effect(now, one, data, settings.quick))
     made = each(begun, chosen)
     most = max((end.gain for _, end in made if end is not None), default=0.0)
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avis_ctrl.identification.fit_settings import FitSettings
 
@@ -37,7 +37,8 @@ class GapSettings(FitSettings):
         on.
     kept_promise : fraction of the fall of the sum of squares that the score test promises, below which a fit of a
         candidate's own parameters has failed [1]: the fit of all parameters then begins at the seed, too.
-    quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates.
+    quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates, or gives
+        the residual of a stage.
     longest : most effects that are named together.
     revisions : how often an effect may be replaced by a rival that is better beside what was found after it; twice, for
         a pair that was named wrong both times.
@@ -102,6 +103,11 @@ class GapSettings(FitSettings):
     explained: float = 0.9
     known_noise: float = 2.25
     shown_runners_up: int = 12
+
+    @property
+    def quick(self) -> GapSettings:
+        """Of a fit that only compares candidates, or only gives a figure."""
+        return replace(self, rounds=self.quick_rounds, iterations=self.quick_iterations)
 
 
 SETTINGS = GapSettings()

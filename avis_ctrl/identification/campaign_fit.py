@@ -14,7 +14,7 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import LikelihoodFit, Prior, fit
-from avis_ctrl.identification.noise import noise_from_residuals, relative_noise, residual_noise
+from avis_ctrl.identification.noise import noise_from_residuals, relative_noise
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.identification.response import MOMENTS, ResponseModel
 from avis_ctrl.identification.second_order import chosen_turning, terms, without
@@ -336,61 +336,48 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     ------
     InputError, ComputationError : as `fit`, `record_block`, `response_block`.
     """
-    known = True
-    if tolerances is not None and isinstance(campaign, Campaign) and isinstance(model.rig, AvisTable):
-        return _within_tolerances(campaign, model, band_Hz, priors or {}, starts, seed, progress, tolerances)
+    say = progress or (lambda text: None)
     if isinstance(campaign, FrequencyResponse):
-        blocks = [response_block(campaign.between(*band_Hz), model)]
-        notes = [f"frequency responses: {campaign.method or 'as measured'}"]
-    else:
-        raw, notes = campaign_blocks(campaign, model, band_Hz)
-        blocks, said, known = weighted(raw, campaign, band_Hz)
-        notes = [*notes, said]
-    found = fit(model, blocks, priors, starts, seed=seed, progress=progress)
-    first = found
-    if isinstance(campaign, FrequencyResponse):
-        return CampaignFit(found, first, band_Hz, (*notes, *_bounds(found)), model)
-    turning, added = chosen_turning(campaign, blocks, found.model)
-    found = fit(replace(found.model, turning=turning), without(blocks, added), priors, seed=seed, about=model)
-    if progress:
-        progress(f"second-order terms of the table's rotations: {found.iterations} iterations")
-    notes.append(f"{turning.sentence}: {_share(blocks, added)}")
+        found = fit(model, [response_block(campaign.between(*band_Hz), model)], priors, starts, seed=seed,
+                    progress=progress)
+        return CampaignFit(found, found, band_Hz, (f"frequency responses: {campaign.method or 'as measured'}",
+                                                   *_bounds(found)), model)
+    raw, notes = campaign_blocks(campaign, model, band_Hz)
+    blocks, said, known = weighted(raw, campaign, band_Hz)
+    within = tolerances if isinstance(model.rig, AvisTable) else None
+    fitted = blocks
+    if within is not None:
+        blocks = [thinned(block, FIT.residual_lines) for block in blocks]
+        fitted = [thinned(block, FIT.lines) for block in blocks]
+    # The rig file is taken for exact first.
+    first = fit(model, fitted, priors, starts, seed=seed, progress=progress)
+    turning, added = chosen_turning(campaign, blocks, first.model)
+    turned = replace(first.model, turning=turning)
+    notes += [said, f"{turning.sentence}: {_share(blocks, added)}"]
+    if within is not None:
+        if not known:
+            blocks = noise_from_residuals(first.residuals, blocks, first.model)
+        levels = levels_of(campaign.records)
+        begun = begin(turned, without(blocks, added), levels, within, priors or {})
+        say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
+        linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])
+        ended = end(begun, linear, levels)
+        say(f"with their second-order terms: {ended.fitted.iterations} iterations")
+        found = as_likelihood_fit(ended, linear, first)
+        moved = ended.fitted.moved([name for name in found.model.names if name not in model.names])
+        return CampaignFit(found, first, band_Hz, tuple(notes), model, known, moved)
+    found = fit(turned, without(blocks, added), priors, seed=seed, about=model)
+    say(f"second-order terms of the table's rotations: {found.iterations} iterations")
     first = replace(found, starts=first.starts)
     for k in range(reweights):
-        weighed = residual_noise(found.residuals, model=found.model)
+        weighed = noise_from_residuals(found.residuals, [one.block for one in found.residuals], found.model)
         if k == reweights - 1:
             added = terms(campaign, blocks, found.model)
             weighed = [replace(block, Y=one.Y) for block, one in
                        zip(weighed, without(blocks, [one[0] for one in added]), strict=True)]
         found = fit(found.model, weighed, priors, seed=seed, about=model)
-        if progress:
-            progress(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
+        say(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
     return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model, known)
-
-
-def _within_tolerances(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
-                       priors: Mapping[str, Prior], starts: int, seed: int, progress: Progress | None,
-                       tolerances: Tolerances) -> CampaignFit:
-    """First with the rig file taken for exact, then with every tolerance free."""
-    say = progress or (lambda text: None)
-    raw, notes = campaign_blocks(campaign, model, band_Hz)
-    every, said, known = weighted(raw, campaign, band_Hz)
-    blocks = [thinned(block, FIT.residual_lines) for block in every]
-    few = [thinned(block, FIT.lines) for block in blocks]
-    first = fit(model, few, priors, starts, seed=seed, progress=progress)
-    turning, added = chosen_turning(campaign, blocks, first.model)
-    if not known:
-        blocks = noise_from_residuals(first.residuals, blocks, model=first.model)
-    levels = levels_of(campaign.records)
-    begun = begin(replace(first.model, turning=turning), without(blocks, added), levels, tolerances, priors)
-    say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
-    linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])
-    ended = end(begun, linear, levels)
-    say(f"with their second-order terms: {ended.fitted.iterations} iterations")
-    found = as_likelihood_fit(ended, linear, first)
-    moved = ended.fitted.moved([name for name in found.model.names if name not in model.names])
-    notes = [*notes, said, f"{turning.sentence}: {_share(blocks, added)}"]
-    return CampaignFit(found, first, band_Hz, tuple(notes), model, known, moved)
 
 
 def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:

@@ -1,12 +1,18 @@
-"""The compiled inner loop of the extended Kalman filter: flow of a sample with its derivatives, and the filter.
+"""The compiled inner loop of the extended Kalman filter: flow of a sample with its derivatives, square-root covariance.
 
-Order of the augmented state: parameters s (n_p), then x = (q, q', f) with f (n_f, often none) a coloured disturbance
-that accelerates the table by G f.
+Order of the augmented state: parameters s (n_p), which do not move, then x = (q, q', f) with f (n_f, often none) a
+coloured disturbance that accelerates the table by G f.
 
 The flow over a sample is the Taylor polynomial of fourth order at fixed parameters, which for a linear system is
-Runge and Kutta's; its error at 5 Hz and 1 kHz is (omega h)^4 / 120 = 8e-9 of the step's change. Phi and
-Psi are its exact derivatives. The cache of compiled code looks at the date of this file only: after a change in
-`ekf_square_root`, delete the .nbi and .nbc files of this package (numba's rule for functions of other files).
+Runge and Kutta's; its error at 5 Hz and 1 kHz is (omega h)^4 / 120 = 8e-9 of the step's change. Phi and Psi are its
+exact derivatives. P = W^T W with W upper triangular is symmetric and positive semidefinite by construction:
+
+    x+ = Phi x + Psi s + w,   s+ = s      ->      W+ = qr [ W_ss   W_sx Phi^T + W_ss Psi^T ]
+                                                          [ 0      W_xx Phi^T              ]
+                                                          [ 0      W_Q                     ]
+
+and only the last two block rows have to be made triangular again: n_x columns, whatever n_p. Measurements are taken
+one by one (diagonal R) by Carlson's triangular update (AIAA Journal 11 (1973), 1259).
 """
 
 from __future__ import annotations
@@ -16,35 +22,26 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from avis_ctrl.identification.ekf_square_root import propagate, update
-
 FAST = {"reassoc", "contract"}
 
 
-class ModelArrays(NamedTuple):
-    """M(theta) = M0 + sum theta_j dM[..., j], C and K likewise; T (n_q, n_u); H (n_y, n_x) on (q, q', f).
+class Plant(NamedTuple):
+    """M, C and K : constant (3, n_q, n_q) plus slopes (3, n_q, n_q, n_p) times theta = reference (n_p,) times s.
+
+    T (n_q, n_u); H (n_y, n_x) on (q, q', f).
 
     G (n_q, n_f) : acceleration by the disturbance, which is held over a sample. decay : what a sample leaves of f.
+    lowest : s is held there or above.
     """
 
-    M0: np.ndarray
-    C0: np.ndarray
-    K0: np.ndarray
-    dM: np.ndarray
-    dC: np.ndarray
-    dK: np.ndarray
+    constant: np.ndarray
+    slopes: np.ndarray
+    reference: np.ndarray
     T: np.ndarray
     H: np.ndarray
     G: np.ndarray
     decay: float
-
-
-class Scaling(NamedTuple):
-    """theta = reference s, or reference exp(s) where logarithmic; s is held at `lowest` or above."""
-
-    reference: np.ndarray
-    lowest: np.ndarray
-    logarithmic: bool
+    lowest: float
 
 
 class Filter(NamedTuple):
@@ -66,266 +63,126 @@ class Trace(NamedTuple):
     x: np.ndarray
 
 
-class Step(NamedTuple):
-    """Flow of one sample: Phi^T (n_x, n_x), Psi^T (n_p, n_x), and room for what leads there."""
-
-    Phi_t: np.ndarray
-    Psi_t: np.ndarray
-    alpha: np.ndarray
-    motion: np.ndarray
-    theta: np.ndarray
-    slope: np.ndarray
-    M: np.ndarray
-    inverse: np.ndarray
-    N: np.ndarray
-    D: np.ndarray
-    powers: np.ndarray
-    force: np.ndarray
-
-
-def step_room(n_q: int, n_p: int, n_f: int = 0) -> Step:
-    """Zeroed room for `flow`."""
-    zeros, n_x = np.zeros, 2 * n_q + n_f
-    return Step(zeros((n_x, n_x)), zeros((n_p, n_x)), zeros((4, n_q, n_p)), zeros((6, n_q)), zeros(n_p), zeros(n_p),
-                zeros((n_q, n_q)), zeros((n_q, n_q)), zeros((n_q, n_q)), zeros((n_q, n_q)), zeros((5, n_q, 2 * n_q)),
-                zeros(n_q))
-
-
-@njit(cache=True)
-def _sum(out, base, parts, theta):
-    """out = base + sum theta_j parts[..., j]"""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            total = base[i, j]
-            for p in range(theta.shape[0]):
-                total += theta[p] * parts[i, j, p]
-            out[i, j] = total
-
-
-@njit(cache=True)
-def _invert(A, inverse):
-    """Inverse of a symmetric matrix by Gauss and Jordan, A destroyed; False where it is not positive definite."""
-    n = A.shape[0]
-    for i in range(n):
-        for j in range(n):
-            inverse[i, j] = 1.0 if i == j else 0.0
-    for k in range(n):
-        pivot = A[k, k]
-        if not pivot > 0.0:
-            return False
-        for j in range(n):
-            A[k, j] /= pivot
-            inverse[k, j] /= pivot
-        for i in range(n):
-            factor = A[i, k]
-            if i != k and factor != 0.0:
-                for j in range(n):
-                    A[i, j] -= factor * A[k, j]
-                    inverse[i, j] -= factor * inverse[k, j]
-    return True
-
-
 @njit(cache=True, fastmath=FAST)
-def _product(out, A, B):
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            out[i, j] = 0.0
-        for k in range(A.shape[1]):
-            a = A[i, k]
-            for j in range(B.shape[1]):
-                out[i, j] += a * B[k, j]
+def flow(plant, s, x, u, h):
+    """x after a sample of h seconds at held volts u (n_u,), Phi (n_x, n_x) and Psi (n_x, n_p).
 
-
-@njit(cache=True)
-def _matrices(model, room):
-    """M^-1, N = M^-1 K and D = M^-1 C at room.theta; False where M is not positive definite."""
-    _sum(room.M, model.M0, model.dM, room.theta)
-    if not _invert(room.M, room.inverse):
-        return False
-    _sum(room.M, model.K0, model.dK, room.theta)
-    _product(room.N, room.inverse, room.M)
-    _sum(room.M, model.C0, model.dC, room.theta)
-    _product(room.D, room.inverse, room.M)
-    return True
-
-
-@njit(cache=True, fastmath=FAST)
-def _motion(model, room, x, u):
-    """room.motion: derivatives 0..5 of q by time at the start of the sample."""
-    n_q, n_f, d = room.N.shape[0], model.G.shape[1], room.motion
-    for i in range(n_q):
-        d[0, i], d[1, i] = x[i], x[n_q + i]
-        room.force[i] = 0.0
-        for j in range(u.shape[0]):
-            room.force[i] += model.T[i, j] * u[j]
-    for k in range(2, 6):
-        for i in range(n_q):
-            total = 0.0
-            for j in range(n_q):
-                total -= room.N[i, j] * d[k - 2, j] + room.D[i, j] * d[k - 1, j]
-                if k == 2:
-                    total += room.inverse[i, j] * room.force[j]
-            if k == 2:
-                for j in range(n_f):
-                    total += model.G[i, j] * x[2 * n_q + j]
-            d[k, i] = total
-
-
-@njit(cache=True, fastmath=FAST)
-def _transition(room, h):
-    """Phi^T by the rows R_k = [0 I] A^k, of which the upper half of A^(k+1) consists too."""
-    n_q, R = room.N.shape[0], room.powers
-    for i in range(n_q):
-        for j in range(2 * n_q):
-            R[0, i, j] = 1.0 if j == n_q + i else 0.0
-    for k in range(1, 5):
-        for i in range(n_q):
-            for j in range(n_q):
-                R[k, i, j], R[k, i, n_q + j] = 0.0, R[k - 1, i, j]
-            for m in range(n_q):
-                a = R[k - 1, i, n_q + m]
-                for j in range(n_q):
-                    R[k, i, j] -= a * room.N[m, j]
-                    R[k, i, n_q + j] -= a * room.D[m, j]
-    h2, h3, h4 = h * h / 2, h * h * h / 6, h * h * h * h / 24
-    for i in range(n_q):
-        for j in range(2 * n_q):
-            room.Phi_t[j, i] = (1.0 if i == j else 0.0) + h * R[0, i, j] + h2 * R[1, i, j] + h3 * R[2, i, j] + \
-                h4 * R[3, i, j]
-            room.Phi_t[j, n_q + i] = R[0, i, j] + h * R[1, i, j] + h2 * R[2, i, j] + h3 * R[3, i, j] + h4 * R[4, i, j]
-
-
-@njit(cache=True, fastmath=FAST)
-def _disturbance(model, room, h):
-    """Rows of Phi^T that belong to f: the step response of an acceleration G, again by the rows R_k."""
-    n_q, n_f = room.N.shape[0], model.G.shape[1]
-    for p in range(n_f):
-        for i in range(n_q):
-            q = v = 0.0
-            weight = h
-            for k in range(4):
-                a = 0.0
-                for m in range(n_q):
-                    a += room.powers[k, i, n_q + m] * model.G[m, p]
-                v += weight * a
-                weight *= h / (k + 2)
-                if k < 3:
-                    q += weight * a
-            room.Phi_t[2 * n_q + p, i], room.Phi_t[2 * n_q + p, n_q + i] = q, v
-        room.Phi_t[2 * n_q + p, 2 * n_q + p] = model.decay
-
-
-@njit(cache=True, fastmath=FAST)
-def _sensitivity(model, room, h):
-    """Psi^T: alpha_k, the derivative of q^(k+2) by s, = J_k - N alpha_(k-2) - D alpha_(k-1), with
-    J_k = -M^-1 (dM q^(k+2) + dC q^(k+1) + dK q^(k))."""
-    n_q, n_p = room.N.shape[0], room.theta.shape[0]
-    alpha, d, slope = room.alpha, room.motion, room.slope
-    g = np.empty((n_q, n_p))
-    for k in range(4):
-        for i in range(n_q):
-            for p in range(n_p):
-                g[i, p] = 0.0
-            for m in range(n_q):
-                a, v, q = d[k + 2, m], d[k + 1, m], d[k, m]
-                for p in range(n_p):
-                    g[i, p] += model.dM[i, m, p] * a + model.dC[i, m, p] * v + model.dK[i, m, p] * q
-        for i in range(n_q):
-            for p in range(n_p):
-                alpha[k, i, p] = 0.0
-            for m in range(n_q):
-                a = room.inverse[i, m]
-                for p in range(n_p):
-                    alpha[k, i, p] -= a * g[m, p] * slope[p]
-            for m in range(n_q):
-                if k >= 1:
-                    a = room.D[i, m]
-                    for p in range(n_p):
-                        alpha[k, i, p] -= a * alpha[k - 1, m, p]
-                if k >= 2:
-                    a = room.N[i, m]
-                    for p in range(n_p):
-                        alpha[k, i, p] -= a * alpha[k - 2, m, p]
-    h2, h3, h4 = h * h / 2, h * h * h / 6, h * h * h * h / 24
-    for p in range(n_p):
-        for i in range(n_q):
-            a0, a1, a2, a3 = alpha[0, i, p], alpha[1, i, p], alpha[2, i, p], alpha[3, i, p]
-            room.Psi_t[p, i] = h2 * a0 + h3 * a1 + h4 * a2
-            room.Psi_t[p, n_q + i] = h * a0 + h2 * a1 + h3 * a2 + h4 * a3
-
-
-@njit(cache=True)
-def flow(model, scaling, s, x, u, h, room):
-    """x after a sample of h seconds at held volts u, in place; Phi^T and Psi^T in the room.
-
-    False where the mass matrix is not positive definite.
+    Terms (A h)^k / k! of the state, of its derivatives and of the transition together. x is not a number where a
+    mass or an inertia is not positive.
     """
-    for p in range(s.shape[0]):
-        room.theta[p] = scaling.reference[p] * (np.exp(s[p]) if scaling.logarithmic else s[p])
-        room.slope[p] = room.theta[p] if scaling.logarithmic else scaling.reference[p]
-    if not _matrices(model, room):
-        return False
-    _motion(model, room, x, u)
-    _transition(room, h)
-    _disturbance(model, room, h)
-    _sensitivity(model, room, h)
-    n_q, d = room.N.shape[0], room.motion
-    h2, h3, h4 = h * h / 2, h * h * h / 6, h * h * h * h / 24
+    n_p, n_q, n_x = s.shape[0], plant.T.shape[0], x.shape[0]
+    theta, matrices = plant.reference * s, plant.constant.copy()
+    for m in range(3):
+        for i in range(n_q):
+            for j in range(n_q):
+                for p in range(n_p):
+                    matrices[m, i, j] += theta[p] * plant.slopes[m, i, j, p]
     for i in range(n_q):
-        x[i] = d[0, i] + h * d[1, i] + h2 * d[2, i] + h3 * d[3, i] + h4 * d[4, i]
-        x[n_q + i] = d[1, i] + h * d[2, i] + h2 * d[3, i] + h3 * d[4, i] + h4 * d[5, i]
-    for i in range(2 * n_q, x.shape[0]):
-        x[i] *= model.decay
-    return True
+        if not 0.0 < matrices[0, i, i] < np.inf:
+            return np.full(n_x, np.nan), np.eye(n_x), np.zeros((n_x, n_p))
+    inverse, A = np.linalg.inv(matrices[0]), np.zeros((n_x, n_x))
+    for i in range(n_q):
+        A[i, n_q + i] = 1.0
+    A[n_q:2 * n_q, :n_q] = -np.dot(inverse, matrices[2])
+    A[n_q:2 * n_q, n_q:2 * n_q] = -np.dot(inverse, matrices[1])
+    A[n_q:2 * n_q, 2 * n_q:] = plant.G
+    term, power, moved = x, np.eye(n_x), np.zeros((n_x, n_p))
+    after, Phi, Psi = x.copy(), np.eye(n_x), np.zeros((n_x, n_p))
+    for k in range(1, 5):
+        slope, moved = np.dot(A, term), np.dot(A, moved)
+        if k == 1:
+            slope[n_q:2 * n_q] += np.dot(inverse, np.dot(plant.T, u))
+        moved[n_q:2 * n_q] -= np.dot(inverse, _forces(plant, slope, term))
+        term, moved, power = slope * (h / k), moved * (h / k), np.dot(A, power) * (h / k)
+        after, Phi, Psi = after + term, Phi + power, Psi + moved
+    for i in range(2 * n_q, n_x):
+        after[i], Phi[i, i] = plant.decay * x[i], plant.decay
+    return after, Phi, Psi
+
+
+@njit(cache=True, fastmath=FAST)
+def _forces(plant, slope, term):
+    """(n_q, n_p) dM q'' + dC q' + dK q by each s, of a term (q, q') and its derivative by time."""
+    n_q, n_p = plant.T.shape[0], plant.reference.shape[0]
+    out = np.zeros((n_q, n_p))
+    for i in range(n_q):
+        for j in range(n_q):
+            a, v, q = slope[n_q + j], term[n_q + j], term[j]
+            for p in range(n_p):
+                out[i, p] += plant.slopes[0, i, j, p] * a + plant.slopes[1, i, j, p] * v + plant.slopes[2, i, j, p] * q
+        for p in range(n_p):
+            out[i, p] *= plant.reference[p]
+    return out
 
 
 @njit(cache=True)
-def _measure(model, scaling, state, y, R, gain, innovation):
+def propagate(W, Phi, Psi, W_Q):
+    """W over a sample, in place; W_Q (n_x, n_x) with W_Q^T W_Q the process noise of the sample."""
+    n_p = Psi.shape[1]
+    F_t = np.ascontiguousarray(np.concatenate((Psi, Phi), axis=1).T)
+    moved = np.dot(W, F_t)
+    W[:n_p, n_p:] = moved[:n_p]
+    W[n_p:, n_p:] = np.linalg.qr(np.concatenate((moved[n_p:], W_Q)))[1]
+
+
+@njit(cache=True, fastmath=FAST)
+def update(W, h, r, gain):
+    """Carlson's update of W by a measurement h x of variance r; `gain` becomes P h / variance, which is returned."""
+    n, n_x = W.shape[0], h.shape[0]
+    n_p = n - n_x
+    alpha = r
+    for j in range(n):
+        gain[j] = 0.0
+    for i in range(n - 1, -1, -1):
+        f = 0.0
+        for j in range(max(i - n_p, 0), n_x):
+            f += W[i, n_p + j] * h[j]
+        before = alpha
+        alpha += f * f
+        b, c = np.sqrt(before / alpha), f / np.sqrt(before * alpha)
+        for j in range(i, n):
+            w = W[i, j]
+            W[i, j] = b * w - c * gain[j]
+            gain[j] += f * w
+    for j in range(n):
+        gain[j] /= alpha
+    return alpha
+
+
+@njit(cache=True)
+def _measure(plant, state, y, R, gain, innovation):
     """All measurements of one sample, one by one; False where an innovation is not finite."""
-    n_p, n_x = state.s.shape[0], state.x.shape[0]
+    n_p = state.s.shape[0]
     for i in range(y.shape[0]):
-        e = y[i]
-        for j in range(n_x):
-            e -= model.H[i, j] * state.x[j]
-        variance = update(state.W, model.H[i], R[i], gain)
-        innovation[i] = e / np.sqrt(variance)
+        e = y[i] - np.dot(plant.H[i], state.x)
+        innovation[i] = e / np.sqrt(update(state.W, plant.H[i], R[i], gain))
         if not np.isfinite(innovation[i]):
             return False
-        for p in range(n_p):
-            state.s[p] += gain[p] * e
-        for j in range(n_x):
-            state.x[j] += gain[n_p + j] * e
-    if not scaling.logarithmic:
-        for p in range(n_p):
-            if state.s[p] < scaling.lowest[p]:
-                state.s[p] = scaling.lowest[p]
-                state.guarded[p] += 1
+        state.s[:] += gain[:n_p] * e
+        state.x[:] += gain[n_p:] * e
+    for p in range(n_p):
+        if state.s[p] < plant.lowest:
+            state.s[p] = plant.lowest
+            state.guarded[p] += 1
     return True
 
 
 @njit(cache=True)
-def run(model, scaling, state, W_Q, R, u, y, h, keep, room, trace):
+def run(plant, state, W_Q, R, u, y, h, keep, trace):
     """Filters a record: measure, then go to the next sample. Returns the samples done; fewer than all is a failure.
 
     u : (n, n_u) volts held from each sample to the next. y : (n, n_y). R : (n_y,) variances. keep : decimation.
     """
-    n_p, n_x = state.s.shape[0], state.x.shape[0]
-    stack, gain = np.zeros((2 * n_x, n_x)), np.zeros(n_p + n_x)
+    n_p = state.s.shape[0]
+    gain = np.zeros(state.W.shape[0])
     for k in range(y.shape[0]):
-        if not _measure(model, scaling, state, y[k], R, gain, trace.innovation[k]):
+        if not _measure(plant, state, y[k], R, gain, trace.innovation[k]):
             return k
         if k % keep == 0:
             m = k // keep
-            for p in range(n_p):
-                trace.s[m, p] = state.s[p]
-                total = 0.0
-                for i in range(p + 1):
-                    total += state.W[i, p] * state.W[i, p]
-                trace.variance[m, p] = total
-            for j in range(n_x):
-                trace.x[m, j] = state.x[j]
+            trace.s[m], trace.x[m] = state.s, state.x
+            trace.variance[m] = np.sum(state.W[:n_p, :n_p] ** 2, axis=0)
         if k < y.shape[0] - 1:
-            if not flow(model, scaling, state.s, state.x, u[k], h, room):
-                return k
-            propagate(state.W, room.Phi_t, room.Psi_t, W_Q, stack)
+            state.x[:], Phi, Psi = flow(plant, state.s, state.x, u[k], h)
+            propagate(state.W, Phi, Psi, W_Q)
     return y.shape[0]

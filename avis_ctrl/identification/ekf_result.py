@@ -72,42 +72,13 @@ class EkfHistory:
 
 
 @dataclass(frozen=True, eq=False)
-class Directions:
-    """Combinations of parameters by how much the data told of them.
-
-    ratio : (n_p,) variance over the prior's, the least known last. vectors : (n_p, n_p) columns, orthonormal, in
-    relative changes of the parameters.
-    """
-
-    names: tuple[str, ...]
-    ratio: np.ndarray
-    vectors: np.ndarray
-
-    def kept(self, share: float = 0.5) -> np.ndarray:
-        """Columns of the directions that kept at least this share of their prior variance."""
-        return self.vectors[:, self.ratio >= share]
-
-    def words(self, share: float = 0.5) -> tuple[str, ...]:
-        """One line for each of them: the members that carry nine tenths of it, and the sign with which they move."""
-        lines = []
-        for vector, ratio in zip(self.kept(share).T, self.ratio[self.ratio >= share], strict=True):
-            order = np.argsort(-np.abs(vector))
-            count = int(np.searchsorted(np.cumsum(vector[order] ** 2), 0.9)) + 1
-            sign = np.sign(vector[order[0]])
-            parts = [f"{self.names[j]} {'up' if sign * vector[j] > 0 else 'down'}" for j in order[:count]]
-            lines.append(f"not determined: {' with '.join(parts)} (variance {ratio:.2g} of the prior's)")
-        return tuple(lines)
-
-
-@dataclass(frozen=True, eq=False)
 class EkfResult:
     """Parameters as the filter left them.
 
     Attributes
     ----------
     names, units, initial, values : n_p.
-    scaled_covariance : (n_p, n_p) of theta / initial (of log theta with the log parametrisation).
-    prior_share : prior standard deviation in the same units.
+    scaled_covariance : (n_p, n_p) of theta / initial.
     history : decimated. innovations : one a record.
     guarded : (n_p,) at how many samples the guard held a parameter.
     """
@@ -117,8 +88,6 @@ class EkfResult:
     initial: np.ndarray
     values: np.ndarray
     scaled_covariance: np.ndarray
-    logarithmic: bool
-    prior_share: float
     history: EkfHistory
     innovations: tuple[Innovations, ...]
     guarded: np.ndarray
@@ -126,55 +95,26 @@ class EkfResult:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(n_p, n_p) in the parameters' units; to first order with the log parametrisation."""
-        scale = self.values if self.logarithmic else self.initial
-        return self.scaled_covariance * np.outer(scale, scale)
+        """(n_p, n_p) in the parameters' units."""
+        return self.scaled_covariance * np.outer(self.initial, self.initial)
 
     @property
     def sigma(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def correlation(self) -> np.ndarray:
-        sigma = np.sqrt(np.diag(self.scaled_covariance))
-        return self.scaled_covariance / np.outer(sigma, sigma)
-
-    @property
-    def directions(self) -> Directions:
-        """Eigenvectors of the covariance over the prior's, the best known first.
-
-        A ratio near 1 is a combination of which the data said nothing. With the source's reset it is the last record's.
-        """
-        values, vectors = np.linalg.eigh(self.scaled_covariance / self.prior_share ** 2)
-        return Directions(self.names, values, vectors)
-
-    @property
-    def consistent(self) -> bool:
-        """Whether the innovations of the last record agree with the covariance; if not, sigma means little."""
-        return self.innovations[-1].consistent
+    def undetermined(self) -> tuple[np.ndarray, np.ndarray]:
+        """Variance over the prior's (k,), and orthonormal combinations (n_p, k) in relative changes, of which the data
+        told so little that half of the prior's variance or more is left. With the source's reset it is the last
+        record's."""
+        values, vectors = np.linalg.eigh(self.scaled_covariance / self.settings.prior_share ** 2)
+        return values[values >= 0.5], vectors[:, values >= 0.5]
 
 
-@dataclass(frozen=True, eq=False)
-class ParameterCurves:
-    """One figure in the manner of figs. 3.1-3.3: estimates (m, n), band (m, n) each."""
-
-    title: str
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    time_s: np.ndarray
-    estimate: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    boundaries_s: np.ndarray
-
-
-def parameter_curves(result: EkfResult) -> tuple[ParameterCurves, ...]:
-    """The arrays of figs. 3.1-3.3: masses and inertias, damping, stiffness, and the rest where there is any."""
+def kinds(result: EkfResult) -> dict[str, list[int]]:
+    """Parameters by figure, as figs. 3.1 to 3.3 have them: mass and inertia, damping, stiffness, others."""
     groups: dict[str, list[int]] = {"Mass and inertia": [], "Damping": [], "Stiffness": [], "Other parameters": []}
     for j, unit in enumerate(result.units):
         groups[{"kg": "Mass and inertia", "kg m^2": "Mass and inertia", "N s/m": "Damping", "N/m": "Stiffness",
                 "N m s/rad": "Damping", "N m/rad": "Stiffness"}.get(unit, "Other parameters")].append(j)
-    h = result.history
-    return tuple(ParameterCurves(title, tuple(result.names[j] for j in index), tuple(result.units[j] for j in index),
-                                 h.time_s, h.theta[:, index], h.lower[:, index], h.upper[:, index], h.boundaries_s)
-                 for title, index in groups.items() if index)
+    return {title: index for title, index in groups.items() if index}

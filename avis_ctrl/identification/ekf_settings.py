@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from avis_ctrl.checks import require_positive
+from avis_ctrl.checks import require, require_positive, require_whole
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.rig import Rig
@@ -16,65 +15,53 @@ from avis_ctrl.rigs.rig import Rig
 FLOOR_BAND_Hz = (0.5, 60.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class EkfSettings:
     """Tuning.
 
-    Attributes
-    ----------
     q_sigma, v_sigma : standard deviation of q [m, rad] and q' [m/s, rad/s] at the start of a record (eqs. 3.12, 3.13).
     prior_share : of a parameter, as a share of its starting value (eq. 3.14).
-    Q : spectral density of the acceleration noise, E[W(t) W(t')] = Q delta(t - t'), a number, (6,) or (6, 6)
+    Q : spectral density of the acceleration noise of each coordinate, E[W(t) W(t')] = Q delta(t - t')
         [(m/s^2)^2/Hz, two-sided] (eq. 3.16); None: the rig's ambient floor motion, as three more states.
-    R : variance of a measurement [(m/s)^2], a number or (n_y,) (eq. 3.18); None: the rig's sensor noise and converter.
+    R : variance of a measurement [(m/s)^2] (eq. 3.18); None: the rig's sensor noise and converter.
     highpass_Hz, highpass_order : prefilter of u and y (section 3.2).
-    undo_chain : the prefilter also inverts the sensors' chain; False as the source, which biases the estimates.
-    settle_s : dropped at the front of each record after the prefilter; 0 for records that start at rest.
     reset : start each record from the prior covariance about the last estimate (section 3.2); False keeps it.
     warm_up : records filtered once beforehand, whose covariance is then forgotten: the filter proper starts from their
         estimate, where its linearisation holds. Data count once all the same.
-    parametrisation : "linear" (the source's; a guard holds parameters above `lowest`) or "log" (positive by nature).
-    lowest : share of its starting value below which a linear parameter is not let.
-    velocity_from_data : start q' from the first measurement, as the source does, instead of zero.
+    lowest : share of its starting value below which a parameter is not let.
     history_s : spacing of the history.
     """
 
     q_sigma: float = 2.5e-6
     v_sigma: float = 1e-8
     prior_share: float = 0.25
-    Q: float | Sequence[float] | np.ndarray | None = 1e-8
-    R: float | Sequence[float] | np.ndarray | None = 1e-8
+    Q: float | None = 1e-8
+    R: float | None = 1e-8
     highpass_Hz: float = 1.0
     highpass_order: int = 6
-    undo_chain: bool = True
-    settle_s: float = 0.0
     reset: bool = True
     warm_up: int = 0
-    parametrisation: Literal["linear", "log"] = "linear"
     lowest: float = 0.05
-    velocity_from_data: bool = True
     history_s: float = 1.0
 
     def __post_init__(self) -> None:
         for field in ("q_sigma", "v_sigma", "highpass_Hz", "prior_share", "history_s"):
             require_positive(getattr(self, field), field)
-        if self.parametrisation not in ("linear", "log"):
-            raise InputError("expected linear or log", field="parametrisation", value=self.parametrisation)
-        if not (isinstance(self.warm_up, int) and self.warm_up >= 0):
-            raise InputError("expected a number of records, zero or more", field="warm_up", value=self.warm_up)
-        if not 0 < self.lowest < 1:
-            raise InputError("expected a share of the starting value, between 0 and 1", field="lowest",
-                             value=self.lowest)
+        if self.R is not None:
+            require_positive(self.R, "R")
+        if self.Q is not None:
+            require_positive(self.Q, "Q", zero_allowed=True)
+        require_whole(self.warm_up, "warm_up", 0)
+        require(self.lowest, "lowest", 0, 1)
 
 
 SOURCE_SETTINGS = EkfSettings()
-"""Section 3.3 as printed, but for the sensors' chain, which is undone here and was not there (`undo_chain`). What this
-tuning hides: R = 1e-8 is an r.m.s. velocity of 1e-4 m/s, the size of the payload's own motion, five orders of variance
-above sensor noise and converter (1e-13); Q = 1e-8 is near the density of what the drives of section 3.4 do along x and
-y (1.6e-8), a sixth of it along z and a hundredth about x. The source raised R because the filter was unstable without.
-The bands are therefore those of a filter that distrusts its data: they are wide, and cover errors that the data would
-have shown. And of the 26 parameters only 20 combinations act on the payload: the bands of the others tell the prior,
-not the data."""
+"""Section 3.3 as printed, but for the sensors' chain, which is undone here and was not there. What this tuning hides:
+R = 1e-8 is an r.m.s. velocity of 1e-4 m/s, the size of the payload's own motion, five orders of variance above sensor
+noise and converter (1e-13); Q = 1e-8 is near the density of what the drives of section 3.4 do along x and y (1.6e-8), a
+sixth of it along z and a hundredth about x. The source raised R because the filter was unstable without. The bands are
+therefore those of a filter that distrusts its data: they are wide, and cover errors that the data would have shown. And
+of the 26 parameters only 20 combinations act on the payload: the bands of the others tell the prior, not the data."""
 
 HONEST_SETTINGS = EkfSettings(q_sigma=2.5e-6, v_sigma=1e-4, Q=None, R=None, reset=False, warm_up=1)
 """R from the rig's sensor noise and quantiser, process noise from its ambient floor motion (white velocity through the
@@ -92,14 +79,10 @@ def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str]
 
     Raises
     ------
-    InputError : values that are not positive; R = None for a rig without geophones or for data that are not in volts.
+    InputError : R = None for a rig without geophones or for data that are not in volts.
     """
     if settings.R is not None:
-        R = np.broadcast_to(np.asarray(settings.R, float), (len(y_names),)) if np.ndim(settings.R) == 0 else \
-            np.asarray(settings.R, float)
-        if R.shape != (len(y_names),) or not np.all(np.isfinite(R)) or not np.all(R > 0):
-            raise InputError(f"expected one positive variance, or {len(y_names)}", field="R", value=settings.R)
-        return np.array(R)
+        return np.full(len(y_names), settings.R)
     g, a = rig.geophones, rig.acquisition
     if unit != "V" or g is None or a is None or rig.ambient is None:
         raise InputError("the sensor noise is known for geophones in V of a rig with acquisition and ambient noise "
@@ -109,7 +92,7 @@ def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str]
     return (rig.ambient.sensor_noise_rms_V ** 2 + rounding ** 2) / gain ** 2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class FloorNoise:
     """Floor motion as a disturbance: f' = -rate f + w, with f the floor's displacement (3,) behind the high-pass.
 
@@ -140,21 +123,3 @@ def floor_noise(settings: EkfSettings, rig: Rig) -> FloorNoise | None:
         raise InputError("the rig file has no ambient floor motion; give Q", field="Q", value=None)
     density = rig.ambient.floor_velocity_rms_m_per_s ** 2 / (2 * (FLOOR_BAND_Hz[1] - FLOOR_BAND_Hz[0]))
     return FloorNoise(density, np.pi * settings.highpass_Hz)
-
-
-def density_matrix(Q: float | Sequence[float] | np.ndarray, n: int) -> np.ndarray:
-    """(n, n) from a number, a diagonal or a matrix.
-
-    Raises
-    ------
-    InputError : another shape, values that are not finite, a matrix that is not symmetric positive semidefinite.
-    """
-    given = np.asarray(Q, float)
-    if given.ndim == 0:
-        given = np.full(n, float(given))
-    full = np.diag(given) if given.ndim == 1 else given
-    symmetric = full.shape == (n, n) and np.all(np.isfinite(full)) and np.allclose(full, full.T, rtol=1e-9, atol=0)
-    if not symmetric or np.min(np.linalg.eigvalsh(full)) < -1e-12 * np.max(np.abs(full)):
-        raise InputError(f"expected a spectral density: a number, {n} numbers or a symmetric {n} x {n} matrix, none "
-                         "negative", field="Q", value=np.shape(Q) if np.ndim(Q) else Q)
-    return full

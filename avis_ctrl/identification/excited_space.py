@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from avis_ctrl.identification.sparse_space import sparse_rows
+from avis_ctrl.identification.identifiability_text import combination_text
+from avis_ctrl.identification.sparse_space import sparse_rows, whole_numbers
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS
 
@@ -24,7 +25,7 @@ class ExcitedSpace:
     """The excited combinations of the drives (n_u) in a band.
 
     names : of the drives. driven : those that some record excites. unplayed : (d, k) combinations of the k driven ones
-    that no record excites, sparse, the largest entry of each 1.
+    that no record excites, sparse, in whole numbers where they are.
     """
 
     names: tuple[str, ...]
@@ -41,11 +42,12 @@ class ExcitedSpace:
         """What is not excited, in words; empty if everything is."""
         said = []
         if silent := [name for name in self.names if name not in self.driven]:
-            said.append(f"no record drives {', '.join(silent)}: {_its(silent)} response is not measured, and the rig "
-                        f"file's values for {'them' if len(silent) > 1 else 'it'} are taken as exact")
+            its, it = ("their", "them") if len(silent) > 1 else ("its", "it")
+            said.append(f"no record drives {', '.join(silent)}: {its} response is not measured, and the rig file's "
+                        f"values for {it} are taken as exact")
         if not self.full:
             k, d = len(self.driven), len(self.unplayed)
-            combinations = "; ".join(_in_words(row, self.driven) for row in self.unplayed)
+            combinations = "; ".join(combination_text(zip(self.driven, row, strict=True)) for row in self.unplayed)
             said.append(f"the records excite {k - d} of {k} independent combinations of {', '.join(self.driven)}; not "
                         f"excited: {combinations}. The fit does not need the response to each drive separately")
         return "; ".join(said)
@@ -71,20 +73,5 @@ def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSp
     values, vectors = np.linalg.eigh(gram[np.ix_(driven, driven)] / np.outer(size, size))
     missing = vectors[:, values < SETTINGS.span_tolerance ** 2]
     # w with w^T u = 0: in volts the entries are over the sizes.
-    rows = sparse_rows(missing / size[:, None], 1e-4) if missing.size else np.zeros((0, len(driven)))
-    return ExcitedSpace(names, tuple(names[j] for j in driven), rows)
-
-
-def _its(names: list[str]) -> str:
-    return "their" if len(names) > 1 else "its"
-
-
-def _in_words(row: np.ndarray, names: tuple[str, ...]) -> str:
-    """Such as "Ay1 - Ay3"."""
-    parts = [(value, name) for value, name in zip(row, names, strict=True) if value]
-    text = ""
-    for value, name in parts:
-        size = "" if abs(abs(value) - 1) < 1e-3 else f"{abs(value):.3g} "
-        sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
-        text += f"{sign}{size}{name}"
-    return text
+    rows = [whole_numbers(row) for row in sparse_rows(missing / size[:, None], 1e-4)] if missing.size else []
+    return ExcitedSpace(names, tuple(names[j] for j in driven), np.reshape(rows, (-1, len(driven))))

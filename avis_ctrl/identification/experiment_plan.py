@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from avis_ctrl.identification.experiments import (
-    AddedActuator,
-    AddedSensor,
+    Added,
     Drive,
     Noise,
-    Place,
     changed,
     predicted_information,
 )
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
-from avis_ctrl.identification.identifiability_text import listed, number
+from avis_ctrl.identification.identifiability_text import combination_text, listed, number
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.structure import size_of, structural_null_space, structure_of
@@ -30,29 +29,16 @@ CAUTION = ("These predictions include noise only: added masses, changed position
 
 
 @dataclass(frozen=True, eq=False)
-class _Change:
-    """Makes the changed rig's model."""
-
-    shifts: Mapping[str, float] = field(default_factory=dict)
-    masses: tuple[tuple[float, Place], ...] = ()
-    sensors: tuple[AddedSensor, ...] = ()
-    actuators: tuple[AddedActuator, ...] = ()
-
-    def __call__(self, model: ResponseModel) -> ResponseModel:
-        return changed(model, self.shifts, self.masses, self.sensors, self.actuators)
-
-
-@dataclass(frozen=True, eq=False)
 class Experiment:
     """A further record or bench measurement.
 
-    words : what to do, as an order. drive : the record, None for none. change : the rig that it is taken on. bench :
-    relative standard deviations of parameters measured by themselves.
+    words : what to do, as an order. drive : the record, None for none. change : of the rig that it is taken on, as
+    `experiments.changed` has it. bench : relative standard deviations of parameters measured by themselves.
     """
 
     words: str
     drive: Drive | None = None
-    change: Callable[[ResponseModel], ResponseModel] = field(default=lambda model: model)
+    change: Mapping[str, Any] = field(default_factory=dict)
     bench: Mapping[str, float] = field(default_factory=dict)
 
     def information(self, model: ResponseModel, noise: Noise) -> Information:
@@ -60,7 +46,7 @@ class Experiment:
         n = len(model.names)
         found = Information(model.names, model.values, model.units, np.zeros((n, n)), size_of(model.values))
         if self.drive is not None:
-            matrix = predicted_information(self.change(model), self.drive, noise).matrix
+            matrix = predicted_information(changed(model, **self.change), self.drive, noise).matrix
             found = replace(found, matrix=matrix)
         sizes = dict(zip(model.names, size_of(model.values).tolist(), strict=True))
         return found.with_priors({name: share * sizes[name] for name, share in self.bench.items()})
@@ -100,7 +86,7 @@ def _alone_text(alone: Mapping[str, float]) -> str:
     return f", so that these parameters are determined individually: {listed(shown)}"
 
 
-Added = list[tuple[Experiment, Information]]
+Predictions = list[tuple[Experiment, Information]]
 
 
 def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
@@ -128,17 +114,12 @@ def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
     return (*found, *_changed_rigs(model, drive), *_more_channels(model, drive), *_bench(model))
 
 
-def _payload(model: ResponseModel) -> tuple[float, tuple[float, float, float]]:
-    """A tenth of the payload's mass, and the first mount's corner."""
-    corner = model.rig.mounted_body().mounts[0].position
-    return round(0.1 * model.rig.mounted_body().mass, 3), (float(corner[0]), float(corner[1]), float(corner[2]))
-
-
 def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
-    kg, corner = _payload(model)
+    body = model.rig.mounted_body()
+    kg, corner = round(0.1 * body.mass, 3), body.mounts[0].position
     at = ", ".join(f"{v:g}" for v in corner)
     found = [Experiment(f"Record once more with a known mass of {kg:g} kg fixed at ({at}) m", drive,
-                        _Change(masses=((kg, corner),)))]
+                        {"masses": [(kg, corner)]})]
     numbers = sorted({int(name[8:-4]) for name in model.rig.parameters()
                       if name.startswith("isolator") and name.endswith(".p_x")})
     for axis in "xyz":
@@ -149,24 +130,22 @@ def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
             who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
             how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
             found.append(Experiment(f"Record once more with {who} {how}, with the motors and sensors in it", drive,
-                                    _Change(shifts)))
+                                    {"shifts": shifts}))
     return found
 
 
 def _more_channels(model: ResponseModel, drive: Drive) -> list[Experiment]:
-    _, corner = _payload(model)
-    top = (-corner[0], -corner[1], -corner[2])
-    found = []
-    for axis, unit in zip("xyz", np.eye(3), strict=True):
-        direction = (float(unit[0]), float(unit[1]), float(unit[2]))
-        sensor = AddedSensor(f"added sensor {axis}", top, direction)
+    x, y, z = model.rig.mounted_body().mounts[0].position
+    top, found = (-x, -y, -z), []
+    for axis, direction in {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}.items():
+        sensor = Added(f"added sensor {axis}", top, direction)
         found.append(Experiment(f"Add a calibrated sensor along {axis} on the payload at "
                                 f"({', '.join(f'{v:g}' for v in top)}) m and record once more", drive,
-                                _Change(sensors=(sensor,))))
+                                {"sensors": [sensor]}))
     constant = float(np.max(np.abs(model.matrices.T)))
-    motor = AddedActuator("added actuator", top, (0.0, 0.0, 1.0), constant)
+    motor = Added("added actuator", top, (0.0, 0.0, 1.0), constant)
     found.append(Experiment("Add a calibrated vertical actuator at the same place and record once more", drive,
-                            _Change(actuators=(motor,))))
+                            {"actuators": [motor]}))
     return found
 
 
@@ -197,20 +176,17 @@ def _independent(rows: np.ndarray) -> list[int]:
     return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][:len(rows)].tolist())
 
 
-def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Added:
+def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Predictions:
     """Each experiment with what it would add."""
     return [(one, one.information(model, noise)) for one in experiments]
 
 
-def compared(information: Information, added: Added) -> tuple[Outcome, ...]:
+def compared(information: Information, added: Predictions) -> tuple[Outcome, ...]:
     """What each experiment would add by itself, the best first: most combinations, then the smallest errors."""
-    found = [_outcome(information, one, extra) for one, extra in added]
-    return tuple(sorted(found, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter)))
-
-
-def _worst(outcome: Outcome) -> float:
-    """Predicted error of what is new."""
-    return float(np.median(list(outcome.alone.values()))) if outcome.alone else np.inf
+    def rank(one: Outcome) -> tuple[float, ...]:
+        error = float(np.median(list(one.alone.values()))) if one.alone else np.inf
+        return -one.gained, -len(one.alone), error, -one.tighter
+    return tuple(sorted((_outcome(information, one, extra) for one, extra in added), key=rank))
 
 
 def _outcome(before: Information, experiment: Experiment, added: Information) -> Outcome:
@@ -225,13 +201,12 @@ def _outcome(before: Information, experiment: Experiment, added: Information) ->
     return Outcome(experiment, after, after.rank, after.rank - before.rank, alone, tighter)
 
 
-def planned(information: Information, added: Added) -> tuple[Outcome, ...]:
+def planned(information: Information, added: Predictions) -> tuple[Outcome, ...]:
     """Experiments one after the other, each the one that adds most to those before; ends when nothing is gained."""
     chosen: list[Outcome] = []
     now = information
     while now.rank < len(now.names):
-        outcomes = [_outcome(now, one, extra) for one, extra in added]
-        best = min(outcomes, key=lambda one: (-one.gained, -len(one.alone), _worst(one), -one.tighter))
+        best = compared(now, added)[0]
         if not best.gained:
             break
         chosen.append(best)
@@ -251,7 +226,7 @@ def needed_experiment(information: Information, model: ResponseModel, drive: Dri
     added = predicted(model, chosen, noise)
     outcomes = compared(information, added)
     said = [one.words for one in outcomes if one.gained]
-    useless = [_kind(one.experiment.words) for one in outcomes if not one.gained]
+    useless = [f"{one.experiment.words[:1].lower()}{one.experiment.words[1:]}" for one in outcomes if not one.gained]
     if useless:
         said.append(f"These determine no further combination: {'; '.join(dict.fromkeys(useless))}.")
     steps = planned(information, added)
@@ -269,9 +244,5 @@ def needed_experiment(information: Information, model: ResponseModel, drive: Dri
     if left.rank < len(left.names):
         still = identifiability_report(left)
         said.append("None of these experiments determines: " + "; ".join(
-            " ".join(f"{weight:+g} {name}" for name, weight in row.items()) for row in still.unseen[:8]) + ".")
+            combination_text(row.items()) for row in still.unseen[:8]) + ".")
     return (*said, CAUTION)
-
-
-def _kind(words: str) -> str:
-    return words[:1].lower() + words[1:]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,27 +29,24 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
 _LINES = 120
-FLOOR_BAND_HZ = (0.5, 60.0)
 Place = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class AddedSensor:
-    """Calibrated sensor of the rig's own kind at a place [m] along a direction; it senses the payload."""
+class Added(NamedTuple):
+    """Calibrated sensor of the rig's own kind, or actuator, at a place [m] of the payload along a direction.
+
+    force : N/V of an actuator.
+    """
 
     name: str
     place: Place
     direction: Place
+    force: float = 1.0
 
-
-@dataclass(frozen=True)
-class AddedActuator:
-    """Calibrated actuator at a place [m] along a direction."""
-
-    name: str
-    place: Place
-    direction: Place
-    constant_N_per_V: float
+    @property
+    def row(self) -> np.ndarray:
+        """(6,) displacement along it by q; of an actuator, generalised force by volts."""
+        return self.force * np.array(self.direction) @ point_map(self.place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,35 +57,30 @@ class ChangedModel(ResponseModel):
     """
 
     masses: tuple[tuple[float, Place], ...] = ()
-    more_sensors: tuple[AddedSensor, ...] = ()
-    more_actuators: tuple[AddedActuator, ...] = ()
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return (*self.actuators, *FLOOR)
-
-    def matrices_of(self, rig: Rig) -> Matrices:
-        own = self._plain().matrices_of(rig)
-        M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
-        R = np.vstack([own.R, *(np.array(one.direction) @ point_map(one.place) for one in self.more_sensors)])
-        T = np.column_stack([own.T, *(one.constant_N_per_V * point_map(one.place).T @ np.array(one.direction)
-                                      for one in self.more_actuators)])
-        return own._replace(M=M, R=R, T=T)
-
-    def _plain(self) -> ResponseModel:
-        n_y, n_u = len(self.more_sensors), len(self.more_actuators)
-        sensors = self.sensors.picked(range(len(self.sensors.names) - n_y))
-        names = tuple(name for name in self.names if name in self.rig.parameters())
-        return ResponseModel(self.rig, names, sensors, self.actuators[:len(self.actuators) - n_u], self.period_s,
-                             self.delay_s, self.amplifier_corner_Hz)
+    more_sensors: tuple[Added, ...] = ()
+    more_actuators: tuple[Added, ...] = ()
 
     def __post_init__(self) -> None:
-        self._plain()  # refuses what the rig does not have
+        self._own()  # refuses what the rig does not have
+
+    def matrices_of(self, rig: Rig) -> Matrices:
+        own = self._own().matrices_of(rig)
+        M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
+        R = np.vstack([own.R, *(one.row for one in self.more_sensors)])
+        return own._replace(M=M, R=R, T=np.column_stack([own.T, *(one.row for one in self.more_actuators)]))
+
+    def _own(self) -> ResponseModel:
+        """With the rig's own channels and parameters alone."""
+        n_y, n_u = (len(all_) - len(more) for all_, more in ((self.sensors.names, self.more_sensors),
+                                                             (self.actuators, self.more_actuators)))
+        names = tuple(name for name in self.names if name in self.rig.parameters())
+        return ResponseModel(self.rig, names, self.sensors.picked(range(n_y)), self.actuators[:n_u], self.period_s,
+                             self.delay_s, self.amplifier_corner_Hz)
 
 
 def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
-            masses: Sequence[tuple[float, Place]] = (), sensors: Sequence[AddedSensor] = (),
-            actuators: Sequence[AddedActuator] = ()) -> ChangedModel:
+            masses: Sequence[tuple[float, Place]] = (), sensors: Sequence[Added] = (),
+            actuators: Sequence[Added] = ()) -> ChangedModel:
     """The model of the changed rig, with the same free parameters.
 
     shifts : known changes of parameters of the rig, in their units (isolator1.p_z and so on). Raises InputError for
@@ -109,51 +102,20 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
                         tuple(actuators))
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """Noise of a record on a line, for spectra scaled by 1/sqrt(samples).
+class Noise(NamedTuple):
+    """Covariance (n, n_y, n_y) of the noise of a record on lines omega (n,), for spectra scaled by 1/sqrt(samples)."""
 
-    sensor_V : r.m.s. of each channel (n_y,), or one for all, white, converter included. floor_m_per_s : r.m.s. of the
-    floor that was not measured, each direction, over 0.5-60 Hz. measured : (omega, covariance (n, n_y, n_y)) from a
-    campaign, in place of both. assumed : what no file said, in words.
-    """
+    omega: np.ndarray
+    covariance: np.ndarray
 
-    sensor_V: float | np.ndarray
-    floor_m_per_s: float = 0.0
-    measured: tuple[np.ndarray, np.ndarray] | None = None
-    assumed: str = ""
-
-    def covariance(self, model: ResponseModel, omega: np.ndarray, floor_known: bool) -> np.ndarray:
-        """(n, n_y, n_y); channels beyond those that were measured have the median channel's power, independent."""
-        n_y = len(model.sensors.names)
-        if self.measured is not None:
-            return self._interpolated(omega, n_y)
-        white = np.atleast_1d(self.sensor_V) ** 2
-        if len(white) < n_y:
-            white = np.concatenate([white, np.full(n_y - len(white), np.median(white))])
-        C = np.broadcast_to(white * np.eye(n_y, dtype=complex), (len(omega), n_y, n_y)).copy()
-        if self.floor_m_per_s and not floor_known:
-            U = np.zeros((len(omega), len(model.inputs), 3), complex)
-            U[:, -3:] = np.eye(3)
-            G = model.driven(omega, U, False).Y
-            rate = 1 / model.period_s if model.period_s else 1000.0
-            low, high = (2 * np.pi * f for f in FLOOR_BAND_HZ)
-            power = self.floor_m_per_s ** 2 * rate / 2 / (FLOOR_BAND_HZ[1] - FLOOR_BAND_HZ[0])
-            inside = (omega >= low) & (omega <= high)
-            C += np.where(inside, power, 0.0)[:, None, None] * G @ np.conj(G.swapaxes(1, 2))
-        return C
-
-    def _interpolated(self, omega: np.ndarray, n_y: int) -> np.ndarray:
-        assert self.measured is not None
-        known, covariance = self.measured
-        nearest = np.clip(np.searchsorted(known, omega), 0, len(known) - 1)
-        C = np.zeros((len(omega), n_y, n_y), complex)
-        own = covariance[nearest]
+    def at(self, omega: np.ndarray, n_y: int) -> np.ndarray:
+        """(.., n_y, n_y) on the nearest lines; channels beyond the measured ones have the median power, independent."""
+        own = self.covariance[np.clip(np.searchsorted(self.omega, omega), 0, len(self.omega) - 1)]
         n_own = own.shape[1]
-        C[:, :n_own, :n_own] = own
         middle = np.median(np.real(np.einsum("nii->ni", own)), axis=1)
-        C[:, range(n_own, n_y), range(n_own, n_y)] = middle[:, None]
-        return C
+        found = middle[:, None, None] * np.eye(n_y, dtype=complex)
+        found[:, :n_own, :n_own] = own
+        return found
 
 
 def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
@@ -166,8 +128,7 @@ def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
         raise InputError("expected records with an estimate of their noise", field="blocks", value=len(blocks))
     longest = max(records, key=lambda one: len(one.omega))
     assert longest.noise is not None
-    return Noise(float(np.sqrt(np.median(np.real(np.einsum("nkii->nki", longest.noise))))),
-                 measured=(longest.omega, longest.noise[:, 0]))
+    return Noise(longest.omega, longest.noise[:, 0])
 
 
 @dataclass(frozen=True)
@@ -206,7 +167,7 @@ def predicted_information(model: ResponseModel, drive: Drive, noise: Noise) -> I
     dY = model.driven(omega, U[:, :, np.array(columns) > 0]).dY if np.any(columns) else None
     H = np.zeros((len(model.names), len(model.names)))
     if dY is not None:
-        L = np.linalg.inv(np.linalg.cholesky(noise.covariance(model, omega, bool(drive.floor_m_per_s))))
+        L = np.linalg.inv(np.linalg.cholesky(noise.at(omega, len(model.sensors.names))))
         white = (L @ dY) * np.sqrt(2 * lines)[:, None, None]
         flat = white.reshape(len(white), -1)
         H = np.real(np.conj(flat) @ flat.T)

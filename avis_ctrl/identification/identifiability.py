@@ -25,52 +25,24 @@ from avis_ctrl.identification.structure import Structure, size_of, structural_nu
 WEAK = 0.05
 
 
-@dataclass(frozen=True)
-class ParameterRow:
-    """A line of the table: known is "alone", "ratio" (with the pins known it is), or "together"; or "not" at all.
-
-    standard_deviation : by itself, infinite where it is not known alone. with_others : the combinations it stands in.
-    """
-
-    name: str
-    value: float
-    unit: str
-    known: str
-    standard_deviation: float
-    with_others: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class IdentifiabilityReport:
     """What an information matrix says.
 
     Attributes
     ----------
-    parameters, rank, condition : how many, how many combinations are determined, conditioning of those.
-    rows : one a parameter. combinations : as many as the structure leaves; their standard deviation may still be
-        infinite, where the data are too poor. unseen : what no such data show, in the parameters' units.
-    pins : parameters that the ratios refer to. sentences : all of it in words.
+    rank, condition : how many combinations are determined, conditioning of those.
+    combinations : as many as the structure leaves; their standard deviation may still be infinite, where the data are
+        too poor. unseen : what no such data show, in the parameters' units. sentences : all of it in words.
     """
 
     information: Information
     rank: int
     condition: float
-    rows: tuple[ParameterRow, ...]
     structure: Structure
     combinations: tuple[Combination, ...]
     unseen: tuple[Mapping[str, float], ...]
-    pins: tuple[str, ...]
     sentences: tuple[str, ...]
-
-    @property
-    def parameters(self) -> int:
-        return len(self.rows)
-
-    @property
-    def weak(self) -> tuple[Combination, ...]:
-        """Determined combinations known to worse than 5 %, the worst first."""
-        found = [one for one in self.combinations if one.determined and one.relative > WEAK]
-        return tuple(sorted(found, key=lambda one: -one.relative))
 
 
 def identifiability_report(information: Information, model: ResponseModel | None = None, floor: bool = False,
@@ -96,21 +68,18 @@ def identifiability_report(information: Information, model: ResponseModel | None
         null, own = information.null_space, information.null_space
         structure = structure_of(null, values, units, names, 1e-3)
     else:
-        own = structural_null_space(model, floor) * (size_of(model.values) / information.scale)[:, None]
-        own = np.linalg.qr(own)[0] if own.size else own
+        own = _orthonormal(structural_null_space(model, floor) * (size_of(model.values) / information.scale)[:, None])
         null = _left_dark(information, own)
         # Relative units of the structure are those of the values.
         structure = structure_of(_orthonormal(null * (information.scale / size_of(values))[:, None]), values, units,
                                  names)
     combinations = _combinations(information, structure)
     unseen = tuple(_by_name(row, names) for group in structure.groups for row in group.unseen)
-    pins = tuple(names[one.pin] for one in structure.scalings)
-    rows = _rows(information, structure, combinations)
-    said = _sentences(information, structure, combinations, rows)
+    said = _sentences(information, structure, combinations)
     if model is not None and own.shape[1] > null.shape[1]:
         said = (*said, _prior_sentence(own.shape[1] - null.shape[1], priors or {}))
-    return IdentifiabilityReport(information, information.rank, information.condition, rows, structure, combinations,
-                                 unseen, pins, said)
+    return IdentifiabilityReport(information, information.rank, information.condition, structure, combinations, unseen,
+                                 said)
 
 
 def _orthonormal(basis: np.ndarray) -> np.ndarray:
@@ -165,31 +134,9 @@ def _by_name(row: np.ndarray, names: Sequence[str]) -> dict[str, float]:
     return {name: float(weight) for name, weight in zip(names, row, strict=True) if weight}
 
 
-def _rows(information: Information, structure: Structure, combinations: Sequence[Combination]
-          ) -> tuple[ParameterRow, ...]:
-    grouped = {j: group for group in structure.groups for j in group.members}
-    pins = {one.pin for one in structure.scalings}
-    found = []
-    for j, name in enumerate(information.names):
-        sigma = float(information.standard_deviation[j])
-        others = tuple(one.words for one in combinations if name in one.weights)
-        if np.isfinite(sigma):
-            known = "alone"
-        elif j in grouped:
-            known = "together" if len(grouped[j].seen) else "not"
-        elif any(one.exponents[j] for one in structure.scalings):
-            own = [one for one in combinations if name in one.weights and one.determined]
-            known = "ratio" if own or j in pins else "not"
-        else:
-            known = "not"
-        found.append(ParameterRow(name, float(information.values[j]), information.units[j], known, sigma, others))
-    return tuple(found)
-
-
-def _sentences(information: Information, structure: Structure, combinations: Sequence[Combination],
-               rows: Sequence[ParameterRow]) -> tuple[str, ...]:
+def _sentences(information: Information, structure: Structure, combinations: Sequence[Combination]) -> tuple[str, ...]:
     names, count = information.names, len(information.names)
-    alone = [row for row in rows if row.known == "alone"]
+    alone = [name for name, known in zip(names, information.known, strict=True) if known]
     said = [f"The data determine {information.rank} combinations of the {count} parameters; the relative standard "
             f"deviations of the most and the least precise one differ by a factor of "
             f"{number(np.sqrt(information.condition))}."
@@ -197,7 +144,7 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
     if len(alone) == count:
         said.append("Every parameter is determined individually.")
     elif alone:
-        said.append(f"Determined individually ({len(alone)}): {', '.join(row.name for row in alone)}.")
+        said.append(f"Determined individually ({len(alone)}): {', '.join(alone)}.")
     said += [scaling_sentence(one, information) for one in structure.scalings]
     if structure.scalings:
         shared = [text for text in (_combination(information, structure, row).words

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,9 +24,9 @@ def listed(words: Sequence[str], last: str = "and") -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
-def combination_text(terms: Sequence[tuple[str, float]], powers: Sequence[tuple[str, float]]) -> str:
-    """A weighted sum, times powers of other parameters."""
-    text = ""
+def combination_text(terms: Iterable[tuple[str, float]], powers: Sequence[tuple[str, float]] = ()) -> str:
+    """A weighted sum, times powers of other parameters; terms of weight zero are left out."""
+    text, terms = "", [(name, weight) for name, weight in terms if weight]
     for name, weight in terms:
         size = "" if abs(weight) == 1 else f"{abs(weight):.4g} "
         text += f" {'-' if weight < 0 else '+'} {size}{name}"
@@ -121,9 +121,13 @@ def weak_sentence(one: Combination) -> str:
             f"{uncertain_value.text(one.value, one.standard_deviation, one.unit)}.")
 
 
-def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: float) -> str:
+def main_members(names: Sequence[str], direction: np.ndarray) -> list[tuple[str, float]]:
+    """The members that carry nine tenths of a unit vector, the largest first, in positive direction."""
     order = np.argsort(-np.abs(direction))
-    count = min(int(np.searchsorted(np.cumsum(direction[order] ** 2), 0.9)) + 1, 6)
-    sign = np.sign(direction[order[0]])
-    moved = [f"{names[j]} by {100 * sigma * sign * direction[j]:+.2g} %" for j in order[:count]]
+    count = int(np.searchsorted(np.cumsum(direction[order] ** 2), 0.9)) + 1
+    return [(names[j], float(np.sign(direction[order[0]]) * direction[j])) for j in order[:count]]
+
+
+def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: float) -> str:
+    moved = [f"{name} by {100 * sigma * weight:+.2g} %" for name, weight in main_members(names, direction)[:6]]
     return f"The least precise combination: changing {listed(moved)} together is one standard deviation."

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 
 # A direction known to worse than this, as a fraction of the parameters' own size, is not determined.
@@ -154,7 +155,13 @@ class Information:
 
     def with_priors(self, deviations: Mapping[str, float]) -> Information:
         """With independent knowledge of single parameters: standard deviations in their units."""
-        return replace(self, matrix=self.matrix + self._priors(deviations))
+        diagonal = np.zeros(len(self.names))
+        for name, sigma in deviations.items():
+            if name not in self.names:
+                raise InputError(f"expected some of {', '.join(self.names)}", field="priors", value=name)
+            require_positive(sigma, f"prior of {name}")
+            diagonal[self.names.index(name)] = 1 / sigma ** 2
+        return replace(self, matrix=self.matrix + np.diag(diagonal))
 
     def of_some(self, names: Sequence[str]) -> Information:
         """Of some of the parameters, whatever the others are (Schur complement)."""
@@ -171,13 +178,3 @@ class Information:
         V = other.directions[1][:, other.determined]
         P = (V @ V.T) * np.outer(other.scale, 1 / other.scale)
         return replace(self, matrix=P.T @ self.matrix @ P)
-
-    def _priors(self, deviations: Mapping[str, float]) -> np.ndarray:
-        diagonal = np.zeros(len(self.names))
-        for name, sigma in deviations.items():
-            if name not in self.names:
-                raise InputError(f"expected some of {', '.join(self.names)}", field="priors", value=name)
-            if not (np.isfinite(sigma) and sigma > 0):
-                raise InputError("expected a positive standard deviation", field=f"prior of {name}", value=sigma)
-            diagonal[self.names.index(name)] = 1 / sigma ** 2
-        return np.diag(diagonal)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from avis_ctrl.rigs.nonlinear import RigArrays, payload_acceleration, rig_arrays
+from avis_ctrl.rigs.nonlinear import payload_acceleration, rig_arrays
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -35,18 +35,11 @@ class Turning(NamedTuple):
 AS_SIMULATED = Turning()
 
 
-class Sensors(NamedTuple):
-    """Places (n_y, 3) [m] and directions (n_y, 3) of sensors on the payload."""
-
-    place: np.ndarray
-    direction: np.ndarray
-
-
-def sensors_of(rig: Rig, names: tuple[str, ...]) -> Sensors:
-    """Of the named sensors."""
+def sensors_of(rig: Rig, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n_y, 3) [m] and directions (n_y, 3) of the named sensors on the payload."""
     axes = rig.sensor_axes()
     place, direction = (np.array([axes[name][k] for name in names], float).reshape(-1, 3) for k in (0, 1))
-    return Sensors(place, direction)
+    return place, direction
 
 
 def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sensors: tuple[str, ...]
@@ -218,8 +211,3 @@ def march_linear(drive, x, Phi, states):
             after[i] = sum_
         for i in range(N):
             x[i] = after[i]
-
-
-def arrays_of(rig: Rig) -> RigArrays:
-    """The rig's body for `march`."""
-    return rig_arrays(rig.mounted_body())

@@ -12,9 +12,10 @@ problem).
 Levenberg-Marquardt steps in relative parameters; the information matrix is J^T J at the end, its inverse the
 Cramer-Rao bound where C_k is known. Where C_k was estimated, weights that scatter cost precision, and the information
 is less by what they cost (`weight_cost`). Directions that the data do not determine keep their starting value.
-Parameters that physics keeps positive stop just above zero, and stay there while chi2 would fall further below zero
-(an active set); the other parameters then find their own optimum. A moment of inertia stops in the same way at the sum
-of the other two.
+Parameters that physics keeps positive stop just above zero, and a moment of inertia at the sum of the other two, while
+chi2 would fall further beyond; the other parameters then find their own optimum. In coordinates in which these limits
+are a box, a step is a linear least-squares problem with bounds (Stark and Parker, Computational Statistics 10 (1995)
+129-141, as scipy has it).
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.optimize import lsq_linear
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.response import FrequencyModel, moment_rows, positive
-from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
+from avis_ctrl.identification.response import FrequencyModel, moment_rows
+from avis_ctrl.identification.spectra import span, thinned, transient_columns, transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Prior = tuple[float, float]
@@ -42,14 +43,20 @@ Fitted = TypeVar("Fitted", bound=FrequencyModel)
 @dataclass(frozen=True)
 class LikelihoodSettings:
     """few_lines : number of lines, all blocks together, below which threads cost more time than they save.
-    edge : distance that a moment of inertia keeps from the sum of the other two, relative to the sum of all three:
-        large enough that round-off takes it no further.
+    edge : distance that a moment of inertia keeps from the sum of the other two, relative to the sum of all three.
+    near : distance from a limit, in relative units, within which a parameter counts as at it.
+    known : smallest eigenvalue of the scaled normal matrix, relative to the largest, of a direction that is determined.
+    thin_lines, thin_by : lines of a block on which a start other than the first begins: so many, or one in so many.
     at_once : lines that are whitened together: with some hundred parameters they stay in the processor's cache.
     """
 
     few_lines: int = 4000
+    thin_lines: int = 200
+    thin_by: int = 8
     at_once: int = 32
     edge: float = 1e-6
+    near: float = 1e-6
+    known: float = 1e-11
 
 
 SETTINGS = LikelihoodSettings()
@@ -75,7 +82,7 @@ class LikelihoodFit(Generic[Fitted]):
     information : of the estimate: the Cramer-Rao bound, less what estimated weights cost.
     chi2, dof : sum of squares of what should be standard normal numbers, priors included, and how many are free: less
         the transients' unknowns and the combinations of parameters that are determined.
-    iterations, converged : of the best start. history : chi2 after each of its steps.
+    iterations, converged : of the best start.
     residuals : one a block.
     starts : chi2 reached from each start, infinite where it failed.
     priors : used, by name. held : parameters that ended at the smallest value that physics allows, and moments of
@@ -89,7 +96,6 @@ class LikelihoodFit(Generic[Fitted]):
     dof: int
     iterations: int
     converged: bool
-    history: tuple[float, ...]
     residuals: tuple[Residual, ...]
     starts: tuple[float, ...]
     priors: Mapping[str, Prior] = field(default_factory=dict)
@@ -106,13 +112,13 @@ class LikelihoodFit(Generic[Fitted]):
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """chi2 and its expansion: g = -J^T e, H = J^T J in relative parameters; F the same less the weights' cost."""
+    """chi2 and its expansion: gradient -J^T e and H = J^T J in the coordinates of the descent; F = J^T J in the
+    parameters' units, less the weights' cost."""
 
     chi2: float
     gradient: np.ndarray
     H: np.ndarray
     F: np.ndarray
-    residuals: tuple[Residual, ...] = ()
 
 
 def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
@@ -155,25 +161,44 @@ def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Pri
         raise ComputationError("no starting point of the fit reached a finite chi-square", measured=f"{chi2}",
                                cause="data that are zero or far from this rig",
                                next_step="check the findings of the gates, and start from better values")
-    last = best.evaluate(best.model, residuals=True)
-    scale = about.scales()
+    now = best.now
+    residuals = tuple(block_residual(best.model, block, L, derivative=False)[2]
+                      for block, L in zip(blocks, whiteners, strict=True))
     unknown = sum(transient_unknowns(block, model) for block in blocks)
-    information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
+    information = Information(model.names, best.model.values, model.units, now.F, about.scales())
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
-    return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
-                         tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors,
-                         tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low)
-                         + best.largest_moments())
+    return LikelihoodFit(best.model, information, now.chi2, dof, best.iterations, best.converged,
+                         residuals, tuple(value for value, _ in reached), priors,
+                         tuple(name for name, low in zip(model.names, best.at_lowest(), strict=True) if low))
 
 
 def _thinned_descent(begin: Fitted, blocks, priors, first: Fitted, max_iterations: int) -> Fitted:
-    """A first descent on some of the lines, drawn at random: from afar it leads to the same place, in less time."""
-    rng = np.random.default_rng(0)
-    few = [block.lines(np.sort(rng.choice(len(block.omega), max(min(len(block.omega), 200), len(block.omega) // 8),
-                                          replace=False))) for block in blocks]
+    """A first descent on some of the lines: from afar it leads to the same place, in less time."""
+    few = [thinned(block, max(SETTINGS.thin_lines, len(block.omega) // SETTINGS.thin_by)) for block in blocks]
     descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
     descent.run(max_iterations)
     return descent.model
+
+
+class _Box:
+    """Coordinates x (n_p,), theta = basis @ x, in which the limits of a model's parameters are low and high (n_p,).
+
+    They are the parameters in relative units but for moments of inertia: where all three are free, each stands for the
+    sum of the other two less itself. A thin plate starts at the limit itself, or beside it by round-off; one that the
+    starting values violate by more than `edge` is none.
+    """
+
+    def __init__(self, first: FrequencyModel):
+        rows, values = moment_rows(first.names), first.values
+        self.low, self.high = first.bounds()
+        forward = np.eye(len(values))
+        for row in rows:
+            k = int(np.argmin(row))
+            room, size = float(row @ values), SETTINGS.edge * float(np.abs(row) @ np.abs(values))
+            forward[k], self.low[k] = row, min(size, room) if room >= -size else -np.inf
+        self.scale = first.scales()
+        self.forward, self.basis = forward / self.scale[:, None], np.linalg.inv(forward) * self.scale
+        self.low, self.high = self.low / self.scale, self.high / self.scale
 
 
 class _Descent(Generic[Fitted]):
@@ -181,16 +206,14 @@ class _Descent(Generic[Fitted]):
 
     def __init__(self, model: Fitted, blocks, whiteners, priors, first: Fitted):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
-        self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
-        self.rows = _held_rows(first)
+        self.box = _Box(first)
         self.now = self.evaluate(model)
-        self.history = [self.now.chi2]
         self.iterations, self.converged = 0, False
 
-    def evaluate(self, model: Fitted, derivative: bool = True, residuals: bool = False) -> _Quadratic:
+    def evaluate(self, model: Fitted, derivative: bool = True) -> _Quadratic:
         """chi2 at a model, with its expansion if asked for."""
         n_p = len(model.names)
-        chi2, g, H, F, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), np.zeros((n_p, n_p)), []
+        chi2, g, H, F = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), np.zeros((n_p, n_p))
         _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
         work = partial(block_residual, model, derivative=derivative)
         # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
@@ -202,21 +225,18 @@ class _Descent(Generic[Fitted]):
         for e, J, residual in parts:
             chi2 += float(e @ e)
             if derivative:
-                J *= self.scale[:, None]
                 g -= J @ e
                 own = J @ J.T
                 H += own
                 F += own / weight_cost(residual.block)
-            if residuals:
-                kept.append(residual)
         for name, (mean, sigma) in self.priors.items():
             j = model.names.index(name)
-            miss, slope = (mean - model.values[j]) / sigma, self.scale[j] / sigma
-            chi2 += miss ** 2
-            g[j] -= slope * miss
-            H[j, j] += slope ** 2
-            F[j, j] += slope ** 2
-        return _Quadratic(chi2, g, H, F, tuple(kept))
+            chi2 += ((mean - model.values[j]) / sigma) ** 2
+            g[j] -= (mean - model.values[j]) / sigma ** 2
+            H[j, j] += 1 / sigma ** 2
+            F[j, j] += 1 / sigma ** 2
+        basis = self.box.basis
+        return _Quadratic(chi2, basis.T @ g, basis.T @ H @ basis, F)
 
     def run(self, max_iterations: int) -> None:
         damping = 1e-3
@@ -231,7 +251,6 @@ class _Descent(Generic[Fitted]):
                 gain = (self.now.chi2 - trial[1]) / promised
                 self.model, self.iterations = trial[0], self.iterations + 1
                 self.now = self.evaluate(self.model)
-                self.history.append(self.now.chi2)
                 damping = max(damping * (0.1 if gain > 0.5 else 1.0), 1e-12)
             else:
                 damping *= 10
@@ -241,88 +260,42 @@ class _Descent(Generic[Fitted]):
                     break
 
     def _step(self, damping: float) -> tuple[np.ndarray, float]:
-        """Relative step, and the decrease of chi2 that the expansion predicts for it.
-
-        The step runs along the bounds and edges that it would otherwise cross.
-        """
-        free = ~((self.at_bound() & (self.now.gradient > 0)) | (self.at_top() & (self.now.gradient < 0)))
-        basis = np.eye(len(free))[:, free]
-        step, promised = self._step_in(basis, damping)
-        rows, edge, held = self.rows * self.scale, self.at_edge(), np.zeros(len(self.rows), bool)
-        for _ in rows:
-            leaving = edge & ~held & (rows @ step < 0)
-            if not np.any(leaving):
-                break
-            held |= leaving
-            step, promised = self._step_in(basis @ null_space(rows[held] @ basis), damping)
-        return step, promised
-
-    def _step_in(self, basis: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
-        """The step in the space spanned by the columns of basis (n_p, k).
+        """Step of x inside the box, and the decrease of chi2 that the expansion predicts for it.
 
         H is scaled to a unit diagonal before its eigenvalues decide what is determined.
         """
-        H, g = basis.T @ self.now.H @ basis, basis.T @ self.now.gradient
-        if not g.size:
-            return np.zeros(len(basis)), 0.0
+        H, g, x = self.now.H, self.now.gradient, self.box.forward @ self.model.values
         size = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(H / np.outer(size, size))
-        along = vectors.T @ (g / size)
-        known = values > 1e-11 * values[-1]
+        known = values > SETTINGS.known * values[-1]
+        values, V = values[known], vectors[:, known]
+        low, high = np.minimum((self.box.low - x) * size, 0.0), np.maximum((self.box.high - x) * size, 0.0)
         # No parameter by more than its reach at once: what the data hardly know is held back first.
         down, up = self.model.reach()
         while True:
-            y = np.where(known, -along / np.where(known, values + damping, 1.0), 0.0)
-            step = basis @ (vectors @ y / size)
-            largest = np.max(np.abs(step) / np.where(step > 0, up, down))
+            root = np.sqrt(values + damping)
+            step = lsq_linear(root[:, None] * V.T, -(V.T @ (g / size)) / root, (low, high),
+                              method="bvls").x / size
+            moved = self.box.basis @ step / self.box.scale
+            largest = np.max(np.abs(moved) / np.where(moved > 0, up, down))
             if largest <= 1 or damping >= 1.0:
                 break
             damping *= 4
-        if largest > 1:
-            y, step = y / largest, step / largest
-        return step, float(-(2 * along @ y + y @ (values * y)))
+        step /= max(largest, 1.0)
+        return step, float(-(2 * g @ step + step @ H @ step))
 
-    def at_edge(self) -> np.ndarray:
-        """(k,) whether each row's moment of inertia has reached the sum of the other two."""
-        return self.rows @ self.model.values <= 3 * SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
-
-    def largest_moments(self) -> tuple[str, ...]:
-        """Names of the moments of inertia at the largest value that a body can have."""
-        return tuple(self.model.names[int(np.argmin(row))] for row in self.rows[self.at_edge()])
-
-    def at_bound(self) -> np.ndarray:
-        """(n_p,) parameters at the smallest value that physics allows."""
-        slack = 1e-9 * np.abs(self.lowest, where=np.isfinite(self.lowest), out=np.zeros(len(self.lowest)))
-        return self.model.values <= self.lowest + slack
-
-    def at_top(self) -> np.ndarray:
-        """(n_p,) parameters at the largest."""
-        slack = 1e-9 * np.abs(self.highest, where=np.isfinite(self.highest), out=np.zeros(len(self.highest)))
-        return self.model.values >= self.highest - slack
+    def at_lowest(self) -> np.ndarray:
+        """(n_p,) parameters at the smallest value that physics allows, and moments of inertia at the largest."""
+        return self.box.forward @ self.model.values <= self.box.low + SETTINGS.near
 
     def _try(self, step: np.ndarray) -> tuple[Fitted, float] | None:
-        values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
-        if len(self.rows):
-            # Shorten the step to end where a moment reaches the sum of the other two, less the distance `edge`.
-            size = SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
-            room = np.maximum(self.rows @ self.model.values - size, 0.0)
-            used = -(self.rows @ (values - self.model.values))
-            beyond = used > room + 1e-6 * size  # a step along the edge leaves it by round-off
-            share = np.min(np.where(beyond, room / np.where(beyond, used, 1.0), 1.0))
-            values = self.model.values + share * (values - self.model.values)
+        x = np.clip(self.box.forward @ self.model.values + step, self.box.low, self.box.high)
         try:
-            model = self.model.at(values)
+            model = self.model.at(self.box.basis @ x)
         except InputError:
             return None  # no rig has these parameters: a shorter step
-        if not _physical(model):
-            return None
         chi2 = self.evaluate(model, derivative=False).chi2
         return (model, chi2) if np.isfinite(chi2) else None
-
-
-def _physical(model: FrequencyModel) -> bool:
-    """Stiffness, damping and sensitivities keep the sign that they have on a rig."""
-    return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
 
 
 def block_residual(model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
@@ -440,21 +413,15 @@ def transient_unknowns(block: SpectralBlock, model: FrequencyModel) -> int:
 
 def _moved(model: Fitted, spread: float, rng: np.random.Generator) -> Fitted | None:
     """Another start: each parameter a random factor away; None where no rig has the draw."""
+    box = _Box(model)
     for _ in range(20):
         try:
-            moved = model.at(model.values + model.scales() * spread * rng.uniform(-1, 1, len(model.names)))
+            moved = model.at(model.values + box.scale * spread * rng.uniform(-1, 1, len(model.names)))
         except InputError:
             continue
-        if _physical(moved) and np.all(_held_rows(model) @ moved.values > 0):
+        if np.all((box.forward @ moved.values > box.low) & (box.forward @ moved.values < box.high)):
             return moved
     return None
-
-
-def _held_rows(first: FrequencyModel) -> np.ndarray:
-    """`moment_rows` without those that the starting values violate by more than `edge`: a thin plate starts at the sum
-    itself."""
-    rows = moment_rows(first.names)
-    return rows[rows @ first.values >= -SETTINGS.edge * np.abs(rows) @ np.abs(first.values)]
 
 
 def _check(model: FrequencyModel, blocks, priors, starts: int) -> None:

@@ -27,7 +27,6 @@ from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.response import N_Q, ResponseModel
-from avis_ctrl.identification.sample_and_hold import aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
@@ -77,7 +76,8 @@ class MeasuredModes:
 
 @dataclass(frozen=True)
 class ModeRow:
-    """A line of the mode table; *_sigma : difference, model less measured, over its standard deviation."""
+    """A line of the mode table; *_sigma : difference, model less measured, over its standard deviation. NaN : not
+    measured."""
 
     shape: str
     frequency_Hz: float
@@ -86,12 +86,12 @@ class ModeRow:
     damping_std: float
     start_frequency_Hz: float
     start_damping: float
-    measured_frequency_Hz: float = float("nan")
-    measured_frequency_std_Hz: float = float("nan")
-    measured_damping: float = float("nan")
-    measured_damping_std: float = float("nan")
-    frequency_sigma: float = float("nan")
-    damping_sigma: float = float("nan")
+    measured_frequency_Hz: float
+    measured_frequency_std_Hz: float
+    measured_damping: float
+    measured_damping_std: float
+    frequency_sigma: float
+    damping_sigma: float
 
 
 def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> ModelModes:
@@ -141,20 +141,17 @@ def mode_table(model: ResponseModel, covariance: np.ndarray, start: ResponseMode
                measured: MeasuredModes | None) -> tuple[ModeRow, ...]:
     """The model's modes beside the start's and the measured ones, lowest first."""
     found, before = model_modes(model, covariance), model_modes(start)
-    n, rows = len(found.damping), []
-    for k in range(n):
-        row: dict[str, float] = {}
-        if measured is not None:
-            total = np.sqrt(np.diag(found.covariance) + np.diag(measured.covariance))
-            own = np.sqrt(np.diag(measured.covariance))
-            row = {"measured_frequency_Hz": float(measured.frequency_Hz[k]), "measured_frequency_std_Hz": float(own[k]),
-                   "measured_damping": float(measured.damping[k]), "measured_damping_std": float(own[n + k]),
-                   "frequency_sigma": float((found.frequency_Hz - measured.frequency_Hz)[k] / total[k]),
-                   "damping_sigma": float((found.damping - measured.damping)[k] / total[n + k])}
-        rows.append(ModeRow(found.words[k], float(found.frequency_Hz[k]), float(found.frequency_std_Hz[k]),
-                            float(found.damping[k]), float(found.damping_std[k]), float(before.frequency_Hz[k]),
-                            float(before.damping[k]), **row))
-    return tuple(rows)
+    n = len(found.damping)
+    beside = [np.full(n, np.nan)] * 6
+    if measured is not None:
+        own = np.sqrt(np.diag(measured.covariance))
+        total = np.sqrt(np.diag(found.covariance) + np.diag(measured.covariance))
+        beside = [measured.frequency_Hz, own[:n], measured.damping, own[n:],
+                  (found.frequency_Hz - measured.frequency_Hz) / total[:n],
+                  (found.damping - measured.damping) / total[n:]]
+    columns = [found.frequency_Hz, found.frequency_std_Hz, found.damping, found.damping_std, before.frequency_Hz,
+               before.damping, *beside]
+    return tuple(ModeRow(shape, *map(float, row)) for shape, *row in zip(found.words, *columns, strict=True))
 
 
 def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> MeasuredModes:
@@ -275,15 +272,7 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     n, n_y, m = block.Y.shape
     omega, n_u = np.tile(block.omega, m), len(model.actuators)
     s = 1j * omega
-    chain = model.sensors.sense(omega)[:, 0]
-    if model.period_s:
-        drive = hold(omega, model.period_s, model.delay_s)
-        folded = aliases(omega, model.period_s, model.delay_s, model.sensors.motion, model.amplifier_corner_Hz,
-                         model.sensors.low_pass)
-    else:
-        drive, folded = np.exp(-s * model.delay_s), np.zeros(len(omega), complex)
-    if model.amplifier_corner_Hz:
-        drive = drive / (1 + s / (2 * np.pi * model.amplifier_corner_Hz))
+    chain, (drive, folded) = model.sensors.sense(omega)[:, 0], (one[:, 0, 0] for one in model.drive(omega))
     U = np.moveaxis(block.U[:, driven], 2, 0).reshape(m * n, -1)
     volts = driven < n_u
     # Of a floor's velocity the springs take the integral.

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.maximum_likelihood import Residual
@@ -26,9 +27,9 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 
 # Half the band [Hz] over which S and d count as constant, lines in it at least, and rounds of their fit.
 SHAPE_HALF_Hz, SHAPE_LINES, ROUNDS = 0.25, 40, 30
-# Degrees of freedom of an average: of residuals as they are, and of whitened ones. An estimate of so many costs
-# n_y / dof of the precision that the noise would allow (Pintelon and Schoukens 2012, section 12.3).
-LEAST_DOF, LEAST_DOF_FLAT = 30, 100
+# Half the band [Hz] of an average at least, and its degrees of freedom: an estimate of so many costs n_y / dof of the
+# precision that the noise would allow (Pintelon and Schoukens 2012, section 12.3).
+HALF_Hz, LEAST_DOF = 0.15, 100
 
 
 def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> list[SpectralBlock]:
@@ -40,25 +41,16 @@ def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> li
     for block in blocks:
         power = np.sum(np.abs(block.Y) ** 2, axis=2)
         width = max(3, len(block.omega) // 20)
-        level = _smoothed(power, width) + 1e-12 * power.max(0)
+        level = uniform_filter1d(power, width, axis=0, mode="nearest") + 1e-12 * power.max(0)
         found.append(block.with_noise(fraction ** 2 * level[:, :, None] * np.eye(level.shape[1])))
     return found
 
 
-def residual_noise(residuals: Sequence[Residual], half_width_Hz: float = 0.15, least_dof: int | None = None,
-                   model: FrequencyModel | None = None) -> list[SpectralBlock]:
-    """The blocks with the covariance of their residuals, averaged over +- half_width_Hz and records of a kind.
+def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], model: FrequencyModel
+                         ) -> list[SpectralBlock]:
+    """Blocks with the covariance that residuals of a model have near their lines, averaged over records of a kind.
 
-    The window grows until the covariance has least_dof degrees of freedom and three for each output. With a model the
-    residuals are whitened by the shape that an unmeasured floor gives them before they are averaged; that allows wider
-    windows, of 100 degrees of freedom by default instead of 30.
-    """
-    return noise_from_residuals(residuals, [one.block for one in residuals], half_width_Hz, least_dof, model)
-
-
-def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], half_width_Hz: float = 0.15,
-                         least_dof: int | None = None, model: FrequencyModel | None = None) -> list[SpectralBlock]:
-    """Blocks, which may be other ones, with the covariance that residuals of their kind have near their lines.
+    The window grows until the covariance has LEAST_DOF degrees of freedom and three for each output.
 
     Raises
     ------
@@ -70,17 +62,13 @@ def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[Spectra
         own = [block for block in blocks if block.kind == kind]
         if not pool:
             raise InputError(f"expected residuals of its kind, {kind}", field=f"block {own[0].name}")
-        shape = _shape(pool, model) if model is not None else None
-        flat = [_outer(one.error if shape is None else np.linalg.solve(shape.factor(one.block.omega, model), one.error))
-                for one in pool]
-        least = least_dof or (LEAST_DOF if shape is None else LEAST_DOF_FLAT)
-        half = max(half_width_Hz * 2 * np.pi, max(least, 3 * own[0].Y.shape[1]) / _density(pool) / 2)
+        shape = _shape(pool, model)
+        flat = [_outer(np.linalg.solve(shape.factor(one.block.omega, model), one.error)) for one in pool]
+        half = max(HALF_Hz * 2 * np.pi, max(LEAST_DOF, 3 * own[0].Y.shape[1]) / _density(pool) / 2)
         for block in own:
             total, count = _window_sums(pool, flat, block.omega, half)
-            noise = total / np.maximum(count, 1)[:, None, None]
-            if shape is not None:
-                A = shape.factor(block.omega, model)
-                noise = A @ noise @ np.conj(A.swapaxes(1, 2))
+            A = shape.factor(block.omega, model)
+            noise = A @ (total / np.maximum(count, 1)[:, None, None]) @ _adjoint(A)
             found[id(block)] = block.with_noise(_lifted(noise), float(np.median(count)))
     return [found[id(block)] for block in blocks]
 
@@ -100,9 +88,8 @@ class _Shape(NamedTuple):
         S = (1 - share)[:, None, None] * self.S[right - 1] + share[:, None, None] * self.S[right]
         return S, (1 - share)[:, None] * self.d[right - 1] + share[:, None] * self.d[right]
 
-    def factor(self, omega: np.ndarray, model: FrequencyModel | None) -> np.ndarray:
+    def factor(self, omega: np.ndarray, model: FrequencyModel) -> np.ndarray:
         """(n, n_y, n_y) Cholesky factor of C_0."""
-        assert model is not None
         S, d = self.at(omega)
         G = _floor_response(model, omega)
         return np.linalg.cholesky(_lifted(G @ S @ _adjoint(G) + d[:, :, None] * np.eye(d.shape[1])))
@@ -186,10 +173,3 @@ def _lifted(noise: np.ndarray) -> np.ndarray:
     size = np.real(np.einsum("nii->ni", noise))
     n_y = noise.shape[-1]
     return noise + 1e-9 * size[:, :, None] * np.eye(n_y) + 1e-30 * np.eye(n_y) * (size.max() or 1.0)
-
-
-def _smoothed(power: np.ndarray, width: int) -> np.ndarray:
-    """(n, n_y) running mean over lines."""
-    kernel = np.ones(width) / width
-    padded = np.pad(power, ((width // 2, width - 1 - width // 2), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, kernel, mode="valid") for column in padded.T], axis=1)

@@ -51,14 +51,10 @@ class ResponseOverlay(MeasuredOverlay):
     Attributes
     ----------
     start, model : (n, n_y, n_u) complex.
-    model_magnitude_std, model_phase_std : (n, n_y, n_u) of the identified model's magnitude and phase [rad], from the
-        covariance of its parameters; 1.96 of them to each side hold 95 %.
     """
 
     start: np.ndarray
     model: np.ndarray
-    model_magnitude_std: np.ndarray
-    model_phase_std: np.ndarray
 
     @property
     def inside(self) -> float:
@@ -68,8 +64,7 @@ class ResponseOverlay(MeasuredOverlay):
         return float(np.mean(np.abs(self.measured - self.model) ** 2 < -2 * np.log(0.05) * self.measured_std ** 2))
 
 
-def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseModel, covariance: np.ndarray
-            ) -> ResponseOverlay:
+def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseModel) -> ResponseOverlay:
     """Plain arrays for figures at the response's own frequencies, on the lines where it is known.
 
     Raises
@@ -83,17 +78,11 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
         measured = measured.at(np.all(measured.spanned(np.eye(len(measured.inputs))), axis=1))
     rows = places(model.sensors.names, measured.outputs, "the response has", "outputs")
     U = np.broadcast_to(V.astype(complex), (len(measured.omega), *V.shape))
-    found = model.driven(measured.omega, U)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # d log G = d|G| / |G| + j d phase
-        relative = found.dY / found.Y
-    spread = [np.sqrt(np.einsum("pkij,pq,qkij->kij", part, covariance, part, optimize=True))
-              for part in (relative.real, relative.imag)]
     return ResponseOverlay(
         measured.frequency_Hz, measured.inputs, model.sensors.names,
         f"{measured.output_unit} per {measured.input_unit}", measured.value[:, rows],
         measured.standard_deviation[:, rows] / np.sqrt(2), measured.method,
-        start.driven(measured.omega, U, False).Y, found.Y, spread[0] * np.abs(found.Y), spread[1])
+        start.driven(measured.omega, U, False).Y, model.driven(measured.omega, U, False).Y)
 
 
 def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tuple[FrequencyResponse, np.ndarray]:

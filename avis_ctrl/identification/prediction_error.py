@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitener
+from avis_ctrl.identification.maximum_likelihood import as_real, block_residual, whitened, whitener
 from avis_ctrl.identification.response import FrequencyModel
 from avis_ctrl.identification.spectra import span, transient_columns
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -78,23 +78,16 @@ def prediction_error(model: FrequencyModel, block: SpectralBlock, derivative: bo
     ------
     InputError : a noise covariance that is missing or singular.
     """
-    L = whitener(block)
-    n, n_y, m = block.Y.shape
-    found = model.answer(block, None, derivative)
-    plain = block.Y - found.Y
-    e = as_real(whitened(L, plain)[None])[0]
-    J = as_real(whitened(L, found.dY)) if derivative else np.empty((0, e.size))
+    L, (n, n_y, m) = whitener(block), block.Y.shape
+    _, J, left = block_residual(model, block, L, derivative=derivative)
     lost, rank = np.zeros(n_y), 0
     if block.transient:
         columns, _ = transient_columns(block, model)
         basis, _ = span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
-        rank = basis.shape[1]
-        e, J = e - basis @ (basis.T @ e), J - (J @ basis) @ basis.T
-        lost = _lost(L, basis, block)
-    error = np.linalg.solve(L, _complex(e, (n, n_y, m)).swapaxes(1, 2)[..., None])[..., 0].swapaxes(1, 2) if m > 1 \
-        else np.linalg.solve(L[:, 0], _complex(e, (n, n_y, m)))
-    return PredictionError(block, plain, error, _complex(e, (n, n_y, m)) / np.sqrt(2),
-                           _complex(J, (n, n_y, m)) / np.sqrt(2), 2 * n * n_y * m - rank, 2 * n * m - lost)
+        rank, lost = basis.shape[1], _lost(L, basis, block)
+    slopes = _complex(J, (n, n_y, m)) / np.sqrt(2) if derivative else np.empty((0, n, n_y, m), complex)
+    return PredictionError(block, left.error + left.transient, left.error, left.white, slopes, 2 * n * n_y * m - rank,
+                           2 * n * m - lost)
 
 
 def _lost(L: np.ndarray, basis: np.ndarray, block: SpectralBlock) -> np.ndarray:

@@ -9,6 +9,7 @@ from one sample to the next, as the simulator does it (`simulation.kernel`).
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +17,10 @@ import scipy.linalg as la
 
 from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.large_motion import March, arrays_of, march, march_linear, sensors_of
-from avis_ctrl.identification.response import FLOOR, ResponseModel, SensorModel
+from avis_ctrl.identification.large_motion import March, march, march_linear, sensors_of
+from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.measurement.campaign import Record
+from avis_ctrl.rigs.nonlinear import rig_arrays
 
 
 class Continuous(NamedTuple):
@@ -31,19 +33,29 @@ class Continuous(NamedTuple):
     D: np.ndarray
 
 
+# States of the table: q, q', displacement of the floor. How often each motion is integrated from an acceleration.
+TABLE, INTEGRATIONS = 15, {"displacement": 2, "velocity": 1, "acceleration": 0}
+
+
+def _body(model: ResponseModel) -> np.ndarray:
+    """(6, 15 + n_u + 3): acceleration of the payload by the states of the table, by volts and by floor velocity."""
+    m = model.matrices
+    return la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
+
+
 def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
     """States q, q', displacement of the floor, and those of each sensor's chain (and of each amplifier).
 
     beside : with inputs e, whose readings add integrators in front of the chains as states behind the amplifiers.
     """
-    m, n_u, rows = model.matrices, len(model.actuators), model.matrices.R
-    body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
+    n_u, rows, body = len(model.actuators), model.matrices.R, _body(model)
     sensors, gains = model.sensors.realised, model.sensors.sensitivity
-    n_y, own = len(rows), chain_states(sensors)
+    n_y, own = len(rows), _slices(TABLE, (0 if chain is None else chain.nstates for chain in sensors.chains))
     corner = 2 * np.pi * model.amplifier_corner_Hz if model.amplifier_corner_Hz else None
     n_a = n_u if corner else 0
-    plain = (own[-1].stop if own else 15) + n_a
-    integrators = integrator_states(sensors, plain) if beside else [slice(plain, plain)] * n_y
+    plain = (own[-1].stop if own else TABLE) + n_a
+    # Those that make a sensor's motion of an acceleration.
+    integrators = _slices(plain, (INTEGRATIONS[motion] * beside for motion in sensors.motions))
     size, n_in, n_e = max(plain, *(one.stop for one in integrators)), n_u + 3, 6 + n_y if beside else 0
     amplifiers, volts = slice(plain - n_a, plain), slice(0, n_u)
     A, B = np.zeros((size, size)), np.zeros((size, n_in + n_e))
@@ -84,16 +96,9 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
     return Continuous(A, B, C, D)
 
 
-def chain_states(sensors: SensorModel) -> list[slice]:
-    """Of each sensor's chain, behind the 15 states of the table."""
-    ends = 15 + np.cumsum([0, *(0 if chain is None else chain.nstates for chain in sensors.chains)])
-    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-
-
-def integrator_states(sensors: SensorModel, first: int) -> list[slice]:
-    """Of each sensor, those that make its motion of an acceleration, from index `first` on."""
-    ends = first + np.cumsum([0, *({"displacement": 2, "velocity": 1, "acceleration": 0}[one]
-                                   for one in sensors.motions)])
+def _slices(first: int, sizes: Iterable[int]) -> list[slice]:
+    """Of states that stand one after the other, from index `first` on."""
+    ends = first + np.cumsum([0, *sizes])
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
@@ -126,19 +131,19 @@ class Predictor:
         self.table: March | None = None
         if large_motion:
             held, rising = (np.ascontiguousarray(step[:, n_u + 3:]) for step in whole_step[1:])
-            self.table, self.arrays = self._march(held, rising), arrays_of(model.rig)
+            self.table, self.arrays = self._march(held, rising), rig_arrays(model.rig.mounted_body())
             self.before, self.started = np.zeros(6 + len(model.sensors.names)), False
 
     def _march(self, held: np.ndarray, rising: np.ndarray) -> March:
         model, m = self.model, self.model.matrices
         n_u, corner = len(model.actuators), model.amplifier_corner_Hz
         known = [one.name for one in model.rig.mounted_body().actuators]
-        first = chain_states(model.sensors.realised)[-1].stop if corner else -1
-        body = la.solve(m.M, np.hstack([-m.K, -m.C, m.K_floor[:, :3], m.T, m.C_floor[:, :3]]))
+        chains = sum(0 if chain is None else chain.nstates for chain in model.sensors.realised.chains)
         of_x, of_volts, of_floor = (np.ascontiguousarray(one) for one in
-                                    (body[:, :15], body[:, 15:15 + n_u], body[:, 15 + n_u:]))
+                                    np.split(_body(model), [TABLE, TABLE + n_u], axis=1))
         place, direction = sensors_of(model.rig, model.sensors.names)
-        return March(np.ascontiguousarray(self.Phi), held, rising, of_x, of_volts, of_floor, first,
+        return March(np.ascontiguousarray(self.Phi), held, rising, of_x, of_volts, of_floor,
+                     TABLE + chains if corner else -1,
                      np.array([known.index(name) for name in model.actuators], np.int64),
                      np.ascontiguousarray(la.inv(m.M)), place, direction, float(model.turning.motors),
                      float(model.turning.sensors))

@@ -13,43 +13,33 @@ filtered data obey the unfiltered model. The chain's inverse is discretised by T
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.signal as signal
 
-from avis_ctrl.checks import places
+from avis_ctrl.checks import places, require, require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.rigs.rig import Rig
 
 
-@dataclass(frozen=True)
-class SensorInverse:
+class SensorInverse(NamedTuple):
     """(s - zeros) / (s - poles) / gain, from the measured quantity to the motion that the model measures.
 
-    gain : (n_y,) of each channel. poles lie at zero or in the open left half plane.
+    gain : (n_y,) of each channel. poles lie at zero or in the open left half plane. low_pass : poles of the anti-alias
+    filter, which no proper filter undoes: u passes it, too.
     """
 
     motion: str
     zeros: np.ndarray
     poles: np.ndarray
     gain: np.ndarray
+    low_pass: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Filtered:
-    """u (n, n_u) V, delayed as the actuators see it; y (n, n_y) m/s (or m); start: samples dropped at the front."""
-
-    u: np.ndarray
-    y: np.ndarray
-    start: int
-
-
-def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bool = True) -> SensorInverse:
+def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str) -> SensorInverse:
     """How the records of a rig become velocity, or displacement where they are in m.
-
-    undo_chain=False divides by the passband gain only, as the source does.
 
     Raises
     ------
@@ -61,7 +51,7 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bo
     plain = {"m": ("displacement", none), "m/s": ("velocity", none), "m/s^2": ("velocity", np.zeros(1, complex))}
     if unit in plain:
         motion, poles = plain[unit]
-        return SensorInverse(motion, none, poles, one)
+        return SensorInverse(motion, none, poles, one, none)
     if unit != "V":
         raise InputError("expected V, m, m/s or m/s^2", field="unit of y", value=unit)
     sensors = [one for name in y_names for one in rig.sensors() if one.name == name]
@@ -69,51 +59,45 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str, undo_chain: bo
     if len(kinds) != 1 or not sensors[0].inertial:
         raise InputError("expected geophones or accelerometers of one kind: the filter inverts a single sensor chain",
                          field="y names", value=list(y_names))
-    # Of the chain's poles and zeros alone; without them, in the passband.
-    gain = np.array([one.gain * (one.leading if undo_chain else 1.0) for one in sensors])
-    chain = np.array(sensors[0].poles, complex) if undo_chain else none
     # Velocity is the voltage over the chain: of an accelerometer its zero at rest and the integration.
-    at_rest = len(sensors[0].zeros) if undo_chain else 0
-    integration = 1 if sensors[0].quantity == "acceleration" else 0
-    return SensorInverse("velocity", chain, np.zeros(at_rest + integration, complex), gain)
+    first = sensors[0]
+    at_rest = len(first.zeros) + (first.quantity == "acceleration")
+    own = np.array([pole for pole in first.poles if pole not in first.low_pass], complex)
+    return SensorInverse("velocity", own, np.zeros(at_rest, complex), np.array([one.gain for one in sensors]),
+                         np.array(first.low_pass, complex))
 
 
-def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz: float = 1.0, order: int = 6,
-              settle_s: float = 0.0) -> Filtered:
-    """High-pass u and y of a record, y as motion, u delayed.
+def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz: float = 1.0, order: int = 6
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """u (n, n_u) V, delayed as the actuators see it, and y (n, n_y) as motion, both behind a high-pass.
 
     Parameters
     ----------
-    delay_s : loop delay. A part of a sample is met by the mean of the voltages held during the sample, which leaves
-        the force impulse of each sample exact.
+    record : from rest. delay_s : loop delay. A part of a sample is met by the mean of the voltages held during the
+        sample, which leaves the force impulse of each sample exact.
     corner_Hz, order : Butterworth, by the bilinear map with its corner prewarped.
-    settle_s : seconds dropped at the front, for records that do not start at rest: their start passes the high-pass
-        as a transient that is not a motion of the model.
 
     Raises
     ------
-    InputError : an order that leaves the inverse unstable, a corner beyond half the sample rate, nothing left.
+    InputError : an order that leaves the inverse unstable, a corner beyond half the sample rate.
     """
     rate = record.header.sample_rate_Hz
     at_rest = int(np.count_nonzero(inverse.poles == 0))
     if not (isinstance(order, int) and at_rest < order <= 12):
         raise InputError(f"expected a whole number from {at_rest + 1} to 12", field="highpass_order", value=order)
-    if not 0 < corner_Hz < rate / 2:
-        raise InputError(f"expected a frequency in Hz between 0 and half the sample rate, {rate / 2:g}",
-                         field="highpass_Hz", value=corner_Hz)
-    if not (np.isfinite(delay_s) and delay_s >= 0):
-        raise InputError("expected a delay in s, zero or positive", field="loop_delay_s", value=delay_s)
-    start = round(settle_s * rate)
-    if not 0 <= start < record.header.samples - 2:
-        raise InputError(f"expected seconds, less than the record's {record.header.duration_s:g}", field="settle_s",
-                         value=settle_s)
+    require(corner_Hz, "highpass_Hz", 0, rate / 2)
+    require_positive(delay_s, "loop_delay_s", zero_allowed=True)
     zeros, poles, gain = signal.butter(order, corner_Hz, "highpass", fs=rate, output="zpk")
-    u = signal.sosfilt(signal.zpk2sos(zeros, poles, gain), delayed(record.u, delay_s * rate), axis=0)
-    z, p, k = _tustin(inverse, rate)
-    # Poles at z = 1 of the inverse cancel zeros of the high-pass.
-    sections = signal.zpk2sos(np.concatenate([zeros[at_rest:], z]), np.concatenate([poles, p[p != 1.0]]), gain * k)
-    y = signal.sosfilt(sections, record.y / inverse.gain, axis=0)
-    return Filtered(np.ascontiguousarray(u[start:]), np.ascontiguousarray(y[start:]), start)
+
+    def filtered(samples: np.ndarray, of: np.ndarray, by: np.ndarray, k: float) -> np.ndarray:
+        """Behind the high-pass and k (s - of) / (s - by); poles at z = 1 cancel zeros of the high-pass."""
+        z, p, k = signal.bilinear_zpk(of, by, k, rate)
+        cancelled = int(np.count_nonzero(by == 0))
+        sections = signal.zpk2sos([*zeros[cancelled:], *z], [*poles, *p[by != 0]], gain * k)
+        return signal.sosfilt(sections, samples, axis=0)
+    u = filtered(delayed(record.u, delay_s * rate), np.zeros(0), inverse.low_pass,
+                 float(np.prod(-inverse.low_pass).real))
+    return u, filtered(record.y / inverse.gain, inverse.zeros, inverse.poles, 1.0)
 
 
 def delayed(u: np.ndarray, samples: float) -> np.ndarray:
@@ -124,13 +108,3 @@ def delayed(u: np.ndarray, samples: float) -> np.ndarray:
     def shifted(by: int) -> np.ndarray:
         return np.vstack([np.zeros((min(by, len(u)), u.shape[1])), u[:max(len(u) - by, 0)]])
     return shifted(whole) if part < 1e-9 else (1 - part) * shifted(whole) + part * shifted(whole + 1)
-
-
-def _tustin(inverse: SensorInverse, rate: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Zeros, poles and gain in z of the inverse without its channels' gains."""
-    def mapped(roots: np.ndarray) -> np.ndarray:
-        return (2 * rate + roots) / (2 * rate - roots)
-    excess = len(inverse.poles) - len(inverse.zeros)
-    gain = np.real(np.prod(2 * rate - inverse.zeros) / np.prod(2 * rate - inverse.poles))
-    zeros = np.concatenate([mapped(inverse.zeros), -np.ones(max(excess, 0))])
-    return zeros, np.where(inverse.poles == 0, 1.0, mapped(inverse.poles)), float(gain)

@@ -14,6 +14,8 @@ import math
 from fractions import Fraction
 
 import numpy as np
+import scipy.linalg as la
+from scipy.sparse.csgraph import connected_components
 
 _MOST_CIRCUITS = 3000
 
@@ -24,35 +26,20 @@ def reduced_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
     Entries below the tolerance of their row's largest are zero.
     """
     rows = np.array(basis, float).T
-    n_rows = len(rows)
-    pivots: list[int] = []
-    for k in range(n_rows):
-        size = np.abs(rows[k:])
-        size[:, pivots] = 0.0
-        i, j = np.unravel_index(np.argmax(size), size.shape)
-        if size[i, j] == 0:
-            rows = rows[:k]
-            break
-        swapped = k + int(i)
-        rows[[k, swapped]] = rows[[swapped, k]]
-        rows[k] /= rows[k, j]
-        others = [m for m in range(n_rows) if m != k]
-        rows[others] -= np.outer(rows[others, j], rows[k])
-        pivots.append(int(j))
-    return _cleaned(rows, tolerance)
+    _, R, order = la.qr(rows, mode="economic", pivoting=True)
+    size = np.abs(np.diag(R))
+    rank = int(np.count_nonzero(size > len(order) * np.finfo(float).eps * np.max(size, initial=0.0)))
+    found = np.zeros((rank, rows.shape[1]))
+    found[:, order] = la.solve_triangular(R[:rank, :rank], R[:rank])
+    return _cleaned(found, tolerance)
 
 
 def components(rows: np.ndarray) -> list[tuple[list[int], list[int]]]:
     """Parts that share no column: (rows, columns) of each, columns ascending, parts by their first column."""
-    parts: list[tuple[set[int], set[int]]] = []
-    for i, row in enumerate(rows):
-        merged, columns = {i}, set(np.flatnonzero(row).tolist())
-        for part in [one for one in parts if one[1] & columns]:
-            parts.remove(part)
-            merged |= part[0]
-            columns |= part[1]
-        parts.append((merged, columns))
-    return sorted(((sorted(i), sorted(j)) for i, j in parts), key=lambda part: part[1])
+    count, of = connected_components((rows != 0).astype(int) @ (rows != 0).T.astype(int), directed=False)
+    parts = [np.flatnonzero(of == k) for k in range(count)]
+    return sorted(((part.tolist(), np.flatnonzero(np.any(rows[part], axis=0)).tolist()) for part in parts),
+                  key=lambda part: part[1])
 
 
 def sparse_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:

@@ -84,8 +84,8 @@ def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], firs
     chi2 = (cost + float(known @ one.z ** 2)) * dof / fitted
     residuals = tuple(block_residual(model, block, whitener(block), derivative=False)[2] for block in blocks)
     return LikelihoodFit(model, information, chi2, dof, first.iterations + one.iterations,
-                         bool(step @ (g - one.z) < settings.converged * len(one.white.e)), first.history, residuals,
-                         first.starts, _with_prior(one.priors, ~found.flat))
+                         bool(step @ (g - one.z) < settings.converged * len(one.white.e)), residuals, first.starts,
+                         _with_prior(one.priors, ~found.flat))
 
 
 def _with_prior(priors: Priors, which: np.ndarray) -> dict[str, Prior]:

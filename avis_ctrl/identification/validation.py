@@ -8,7 +8,7 @@ them, or in none). The local polynomial model's covariance gives a second figure
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +92,6 @@ class Validation:
     outputs, band_Hz : of all figures. held_out : one a record, or piece of a long one.
     overlay : measured and model responses for figures, of all records; None where they allow none.
     modes : the model's beside the start's and those measured in the held-out data without the rig's equations.
-    mode_note : where the measured ones come from, or why there are none.
     verdict : one sentence with the numbers. sentences : the verdict, whiteness, time, modes and responses in words.
     notes : what was used, and what could not be computed.
     """
@@ -102,7 +101,6 @@ class Validation:
     held_out: tuple[HeldOut, ...]
     overlay: ResponseOverlay | None
     modes: tuple[ModeRow, ...]
-    mode_note: str
     verdict: str
     sentences: tuple[str, ...]
     notes: tuple[str, ...]
@@ -113,27 +111,16 @@ class Validation:
         return all(one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for a file, without the arrays of figures."""
-        return {"verdict": self.verdict, "passed": self.passed, "sentences": list(self.sentences),
-                "notes": list(self.notes), "outputs": list(self.outputs), "band_Hz": list(self.band_Hz),
-                "held_out": [_plain(one) for one in self.held_out],
-                "modes": [{f.name: _number(getattr(row, f.name)) for f in fields(row)} for row in self.modes]}
+        """Values for a file, without the arrays of figures."""
+        return {"verdict": self.verdict, "passed": self.passed, "sentences": self.sentences, "notes": self.notes,
+                "outputs": self.outputs, "band_Hz": self.band_Hz, "modes": [vars(row) for row in self.modes],
+                "held_out": [_without_figures(one) for one in self.held_out]}
 
 
-def _plain(one: HeldOut) -> dict[str, Any]:
-    found = {f.name: _number(getattr(one, f.name)) for f in fields(one) if f.name != "whiteness"}
-    if one.whiteness is not None:
-        found["whiteness"] = {"white": one.whiteness.white, "sentences": list(one.whiteness.sentences)}
-    return found
-
-
-def _number(value: Any) -> Any:
-    """Arrays as lists; what is not a number as None, which JSON knows."""
-    if isinstance(value, np.ndarray):
-        return [_number(one) for one in value.tolist()]
-    if isinstance(value, (tuple, list)):
-        return [_number(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _without_figures(one: HeldOut) -> dict[str, Any]:
+    found = dict(vars(one))
+    white = found.pop("whiteness")
+    return found if white is None else found | {"whiteness": {"white": white.white, "sentences": white.sentences}}
 
 
 def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse
@@ -155,7 +142,7 @@ def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     drawn = _overlay(found, fitted, held_out, notes)
     verdict = verdict_of(figures)
     said = (verdict, *_sentences(figures), *_mode_sentence(modes), mode_note, *_overlay_sentence(drawn))
-    return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, mode_note, verdict,
+    return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, verdict,
                       said, tuple(notes))
 
 
@@ -320,8 +307,7 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     else:
         data = held_out
     try:
-        return overlay(measured_response(data, found.band_Hz, found.fit.model), found.fit.model, found.start,
-                       found.fit.information.covariance)
+        return overlay(measured_response(data, found.band_Hz, found.fit.model), found.fit.model, found.start)
     except AvisError as failed:
         notes.append(f"no measured response to draw ({failed})")
         return None

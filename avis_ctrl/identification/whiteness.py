@@ -64,16 +64,9 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False)
 class Whiteness:
-    """The three kinds; with_inputs is None where no input is driven. sentences : one each."""
+    """correlations : over frequency, over time and, where an input is driven, with the inputs. sentences : one each."""
 
-    over_frequency: Correlation
-    over_time: Correlation
-    with_inputs: Correlation | None
-
-    @property
-    def correlations(self) -> tuple[Correlation, ...]:
-        found = (self.over_frequency, self.over_time, self.with_inputs)
-        return tuple(one for one in found if one is not None)
+    correlations: tuple[Correlation, ...]
 
     @property
     def white(self) -> bool:
@@ -105,10 +98,11 @@ def whiteness(error: PredictionError, outputs: Sequence[str], inputs: Sequence[s
     tests = n_y * (lines + steps + len(driven) * len(lags))
     level = -np.log(-np.expm1(np.log1p(-FAMILY / families) / tests))
     step = 2 * np.pi / (omega[-1] - omega[0])
-    over_frequency = _over_frequency(error, outputs, lines, level)
-    over_time = _over_time(error, outputs, np.arange(1, steps + 1) * step, level, noise_lines)
-    return Whiteness(over_frequency, over_time, _with_inputs(error, outputs, inputs, driven, lags * step, level,
-                                                             covariance) if driven.size else None)
+    found = [_over_frequency(error, outputs, lines, level),
+             _over_time(error, outputs, np.arange(1, steps + 1) * step, level, noise_lines)]
+    if driven.size:
+        found.append(_with_inputs(error, outputs, inputs, driven, lags * step, level, covariance))
+    return Whiteness(tuple(found))
 
 
 def _over_frequency(error: PredictionError, outputs: Sequence[str], lines: int, level: float) -> Correlation:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -81,6 +81,10 @@ class RecordHeader:
             raise InputError(f"expected a whole number of samples; at {self.sample_rate_Hz:g} Hz it is {count:.6g}",
                              field=field, value=period_s)
 
+    def part(self, start: int, stop: int) -> RecordHeader:
+        """Of samples start .. stop."""
+        return replace(self, samples=stop - start, start_s=self.start_s + start / self.sample_rate_Hz)
+
     @property
     def duration_s(self) -> float:
         return self.samples / self.sample_rate_Hz
@@ -106,6 +110,15 @@ def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
     for start in range(0, max(samples - 1, 1), longest):
         left = samples - start
         yield start, samples if left <= longest + 1 else start + longest
+
+
+def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: int = 0) -> None:
+    """Refuse NaN and Inf in (samples, channels), saying where: sample number counted from the start of the record."""
+    good = np.isfinite(array)
+    if not good.all():
+        row, column = np.argwhere(~good)[0]
+        raise InputError(f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at sample "
+                         f"{start + row} of channel {names[column]}", field=field, value=float(array[row, column]))
 
 
 class RecordSource(ABC):
@@ -157,12 +170,7 @@ class Record(RecordSource):
             if array.shape != (h.samples, len(names)):
                 raise InputError(f"expected shape {(h.samples, len(names))}: {h.samples} samples of {len(names)} "
                                  "channels", field=f"record {h.name}: {field}", value=array.shape)
-            if not np.all(np.isfinite(array)):
-                row, column = np.argwhere(~np.isfinite(array))[0]
-                raise InputError("expected finite numbers; NaN or infinite: "
-                                 f"{np.count_nonzero(~np.isfinite(array))}, the first at sample {row} "
-                                 f"of channel {names[column]}", field=f"record {h.name}: {field}",
-                                 value=float(array[row, column]))
+            require_finite(array, names, f"record {h.name}: {field}")
             object.__setattr__(self, field, array)
         if self.floor is None and h.floor_names:
             raise InputError("floor channels are named but there are no floor samples", field=f"record {h.name}: floor")
@@ -176,9 +184,7 @@ class Record(RecordSource):
         stop = self.header.samples if stop is None else stop
         if (start, stop) == (0, self.header.samples):
             return self
-        header = replace(self.header, samples=stop - start,
-                         start_s=self.header.start_s + start / self.header.sample_rate_Hz)
-        return Record(header, self.u[start:stop], self.y[start:stop],
+        return Record(self.header.part(start, stop), self.u[start:stop], self.y[start:stop],
                       None if self.floor is None else self.floor[start:stop])
 
 
@@ -186,9 +192,8 @@ class Portion(RecordSource):
     """Samples start .. stop of another record, still where they lie."""
 
     def __init__(self, whole: RecordSource, start: int, stop: int):
-        h = whole.header
         self.whole, self.start, self.stop = whole, start, stop
-        self.header = replace(h, samples=stop - start, start_s=h.start_s + start / h.sample_rate_Hz)
+        self.header = whole.header.part(start, stop)
 
     def load(self, start: int = 0, stop: int | None = None) -> Record:
         stop = self.header.samples if stop is None else stop

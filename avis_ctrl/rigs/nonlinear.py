@@ -63,8 +63,12 @@ def rig_arrays(body: MountedBody) -> RigArrays:
 
 
 @njit(cache=True)
-def _rotation(angles):
-    """Body to earth axes, eq. 2.4; element by element as `rotation_matrix`."""
+def rotation(angles):
+    """Body to earth axes for the 3-2-1 angles (phi_x, phi_y, phi_z) [rad], (3, 3): R3(phi_z) R2(phi_y) R1(phi_x).
+
+    The matrix of Rademakers' eq. 2.4. His eq. 2.3 reads as if it took earth to body axes; it takes the components of a
+    vector from body to earth axes.
+    """
     c1, c2, c3 = np.cos(angles[0]), np.cos(angles[1]), np.cos(angles[2])
     s1, s2, s3 = np.sin(angles[0]), np.sin(angles[1]), np.sin(angles[2])
     R = np.empty((3, 3), angles.dtype)
@@ -82,8 +86,11 @@ def _cross(out, a, b):
 
 
 @njit(cache=True)
-def _body_rates(omega, angles, rates):
-    """Angular velocity in body axes, eq. 2.5."""
+def body_rates(omega, angles, rates):
+    """Angular velocity in body axes, from angles' (Rademakers, eq. 2.5).
+
+    The source says that eq. 2.5 is "with respect to" the earth frame; its components are in body axes.
+    """
     c1, s1, c2, s2 = np.cos(angles[0]), np.sin(angles[0]), np.cos(angles[1]), np.sin(angles[1])
     omega[0] = rates[0] - s2 * rates[2]
     omega[1] = c1 * rates[1] + s1 * c2 * rates[2]
@@ -117,8 +124,8 @@ def _add_force(wrench, arm, R, force):
 @njit(cache=True)
 def _mount_wrench(wrench, R, omega, q, q_dot, q_ch, q_ch_dot, arrays):
     """Springs and dampers of eqs. 2.15-2.16, in body axes about the reference point."""
-    R_ch, omega_ch = _rotation(q_ch[3:]), np.empty_like(omega)
-    _body_rates(omega_ch, q_ch[3:], q_ch_dot[3:])
+    R_ch, omega_ch = rotation(q_ch[3:]), np.empty_like(omega)
+    body_rates(omega_ch, q_ch[3:], q_ch_dot[3:])
     place, speed, place_ch, speed_ch = (np.empty_like(omega), np.empty_like(omega), np.empty_like(omega),
                                         np.empty_like(omega))
     force = np.empty_like(omega)
@@ -201,9 +208,9 @@ def payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, arrays):
     complex-step Jacobians).
     Singular at phi_y = +-90 degrees, as every set of 3-2-1 angles is.
     """
-    R = _rotation(q[3:])
+    R = rotation(q[3:])
     omega = np.empty_like(q[3:])
-    _body_rates(omega, q[3:], q_dot[3:])
+    body_rates(omega, q[3:], q_dot[3:])
     wrench = np.zeros_like(q)
     _mount_wrench(wrench, R, omega, q, q_dot, q_ch, q_ch_dot, arrays)
     _generalised_wrench(wrench, R, q, q_dot, q_ch, q_ch_dot, arrays)

@@ -42,27 +42,6 @@ def tilt_row(direction: ArrayLike) -> np.ndarray:
     return GRAVITY * np.array([0.0, 0.0, 0.0, y, -x, 0.0])
 
 
-def rotation_matrix(angles: ArrayLike) -> np.ndarray:
-    """Body to earth axes for the 3-2-1 angles (phi_x, phi_y, phi_z) [rad], (3, 3).
-
-    R = R3(phi_z) R2(phi_y) R1(phi_x), the matrix of Rademakers' eq. 2.4. His eq. 2.3 reads as if it
-    took earth to body axes; it takes the components of a vector from body to earth axes.
-    """
-    (c1, c2, c3), (s1, s2, s3) = np.cos(angles), np.sin(angles)
-    return np.array([[c3 * c2, s1 * s2 * c3 - c1 * s3, c1 * s2 * c3 + s1 * s3],
-                     [s3 * c2, s1 * s2 * s3 + c1 * c3, c1 * s2 * s3 - s1 * c3],
-                     [-s2, s1 * c2, c1 * c2]])
-
-
-def body_rate_map(angles: ArrayLike) -> np.ndarray:
-    """W, (3, 3), with angular velocity in body axes = W(angles) angles' (Rademakers, eq. 2.5).
-
-    The source says that eq. 2.5 is "with respect to" the earth frame; its components are in body axes.
-    """
-    (c1, c2, _), (s1, s2, _) = np.cos(angles), np.sin(angles)
-    return np.array([[1.0, 0.0, -s2], [0.0, c1, s1 * c2], [0.0, -s1, c1 * c2]])
-
-
 @dataclass(frozen=True)
 class Modes:
     """Undamped natural frequencies [Hz], ascending, and mass-normalised shapes (columns).

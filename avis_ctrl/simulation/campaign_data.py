@@ -176,7 +176,7 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
         raise InputError(f"expected at least two periods of {m.period_s:g} s: the first contains the transient",
                          field="duration_s", value=samples / fs)
     return multisine(MultisineSettings(names, fs, m.period_s, (low, high), limit_V, None, m.lines, m.spacing,
-                                       m.group, m.scheme, one.records, dealt, None, m.compensate_hold, m.low_crest,
+                                       m.group, m.scheme, one.records, dealt, m.compensate_hold, m.low_crest,
                                        seed))
 
 
@@ -191,7 +191,7 @@ def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -
     On the rig as its file has it; RANGE_SHARE of the converter's range is for the answer to the drives. Where there is
     no converter, ASSUMED_RANGE_V stands for its range.
     """
-    most = signals.scaled_to_limit()
+    most = signals.scaled_to()
     level, range_V = float(np.mean(most.rms_V)), ASSUMED_RANGE_V
     if loop.sensors.converter is not None:
         range_V = loop.sensors.converter.limits_V[1]

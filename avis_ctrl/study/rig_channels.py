@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign
-from avis_ctrl.measurement.formats.flat import UNNAMED, with_header
+from avis_ctrl.measurement.formats.records import UNNAMED, with_header
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.rig import Rig
 

@@ -15,7 +15,7 @@ from avis_ctrl.identification.experiment_plan import (
     predicted,
 )
 from avis_ctrl.identification.experiments import (
-    AddedSensor,
+    Added,
     Drive,
     Noise,
     changed,
@@ -28,7 +28,7 @@ from avis_ctrl.rigs.rigid_body import cross_matrix
 MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
 BODY = ["mass", "J1", "J2", "J3"]
 CORNER = (0.4, 0.3, 0.1)
-NOISE = Noise(1e-3)
+NOISE = Noise(np.array([1.0]), 1e-6 * np.eye(6)[None])
 DRIVE = Drive(0.3, 60.0)
 
 
@@ -67,7 +67,7 @@ def test_the_added_mass_is_that_of_a_body_with_it(avis):
 
 def test_derivatives_of_a_changed_rig(avis):
     model = ResponseModel.of(avis, ["mass", "J1", "isolator1.k_x", "actuator.Ay1", "sensor.Sy1"])
-    new = AddedSensor("new", (0.0, 0.1, 0.2), (1.0, 0.0, 0.0))
+    new = Added("new", (0.0, 0.1, 0.2), (1.0, 0.0, 0.0))
     other = changed(model, {"isolator1.p_z": 0.05}, [(50.0, CORNER)], [new])
     omega = np.linspace(5, 100, 7)
     U = np.broadcast_to(np.eye(11, dtype=complex), (7, 11, 11))
@@ -126,7 +126,7 @@ def test_sentences_and_the_plan(avis):
     longer = Experiment("Record twice as long", DRIVE)
     bench = Experiment("Measure isolator1.k_x", bench={"isolator1.k_x": 0.02})
     raised = Experiment("Raise 1 and 3", DRIVE,
-                        lambda m: changed(m, {"isolator1.p_z": 0.05, "isolator3.p_z": 0.05}))
+                        {"shifts": {"isolator1.p_z": 0.05, "isolator3.p_z": 0.05}})
     added = predicted(model, [longer, bench, raised], NOISE)
     ranked = compared(now, added)
     assert [one.experiment for one in ranked] == [raised, bench, longer]

@@ -11,7 +11,7 @@ from scipy.stats import chi2 as chi2_law
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification import campaign_fit
 from avis_ctrl.identification.maximum_likelihood import SETTINGS, fit, whitened_real
-from avis_ctrl.identification.noise import relative_noise, residual_noise
+from avis_ctrl.identification.noise import noise_from_residuals, relative_noise
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import DEPENDENT, record_block, response_block, span
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -228,7 +228,7 @@ def test_records_of_a_rig_with_floor_motion(avis):
     blocks = relative_noise([record_block(one, model, (0.5, 60.0)) for one in records])
     for _ in range(3):
         found = fit(model, blocks)
-        model, blocks = found.model, residual_noise(found.residuals)
+        model, blocks = found.model, noise_from_residuals(found.residuals, blocks, found.model)
     found = fit(model, blocks)
     sigma, V = found.information.directions
     z = (V.T @ ((found.values - true.values) / found.information.scale) / sigma)[:20]

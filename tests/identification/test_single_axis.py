@@ -36,7 +36,7 @@ def test_stated_deviations_are_those_of_repeated_experiments(rng):
     found, stated, white = [], [], []
     for _ in range(400):
         X = np.column_stack([coloured(rng, 2000, 0.9), np.ones(2000)])
-        fit = regression("", ("a", "b"), ("", ""), X, X @ (2.0, 1.0) + coloured(rng, 2000, 0.9), np.arange(2000.0))
+        fit = regression("", {"a": "", "b": ""}, X, X @ (2.0, 1.0) + coloured(rng, 2000, 0.9), np.arange(2000.0))
         found.append(fit.values)
         stated.append(np.diag(fit.covariance))
         white.append(fit.information.standard_deviation ** 2)
@@ -53,8 +53,8 @@ def test_instruments_undo_the_bias_of_noisy_regressors(rng):
     clean = coloured(rng, n, 0.5)
     y = 3.0 * clean
     seen = (clean + rng.standard_normal(n))[:, None]
-    biased = regression("", ("a",), ("",), seen, y, np.arange(n))
-    unbiased = regression("", ("a",), ("",), seen, y, np.arange(n), instruments=clean[:, None])
+    biased = regression("", {"a": ""}, seen, y, np.arange(n))
+    unbiased = regression("", {"a": ""}, seen, y, np.arange(n), instruments=clean[:, None])
     # Attenuation by var/(var + 1), var = 1/(1 - 0.25).
     assert biased.values[0] == pytest.approx(3.0 * (4 / 3) / (7 / 3), rel=0.03)
     value, sigma = unbiased.of("a")
@@ -66,7 +66,7 @@ def test_an_offset_beside_two_coulomb_frictions_is_not_determined(rng):
     v = np.sin(np.linspace(0, 60, 4000)) + 1e-9
     X = np.column_stack([v > 0, -1.0 * (v < 0), np.ones_like(v)]).astype(float)
     y = X @ (3.0, 2.0, 1.0) + 0.1 * rng.standard_normal(4000)
-    fit = regression("", ("ahead", "back", "offset"), ("N",) * 3, X, y, np.arange(4000.0))
+    fit = regression("", dict.fromkeys(("ahead", "back", "offset"), "N"), X, y, np.arange(4000.0))
     assert fit.information.rank == 2
     assert np.all(np.isinf(fit.standard_deviation))
 

@@ -156,7 +156,7 @@ WRONG = {
     "unit": (edited(0, "t,A1,S1 [bar]"), r"record a: y unit = 'bar': expected a unit of V"),
     "unit of time": (edited(0, "t [h],A1,S1"), r"unit of t = 'h': expected one of s, sec, ms"),
     "no input": (edited(0, "t,S2,S1"), r"record a: u: expected at least one input"),
-    "comment": ("# period_s = long\n" + "\n".join(GOOD), r"comment period_s = 'long': expected one number"),
+    "comment": ("# period_s = long\n" + "\n".join(GOOD), r"comment: period_s = 'long': expected one number"),
     "period": ("# period_s = 0.3\n" + "\n".join(GOOD), r"expected a whole number of samples; at 4 Hz it is 1.2"),
     "binary": ("\n".join(GOOD) + "\n\0\1\2", r"expected (3 columns|text|HDF5)"),
 }

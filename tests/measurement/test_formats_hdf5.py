@@ -323,7 +323,7 @@ def covariance_response(rng, n=5, n_y=3, n_u=2):
     value = rng.normal(size=(n, n_y, n_u)) + 1j * rng.normal(size=(n, n_y, n_u))
     return FrequencyResponse(np.sort(rng.uniform(1, 9, n)), value, hermitian(n_y), hermitian(n_u), ("A1", "A2"),
                              ("S1", "S2", "S3"), "V", "m/s", 12.0, hermitian(n_y), hermitian(n_y),
-                             rng.uniform(0, 1, (n, n_y)), method="local polynomial")
+                             method="local polynomial")
 
 
 def same(one, two):
@@ -405,7 +405,7 @@ RESPONSES_REFUSED = {
     "coherence 0": (put("coherence", np.zeros((5, 2, 1))), "0 for some entry at every line"),
     "shape": (put("value", np.zeros((5, 1, 2), complex)), r"value = \(5, 1, 2\): expected shape \(5, 2, 1\)"),
     "nan": (put("value", np.full((5, 2, 1), np.nan)), "NaN or infinite: 10, the first at line 0"),
-    "text": (put("value", "abc"), "/frf/value: expected numbers, found objects"),
+    "text": (put("value", "abc"), "/frf: value: expected numbers, found objects"),
     "order": (put("frequency_Hz", [1.0, 2.0, 2.0, 3.0, 4.0]), "expected increasing frequencies"),
     "no inputs": (group_edit(lambda g: g.attrs.pop("inputs")), "/frf: inputs: missing"),
     "unit": (group_edit(lambda g: g.attrs.update(output_unit="K")), "/frf: output_unit = 'K': expected a unit of"),
@@ -424,7 +424,7 @@ def test_a_wrong_response_is_refused_in_one_line(path, rng, case):
 def test_a_stated_deviation_stands_in_for_unknown_errors_and_lines_of_no_coherence_are_left_out(path, rng):
     response_file(path, rng, group_edit(lambda g: g.pop("coherence")))
     response = read_measurements(path, relative_standard_deviation=0.1)
-    np.testing.assert_allclose(response.standard_deviation, 0.1 * np.abs(response.value))
+    np.testing.assert_allclose(response.entry_variance, (0.1 * np.abs(response.value)) ** 2)
     assert "stated relative standard deviation 0.1" in response.method
 
     def one_zero(group):

@@ -226,17 +226,20 @@ def test_formats_that_are_read_whole_are_refused_beyond_memory_by_the_size_on_di
 
 
 def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeypatch):
-    """Small on disk: flat variables of 2 GB in a v7.3 file, and compressed zeros in a v5 file."""
+    """Small on disk: variables of 3 GB in a v7.3 file that have to be joined, and compressed zeros in a v5 file."""
     path, samples = tmp_path / "a", 125_000_000
     with h5py.File(path, "w", userblock_size=512) as file:
-        for name in "uy":
+        for name in "uyz":
             file.create_dataset(name, (1, samples), float, chunks=(1, 1 << 14))
             file[name].attrs["MATLAB_class"] = np.bytes_("double")
         file["fs"] = np.array([[100.0]])
         file["fs"].attrs["MATLAB_class"] = np.bytes_("double")
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    assert path.stat().st_size < 1e6 and "holds 2 GB, and this format is read whole" in refusal(path)
+    assert path.stat().st_size < 1e6
+    assert "holds 3 GB, and this format is read whole" in refusal(path, columns={"u": "u", "y": ["y", "z"]})
+    record = read_measurements(path, excitation="noise", level_V=1.0).records[0]  # one variable each stays on disk
+    assert record.load(samples - 3).y.shape == (3, 1)
     monkeypatch.setattr(common, "LARGEST_IN_MEMORY", 5000)
     scipy.io.savemat(path, {"u": np.zeros(400), "y": np.zeros(400), "fs": 1.0}, do_compression=True)
     assert path.stat().st_size < 1000 and "holds 6.5e-06 GB, and this format is read whole" in refusal(path)

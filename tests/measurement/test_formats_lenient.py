@@ -36,7 +36,7 @@ def test_records_of_u_y_and_t_are_enough(path, rng, version):
     assert first.level_V == pytest.approx(np.sqrt(np.mean(one["u"] ** 2)), rel=1e-12) and second.level_V == 0.0
     assert isinstance(campaign.records[0], StoredRecord) == (version == "v7.3")
     np.testing.assert_array_equal(campaign.records[0].load().y, one["y"])
-    for said in ("rig not stated", "u_names not stated", "y_unit not stated; taken as V", "100 Hz by t",
+    for said in ("rig not stated", "u_names not stated", "unit of y not stated; taken as V", "100 Hz by t",
                  "'rest': u is zero", "it follows the record before it"):
         assert any(said in note for note in campaign.notes), said
     assert read_measurements(path, rig="avis").rig == "avis"
@@ -74,9 +74,9 @@ def test_hints_hold_for_every_record(path, rng, version):
 
 
 def test_level_of_a_long_record_on_disk_is_that_of_all_its_pieces(path, rng, monkeypatch):
-    from avis_ctrl.measurement.formats import matlab_records
+    from avis_ctrl.measurement.formats import records
 
-    monkeypatch.setattr(matlab_records, "PIECE", 37)
+    monkeypatch.setattr(records, "PIECE", 37)
     long = record(rng)
     long["u"][100:] *= 30
     Matlab73(path, {"records": long})

@@ -104,6 +104,9 @@ def test_units_by_data_type_and_data_set_164(path):
     with pytest.raises(InputError, match=r"data set 164 makes it 0.001 m/s; which is right"):
         read_measurements(path)
     assert read_measurements(path, y_unit="mm/s").records[0].y[0, 0] == pytest.approx(1e-3)
+    path.write_bytes(units(1000.0).replace(b"1.0000", b"1.0x00") + data_set(y, name="S1", ordinate=(11, "NONE")))
+    with pytest.raises(InputError, match=r"data set 1 \(byte 0\) = .*: expected positive factors of length and force"):
+        read_measurements(path)
 
 
 def test_what_another_function_refers_to_is_an_input(path, rng):

@@ -257,7 +257,6 @@ def test_noise_covariance_of_coloured_noise(rng):
     assert np.mean(inside) > 0.93
     # The degrees of freedom agree with the scatter: var(trace) = 1 / (n dof).
     assert 0.5 < np.mean((trace - 1) ** 2 * 3 * got.dof) < 2.0
-    assert np.allclose(got.density, got.covariance * 2 / RATE)
 
 
 def test_records_at_rest_give_the_sensors_noise(rng):

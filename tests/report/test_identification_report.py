@@ -191,8 +191,8 @@ def kalman(found: Identification, off: float) -> EkfResult:
     theta = np.tile(values, (m, 1))
     history = EkfHistory(np.arange(m, dtype=float), theta, 0.99 * theta, 1.01 * theta, np.array([0.0, 3.0, 6.0]))
     white = innovation_statistics(np.random.default_rng(3).standard_normal((4000, 6)))
-    return EkfResult(information.names, information.units, information.values, values, 1e-6 * np.eye(n), False, 0.25,
-                     history, (white, white), np.zeros(n, int), HONEST_SETTINGS)
+    return EkfResult(information.names, information.units, information.values, values, 1e-6 * np.eye(n), history,
+                     (white, white), np.zeros(n, int), HONEST_SETTINGS)
 
 
 def test_ways_are_compared_in_standard_deviations(found):

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from halcyonics_transfer import transfer
+from nonlinear_rig import rotation_matrix
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.rigs.rigid_body import rotation_matrix
 
 L1, L2, L3, L45, L6 = 0.348, 0.300, 0.550, 0.190, 0.054  # section 3.1 and Table 1
 K_S, K_A, K_T, K_R = 11300.0, 7300.0, 37600.0, 1590.0

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from nonlinear_rig import NonlinearRig
+from nonlinear_rig import NonlinearRig, body_rate_map, rotation_matrix
 from numba import njit
 from scipy.linalg import expm
 
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.mounted_body import MountedBody
 from avis_ctrl.rigs.nonlinear import payload_acceleration
-from avis_ctrl.rigs.rigid_body import body_rate_map, cross_matrix, rotation_matrix
+from avis_ctrl.rigs.rigid_body import cross_matrix
 
 SKEW = {"com_x": 0.05, "com_y": -0.03, "com_z": 0.12, "J12": 3.0, "J13": -2.0, "J23": 4.0}
 UNDAMPED = {f"isolator{i}.c_{axis}": 0.0 for i in range(1, 5) for axis in "xyz"}

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.single_axis.fit import SingleAxisFit, andrews_lags, residual_statistics, sandwich
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded
 
 
 def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping: float, drift: int = 1
@@ -51,26 +50,10 @@ def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping:
                                measured=f"{100 * np.linalg.norm(e) / np.linalg.norm(y):.0f} % of it is left",
                                cause="a start before the release, or a second event inside",
                                next_step="choose the stretch after one release")
-    return _result(time, y, e, theta, found.jac.reshape(*e.shape, 2) / start, drift)
-
-
-def _result(time: np.ndarray, y: np.ndarray, e: np.ndarray, theta: np.ndarray, J: np.ndarray, drift: int
-            ) -> SingleAxisFit:
-    flat = J.reshape(-1, 2)
-    bread = np.linalg.inv(flat.T @ flat)
-    scores = np.einsum("ncp,nc->np", J, e)
-    lags = andrews_lags(scores)
-    spent = 2 + (3 + drift) * y.shape[1]
-    dof = e.size - spent
-    covariance = sandwich(bread, scores, lags, len(e) - spent / y.shape[1])
-    white = float(np.sum(e ** 2)) / dof
-    statistics = residual_statistics(e, y, np.sqrt(np.diag(covariance)), np.sqrt(np.diag(bread) * white), lags)
-    information = Information(("corner_Hz", "damping"), theta, ("Hz", ""), flat.T @ flat / white, np.abs(theta))
-    return SingleAxisFit("free decay of a second-order oscillator", information, covariance,
-                         f"Newey-West, {lags} lags by Andrews' rule; {statistics.inflation:.1f} times those of a white "
-                         "residual", float(dof), dof, "residual", statistics, time, y, y - e,
-                         ("at the amplitudes of this stretch; what moves with the amplitude, the deviations do not "
-                          "hold",))
+    return concluded("free decay of a second-order oscillator", {"corner_Hz": "Hz", "damping": ""}, theta, e,
+                     found.jac.reshape(*e.shape, 2) / start, 2 + (3 + drift) * y.shape[1], (time, y, y - e),
+                     notes=("at the amplitudes of this stretch; what moves with the amplitude, the deviations do not "
+                            "hold",))
 
 
 def _columns(t: np.ndarray, theta: np.ndarray, drift: int) -> np.ndarray:

@@ -51,8 +51,8 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
     if not 0 < cutoff_Hz < rate / 2:
         raise InputError(f"expected a cutoff between 0 and {rate / 2:g} Hz", field="cutoff_Hz", value=cutoff_Hz)
     sections = signal.butter(4, cutoff_Hz / (rate / 2), output="sos")
-    names, units, X = _columns(position, rate, sections, coulomb, offset)
-    Z = None if reference is None else _columns(others[2], rate, sections, coulomb, offset)[2]
+    units, X = _columns(position, rate, sections, coulomb, offset)
+    Z = None if reference is None else _columns(others[2], rate, sections, coulomb, offset)[1]
     y = signal.sosfiltfilt(sections, force)
     # The filter's own transient at the ends.
     edge = int(np.ceil(2 * rate / cutoff_Hz))
@@ -61,12 +61,12 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
     inside = slice(edge, -edge)
     how = "least squares" if Z is None else "instruments from the reference"
     model = f"F = M a + Fv v, Coulomb friction: {coulomb} ({how}, filtered to {cutoff_Hz:g} Hz)"
-    return regression(model, names, units, X[inside], y[inside], time[inside], None if Z is None else Z[inside])
+    return regression(model, units, X[inside], y[inside], time[inside], None if Z is None else Z[inside])
 
 
 def _columns(position: np.ndarray, rate: float, sections: np.ndarray, coulomb: str, offset: bool
-             ) -> tuple[list[str], list[str], np.ndarray]:
-    """Names, units and columns (n, p) of the inverse dynamic model, through the parallel filter."""
+             ) -> tuple[dict[str, str], np.ndarray]:
+    """Units by name and columns (n, p) of the inverse dynamic model, through the parallel filter."""
     q = signal.sosfiltfilt(sections, position)
     v = np.gradient(q, 1 / rate)
     a = np.empty_like(q)
@@ -85,7 +85,7 @@ def _columns(position: np.ndarray, rate: float, sections: np.ndarray, coulomb: s
             found.append(("Fc", "N", signal.sosfiltfilt(sections, sign)))
         if offset:
             found.append(("offset", "N", np.ones_like(v)))
-    return [f[0] for f in found], [f[1] for f in found], np.column_stack([f[2] for f in found])
+    return {name: unit for name, unit, _ in found}, np.column_stack([column for *_, column in found])
 
 
 def _sample_rate(time: np.ndarray) -> float:

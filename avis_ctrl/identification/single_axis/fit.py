@@ -11,7 +11,7 @@ number of lags L follows Andrews, Econometrica 59 (1991) 817, eq. 6.4, from a fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,12 +92,8 @@ class SingleAxisFit(Shown):
 
     def derived(self, function: Callable[[np.ndarray], float]) -> tuple[float, float]:
         """Value and standard deviation of a function of the parameters, to first order."""
-        value, slope = float(function(self.values)), np.zeros(len(self.values))
-        for j, scale in enumerate(self.information.scale):
-            step = np.zeros(len(self.values))
-            step[j] = 1e-5 * scale
-            slope[j] = (function(self.values + step) - function(self.values - step)) / (2e-5 * scale)
-        return value, float(np.sqrt(max(slope @ self.covariance @ slope, 0.0)))
+        slope = slopes(lambda theta: np.asarray(function(theta)), self.values, self.information.scale)
+        return float(function(self.values)), float(np.sqrt(max(slope @ self.covariance @ slope, 0.0)))
 
     def lines(self) -> list[str]:
         """The result as text: one line for each parameter, then the residual."""
@@ -151,12 +147,69 @@ def not_below(covariance: np.ndarray, bread: np.ndarray) -> np.ndarray:
     return covariance * np.outer(lift, lift)
 
 
-def regression(model: str, names: Sequence[str], units: Sequence[str], X: np.ndarray, y: np.ndarray,
-               time: np.ndarray, instruments: np.ndarray | None = None) -> SingleAxisFit:
+def slopes(function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(..., p) derivative of a function (...) by theta (p,) of size `scale`, by central differences."""
+    steps = np.diag(1e-5 * scale)
+    return np.stack([(function(theta + h) - function(theta - h)) / (2 * h.sum()) for h in steps], axis=-1)
+
+
+def inverse_product(Z: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """(p, p) inverse of Z^T X, (n, p) each; zero along combinations that the data do not determine."""
+    size, size_z = np.linalg.norm(X, axis=0), np.linalg.norm(Z, axis=0)
+    return np.linalg.pinv((Z / size_z).T @ (X / size), rcond=1e-12) / size[:, None] / size_z
+
+
+def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: np.ndarray, J: np.ndarray, spent: float,
+              drawn: tuple[np.ndarray, np.ndarray, np.ndarray], *, instruments: np.ndarray | None = None,
+              lags: int | None = None, method: str = "", relative: np.ndarray | None = None,
+              given_chi2: float | None = None, notes: tuple[str, ...] = ()) -> SingleAxisFit:
+    """A fit from what it leaves.
+
+    Parameters
+    ----------
+    parameters : unit by name. theta : (p,). e : (n, ..) residual of n samples or lines. J : (n, .., p) its derivative,
+    of either sign. spent : numbers of e that went into the fit, linear unknowns included.
+    drawn : abscissa, measured and predicted of the result.
+    instruments : as J, in the estimating equations instead of J.
+    lags : e has unit variance already, and is correlated over so many rows; by default the level of e is estimated from
+        it, and the lags follow Andrews' rule.
+    method : how the lags came about, in words. relative : what the statistics are of, measured less predicted by
+    default. given_chi2 : against noise that was measured beforehand.
+    """
+    n, p = len(e), len(theta)
+    J, e = J.reshape(n, -1, p), e.reshape(n, -1)
+    Z = J if instruments is None else instruments.reshape(J.shape)
+    bread, dof = inverse_product(Z.reshape(-1, p), J.reshape(-1, p)), e.size - round(spent)
+    level = float(np.sum(e ** 2)) / dof if lags is None else 1.0
+    plain = bread @ np.einsum("nrp,nrq->pq", Z, Z) @ bread.T * level
+    scores = np.einsum("nrp,nr->np", Z, e)
+    used = andrews_lags(scores) if lags is None else min(lags, n // 4)
+    covariance = sandwich(bread, scores, used, n * (1 - spent / e.size))
+    if lags is not None:
+        covariance = not_below(covariance, plain)
+    abscissa, measured, predicted = drawn
+    seen, left = (measured, measured - predicted) if relative is None else (measured / np.abs(measured), relative)
+    flat = np.abs(left) ** 2
+    tiny, honest, white = np.finfo(float).tiny, np.sqrt(np.diag(covariance)), np.sqrt(np.abs(np.diag(plain)))
+    residual = ResidualStatistics(
+        float(np.sqrt(np.mean(flat))), float(np.linalg.norm(left) / max(float(np.linalg.norm(seen)), tiny)),
+        float(np.sum(np.real(np.conj(left[1:]) * left[:-1])) / max(float(np.sum(flat)), tiny)),
+        float(np.max(honest / np.maximum(white, tiny))), used)
+    how = method or (f"Newey-West, {used} lags by Andrews' rule; {residual.inflation:.1f} times those of a white "
+                     "residual")
+    information = Information(tuple(parameters), theta, tuple(parameters.values()),
+                              np.einsum("nrp,nrq->pq", J, J) / level, np.where(theta == 0, 1.0, np.abs(theta)))
+    chi2 = float(np.sum(e ** 2)) / level if given_chi2 is None else given_chi2
+    return SingleAxisFit(model, information, covariance, how, chi2, dof, "residual" if given_chi2 is None else "given",
+                         residual, abscissa, measured, predicted, notes)
+
+
+def regression(model: str, parameters: Mapping[str, str], X: np.ndarray, y: np.ndarray, time: np.ndarray,
+               instruments: np.ndarray | None = None) -> SingleAxisFit:
     """y = X theta + e for time series, by least squares or with instruments.
 
-    X, instruments : (n, p); y : (n,). Instruments Z of the same shape give theta = inv(Z^T X) Z^T y, consistent
-    where they do not correlate with the noise, as is not so of X in a closed loop.
+    parameters : unit by name. X, instruments : (n, p); y : (n,). Instruments Z of the same shape give theta =
+    inv(Z^T X) Z^T y, consistent where they do not correlate with the noise, as is not so of X in a closed loop.
 
     Raises
     ------
@@ -169,34 +222,9 @@ def regression(model: str, names: Sequence[str], units: Sequence[str], X: np.nda
                          value=(X.shape, y.shape, Z.shape))
     if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(Z))):
         raise InputError("expected finite numbers", field="samples")
-    size, size_z = np.linalg.norm(X, axis=0), np.linalg.norm(Z, axis=0)
-    if not np.all(size > 0) or not np.all(size_z > 0):
-        lost = names[int(np.argmin(size * size_z))]
-        raise ComputationError(f"the data hold nothing of {lost}", measured="its column is zero throughout",
+    if lost := [name for name, x, z in zip(parameters, X.T, Z.T, strict=True) if not (np.any(x) and np.any(z))]:
+        raise ComputationError(f"the data hold nothing of {lost[0]}", measured="its column is zero throughout",
                                cause="an axis that never moved, or a channel that was mapped wrongly",
                                next_step="look at the columns, or leave the parameter out")
-    # The pseudo-inverse holds combinations that the data do not determine at zero.
-    bread = np.linalg.pinv((Z / size_z).T @ (X / size), rcond=1e-10) / size[:, None] / size_z
-    theta = bread @ (Z.T @ y)
-    e = y - X @ theta
-    scores = Z * e[:, None]
-    lags = andrews_lags(scores)
-    covariance = sandwich(bread, scores, lags, n - p)
-    white = float(e @ e) / (n - p)
-    scale = np.where(theta == 0, 1.0, np.abs(theta))
-    information = Information(tuple(names), theta, tuple(units), X.T @ X / white, scale)
-    plain = np.sqrt(np.abs(np.diag(bread @ (Z.T @ Z) @ bread.T)) * white)
-    statistics = residual_statistics(e, y, np.sqrt(np.diag(covariance)), plain, lags)
-    return SingleAxisFit(model, information, covariance,
-                         f"Newey-West, {lags} lags by Andrews' rule; {statistics.inflation:.1f} times those of a "
-                         "white residual", (n - p) * 1.0, n - p, "residual", statistics, time, y, X @ theta)
-
-
-def residual_statistics(e: np.ndarray, y: np.ndarray, honest: np.ndarray, plain: np.ndarray, lags: int
-                        ) -> ResidualStatistics:
-    """Of a residual e and what was measured y, equal shapes, correlation along axis 0."""
-    flat = np.abs(e) ** 2
-    lag_one = float(np.sum(np.real(np.conj(e[1:]) * e[:-1])) / max(float(np.sum(flat)), np.finfo(float).tiny))
-    ratio = float(np.max(honest / np.maximum(plain, np.finfo(float).tiny)))
-    share = float(np.linalg.norm(e) / max(float(np.linalg.norm(y)), np.finfo(float).tiny))
-    return ResidualStatistics(float(np.sqrt(np.mean(flat))), share, lag_one, ratio, lags)
+    theta = inverse_product(Z, X) @ (Z.T @ y)
+    return concluded(model, parameters, theta, y - X @ theta, X, p, (time, y, X @ theta), instruments=Z)

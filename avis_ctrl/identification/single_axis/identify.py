@@ -32,14 +32,14 @@ ROLES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "drive": ("force", ("position",), ("reference",)),
     "oscillator": ("u", ("y",), ()),
 }
-OPTIONS: dict[str, dict[str, type]] = {
-    "seismometer": {"delay": bool},
-    "drive": {"cutoff_Hz": float, "coulomb": str, "offset": bool},
-    "oscillator": {"band_Hz": tuple},
-    "decay": {"corner_Hz": float, "damping": float, "start_s": float, "end_s": float, "drift": int},
+TRUTH, WORD, NUMBER, WHOLE, PAIR = ("true or false", "a word", "a number", "a whole number",
+                                    "two numbers, low and high")
+OPTIONS: dict[str, dict[str, str]] = {
+    "seismometer": {"delay": TRUTH},
+    "drive": {"cutoff_Hz": NUMBER, "coulomb": WORD, "offset": TRUTH},
+    "oscillator": {"band_Hz": PAIR},
+    "decay": {"corner_Hz": NUMBER, "damping": NUMBER, "start_s": NUMBER, "end_s": NUMBER, "drift": WHOLE},
 }
-IN_WORDS = {bool: "true or false", float: "a number", int: "a whole number", str: "a word",
-            tuple: "two numbers, low and high"}
 
 
 def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str], *,
@@ -84,7 +84,7 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
     if kind == "seismometer":
         responses, refused = stepped_sine(campaign, driven, measured, scale)
         fit = fit_seismometer(responses, **options)
-        return _noted(fit, refused)
+        return replace(fit, notes=(*fit.notes, *(f"left out: {reason}" for reason in refused)))
     time, channel = _channels(_single(campaign, path), driven, measured, scale)
     if kind == "drive":
         return fit_drive(time, channel["position"], channel["force"], reference=channel.get("reference"), **options)
@@ -139,18 +139,12 @@ def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale
 def _check_option(kind: str, name: str, value: Any) -> None:
     if name not in OPTIONS[kind]:
         raise InputError(f"expected one of {', '.join(sorted(OPTIONS[kind]))}", field=f"option of {kind}", value=name)
-    wanted = OPTIONS[kind][name]
-
     def number(x: Any) -> bool:
         return isinstance(x, (int, float)) and not isinstance(x, bool) and not np.isnan(x)
-    if wanted is tuple:
-        fits = isinstance(value, (tuple, list)) and len(value) == 2 and all(map(number, value))
-    elif wanted is float:
-        fits = number(value)
-    else:
-        fits = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
-    if not fits:
-        raise InputError(f"expected {IN_WORDS[wanted]}", field=name, value=value)
+    wanted, pair = OPTIONS[kind][name], isinstance(value, (tuple, list)) and len(value) == 2 and all(map(number, value))
+    if not {TRUTH: isinstance(value, bool), WORD: isinstance(value, str), NUMBER: number(value),
+            WHOLE: isinstance(value, int) and number(value), PAIR: pair}[wanted]:
+        raise InputError(f"expected {wanted}", field=name, value=value)
 
 
 def _roles(kind: str, columns: Mapping[str, str], scale: Mapping[str, float]) -> tuple[str, list[str]]:
@@ -210,7 +204,3 @@ def _decay(time: np.ndarray, y: np.ndarray, corner_Hz: float = 1.0, damping: flo
         raise InputError(f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
                          field="start_s, end_s", value=(start_s, end_s))
     return fit_decay(time[keep], y[keep], corner_Hz, damping, drift)
-
-
-def _noted(fit: SingleAxisFit, refused: Sequence[str]) -> SingleAxisFit:
-    return replace(fit, notes=(*fit.notes, *(f"left out: {reason}" for reason in refused)))

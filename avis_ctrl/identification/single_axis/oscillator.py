@@ -13,16 +13,16 @@ best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963).
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.single_axis.fit import SingleAxisFit, not_below, residual_statistics, sandwich
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded, slopes
 
 TRANSIENT = 4  # coefficients of T
 SMOOTHED = 8  # lines on either side whose residual gives the noise
 CORRELATED_LINES = 4
-NAMES, UNITS = ("m", "d", "k"), ("u s^2 a unit of y", "u s a unit of y", "u a unit of y")
+PARAMETERS = {"m": "u s^2 a unit of y", "d": "u s a unit of y", "k": "u a unit of y"}
 
 
 def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float]) -> SingleAxisFit:
@@ -58,36 +58,24 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
         x = found.x * scale
         e = left(x, weight)
         error = (e[:len(f)] + 1j * e[len(f):]) / weight
-        weight = np.sqrt(2 / _smoothed(np.abs(error) ** 2))
+        power = np.abs(error) ** 2
+        level = uniform_filter1d(power, 2 * SMOOTHED + 1, mode="nearest")
+        weight = np.sqrt(2 / np.maximum(level, 1e-12 * power.mean() + np.finfo(float).tiny))
     to_units = np.array([1 / s0 ** 2, 1 / s0, 1.0])
     if not (x[0] > 0 and x[2] > 0):
         raise ComputationError("no oscillator with positive mass and stiffness fits the record",
                                measured=f"m {x[0] * to_units[0]:.3g}, k {x[2]:.3g}",
                                cause="input and output exchanged, or a band without the resonance",
                                next_step="check the columns and widen the band")
-    e = left(x, weight)
-    J = np.column_stack([(left(x + h, weight) - left(x - h, weight)) / (2 * h.max())
-                         for h in np.diag(1e-6 * np.abs(x) + 1e-300)]) / to_units
-    return _result(f, Y, error, x * to_units, e, J)
-
-
-def _result(f: np.ndarray, Y: np.ndarray, error: np.ndarray, theta: np.ndarray, e: np.ndarray, J: np.ndarray
-            ) -> SingleAxisFit:
-    n = len(f)
-    size = np.linalg.norm(J, axis=0)
-    bread = np.linalg.inv((J / size).T @ (J / size)) / np.outer(size, size)
-    scores = J[:n] * e[:n, None] + J[n:] * e[n:, None]
-    spent = len(theta) + TRANSIENT
+    J = slopes(lambda x: left(x, weight), x, np.abs(x)) / to_units
+    n, e, spent = len(f), left(x, weight), len(x) + TRANSIENT
     # Damping rests on the few lines of the resonance, to which the fit bends.
-    covariance = not_below(sandwich(bread, scores, CORRELATED_LINES, n * (1 - spent / (2 * n))), bread)
-    statistics = residual_statistics(error, Y, np.sqrt(np.diag(covariance)), np.sqrt(np.diag(bread)), CORRELATED_LINES)
-    information = Information(NAMES, theta, UNITS, J.T @ J, np.abs(theta))
-    return SingleAxisFit("m y'' + d y' + k y = u", information, covariance,
-                         f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
-                         float(e @ e), 2 * n - spent, "residual", statistics, f, Y, Y - error,
-                         ("of the best linear oscillator at the level of this record; another level has another, which "
-                          "the deviations do not hold",
-                          "figure data: spectrum of the output and of the model's, transient included"))
+    return concluded("m y'' + d y' + k y = u", PARAMETERS, x * to_units, e.reshape(2, n).T,
+                     J.reshape(2, n, -1).swapaxes(0, 1), spent, (f, Y, Y - error), lags=CORRELATED_LINES,
+                     method=f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
+                     notes=("of the best linear oscillator at the level of this record; another level has another, "
+                            "which the deviations do not hold",
+                            "figure data: spectrum of the output and of the model's, transient included"))
 
 
 def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, float]
@@ -117,10 +105,3 @@ def _linear(U: np.ndarray, Y: np.ndarray, s: np.ndarray, powers: np.ndarray) -> 
 
 def _parts(z: np.ndarray) -> np.ndarray:
     return np.concatenate([z.real, z.imag])
-
-
-def _smoothed(power: np.ndarray) -> np.ndarray:
-    """Mean over the neighbouring lines."""
-    width = 2 * SMOOTHED + 1
-    mean = np.convolve(np.pad(power, SMOOTHED, mode="edge"), np.ones(width) / width, mode="valid")
-    return np.maximum(mean, 1e-12 * power.mean() + np.finfo(float).tiny)

@@ -18,15 +18,15 @@ import numpy as np
 from scipy.optimize import brentq, least_squares
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.single_axis.fit import SingleAxisFit, not_below, residual_statistics, sandwich
+from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded, slopes
 
 # The misfit of neighbouring frequencies is alike; scores are taken as correlated over this many.
 CORRELATED_LINES = 2
 # A mode of the mount with more damping has the phase of a delay to fourth order: the two cannot be distinguished.
 LARGEST_MODE_DAMPING = 0.2
 POWER = {"coil": 1, "displacement": 0, "ground": 2}
-PARAMETERS = {"corner_Hz": "Hz", "damping": ""}
+UNITS = {"corner_Hz": "Hz", "damping": "", "force_gain": "m/s^2 a unit of drive", "sensitivity": "V s/m",
+         "gain": "V/s a unit of drive", "drive_delay_s": "s", "delay_s": "s"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +89,8 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
     ------
     ComputationError : no oscillator with positive corner and damping comes near the data.
     """
-    names, units, start = _start(data, delay)
-    kinds = list(data.value)
+    begin = _start(data, delay)
+    names, start, kinds = tuple(begin), np.array(list(begin.values())), list(data.value)
     scale = np.where(start == 0, 1e-3, np.abs(start))
 
     def misses(theta: np.ndarray, r: float) -> np.ndarray:
@@ -109,38 +109,17 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
         raise ComputationError("no oscillator fits the responses", measured=f"corner {theta[0]:.3g} Hz, damping "
                                f"{theta[1]:.3g}", cause="channels that were exchanged, or frequencies on one side of "
                                "the corner only", next_step="check which column is the drive and which the coil")
-    return _result(data, names, units, theta, r, misses, scale)
-
-
-def _result(data: Responses, names: tuple[str, ...], units: tuple[str, ...], theta: np.ndarray, r: float,
-            misses: Callable[[np.ndarray, float], np.ndarray], scale: np.ndarray) -> SingleAxisFit:
-    e, p = misses(theta, r), len(names)
-    J = np.empty((*e.shape, p))
-    for j in range(p):
-        step = np.zeros(p)
-        step[j] = 1e-5 * scale[j]
-        J[..., j] = (misses(theta + step, r) - misses(theta - step, r)) / (2 * step[j])
-    flat = J.reshape(-1, p)
-    size = np.linalg.norm(flat, axis=0)
-    bread = np.linalg.pinv((flat / size).T @ (flat / size), rcond=1e-12) / np.outer(size, size)
-    scores = np.einsum("nkp,nk->np", J, e)
-    lags = min(CORRELATED_LINES, len(scores) // 4)
-    # Of the numbers of a frequency, p / n were spent on the fit.
-    # Few frequencies: a parameter on which their misfits happen to cancel is not known better for it.
-    covariance = not_below(sandwich(bread, scores, lags, len(scores) * (1 - p / e.size)), bread)
-    chi2 = float(np.sum(misses(theta, 0.0) ** 2))
     model = response(data.frequency_Hz, names, theta)
-    measured = np.column_stack([data.value[kind] for kind in data.value])
-    predicted = np.column_stack([model[kind] for kind in data.value])
-    relative = (measured - predicted) / np.abs(measured)
-    plain, honest = np.sqrt(np.diag(bread)), np.sqrt(np.diag(covariance))
-    statistics = residual_statistics(relative, measured / np.abs(measured), honest, plain, lags)
-    information = Information(names, theta, units, flat.T @ flat, np.abs(scale))
-    return SingleAxisFit(
-        f"second-order seismometer, {' and '.join(data.value)}", information, covariance,
-        f"misfit of {100 * r:.2g} % a frequency added to the noise, neighbouring frequencies correlated (Newey-West, "
-        f"{lags} lags)", chi2, e.size - p, "given", statistics, data.frequency_Hz, measured, predicted,
-        (f"columns of the figure data: {', '.join(data.value)}",))
+    measured, predicted = (np.column_stack([values[kind] for kind in kinds]) for values in (data.value, model))
+    e = misses(theta, r)
+    # Few frequencies: a parameter on which their misfits happen to cancel is not known better for it.
+    return concluded(
+        f"second-order seismometer, {' and '.join(kinds)}", {name: UNITS[name] for name in names}, theta, e,
+        slopes(lambda x: misses(x, r), theta, scale), len(names), (data.frequency_Hz, measured, predicted),
+        lags=CORRELATED_LINES, relative=(measured - predicted) / np.abs(measured),
+        method=f"misfit of {100 * r:.2g} % a frequency added to the noise, neighbouring frequencies correlated "
+        f"(Newey-West, {min(CORRELATED_LINES, len(e) // 4)} lags)", given_chi2=float(np.sum(misses(theta, 0.0) ** 2)),
+        notes=(f"columns of the figure data: {', '.join(kinds)}",))
 
 
 def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Callable[[float, np.ndarray], np.ndarray],
@@ -162,8 +141,8 @@ def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Call
     return theta, r
 
 
-def _start(data: Responses, delay: bool) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
-    """Names, units, and a linear estimate: H (s^2 + a1 s + a0) = b s^p is linear in a1, a0 and b (Levy, 1959)."""
+def _start(data: Responses, delay: bool) -> dict[str, float]:
+    """A linear estimate by name: H (s^2 + a1 s + a0) = b s^p is linear in a1, a0 and b (Levy, 1959)."""
     kind = next(iter(data.value))
     H, s = data.value[kind], 2j * np.pi * data.frequency_Hz
     s0 = float(np.sqrt(np.abs(s[0] * s[-1])))
@@ -176,20 +155,15 @@ def _start(data: Responses, delay: bool) -> tuple[tuple[str, ...], tuple[str, ..
     w0 = s0 * np.sqrt(a0) if a0 > 0 else s0
     zeta = a1 * s0 / (2 * w0) if a1 > 0 else 0.5
     b *= s0 ** (2 - POWER[kind])
-    start, names, units = [w0 / (2 * np.pi), zeta], list(PARAMETERS), list(PARAMETERS.values())
+    start = {"corner_Hz": w0 / (2 * np.pi), "damping": zeta}
     if "ground" in data.value:
-        start, names, units = [*start, b], [*names, "sensitivity"], [*units, "V s/m"]
+        start["sensitivity"] = b
     elif "displacement" in data.value:
         D = s ** 2 + 2 * zeta * w0 * s + w0 ** 2
-        gain = float(np.median((data.value["displacement"] * D).real))
-        start, names, units = [*start, gain], [*names, "force_gain"], [*units, "m/s^2 a unit of drive"]
+        start["force_gain"] = float(np.median((data.value["displacement"] * D).real))
         if "coil" in data.value:
-            S = np.median((data.value["coil"] / data.value["displacement"] / s).real)
-            start, names, units = [*start, S], [*names, "sensitivity"], [*units, "V s/m"]
+            start["sensitivity"] = float(np.median((data.value["coil"] / data.value["displacement"] / s).real))
     else:
-        start, names, units = [*start, b], [*names, "gain"], [*units, "V/s a unit of drive"]
-    if delay and len(data.value) > 1:
-        start, names, units = [*start, 0.0], [*names, "drive_delay_s"], [*units, "s"]
-    if delay:
-        start, names, units = [*start, 0.0], [*names, "delay_s"], [*units, "s"]
-    return tuple(names), tuple(units), np.array(start, float)
+        start["gain"] = b
+    late = (["drive_delay_s"] if len(data.value) > 1 else []) + ["delay_s"]
+    return start | dict.fromkeys(late if delay else [], 0.0)

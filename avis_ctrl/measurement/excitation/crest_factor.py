@@ -31,15 +31,6 @@ def synthesise(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samp
     return np.fft.irfft(spectrum, samples)
 
 
-def schroeder_phases(amplitude: np.ndarray) -> np.ndarray:
-    """Phases of Schroeder (IEEE Trans. Inf. Theory 16 (1970), eq. 11) for these line amplitudes, (n_lines,).
-
-    For equal amplitudes -pi k (k - 1) / n; the crest factor is then near 1.7.
-    """
-    power = np.square(amplitude) / np.sum(np.square(amplitude))
-    return -2 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power)[:-1])])
-
-
 def low_crest_phases(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int,
                      rotations: np.ndarray | None = None) -> np.ndarray:
     """Phases near a local minimum of the peak, started from `phase`, (n_lines,).

@@ -21,8 +21,7 @@ depends on the distribution, is then that for signals of this kind.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -36,8 +35,6 @@ Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]
 # Samples times drives times records: 1 GiB.
 MOST_VOLTAGES = 2 ** 27
-# Relative amplitude of the lines: at frequencies [Hz], or one number a line.
-Shape = Callable[[np.ndarray], np.ndarray] | Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,36 +79,23 @@ class ExcitationSignals:
         """(records, n_u) peak over r.m.s. as designed."""
         return crest_factor(np.moveaxis(self.u, 1, -1))
 
-    def scaled_to(self, rms_V: float) -> ExcitationSignals:
-        """The same signals at another level: the r.m.s. of every input.
+    def scaled_to(self, rms_V: float | None = None) -> ExcitationSignals:
+        """The same signals at another level: the common r.m.s. of every input, by default the largest possible.
 
         Raises
         ------
         InputError : a level that needs more than limit_V; it names the largest possible.
         """
+        largest = float(self.limit_V / np.max(self.crest))
+        rms_V = largest if rms_V is None else rms_V
         require_positive(rms_V, "rms_V")
-        largest = largest_rms(self.crest, self.limit_V)
         if rms_V > largest * (1 + 1e-12):
             raise InputError(f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
                              f"{self.limit_V / largest:.3f} more would exceed the limit of {self.limit_V:g} V",
                              field="rms_V", value=rms_V)
-        return _replaced(self, self.u * np.divide(rms_V, self.rms_V[:, None, :]), rms_V)
-
-    def scaled_to_limit(self) -> ExcitationSignals:
-        """The same signals at the largest common r.m.s. that limit_V allows."""
-        return self.scaled_to(largest_rms(self.crest, self.limit_V))
-
-
-def _replaced(signals: ExcitationSignals, u: np.ndarray, rms_V: float) -> ExcitationSignals:
-    values = {one.name: getattr(signals, one.name) for one in fields(signals)}
-    # Round-off must not put the peak beyond the limit.
-    u = np.clip(u, -signals.limit_V, signals.limit_V)
-    return ExcitationSignals(**(values | {"u": u, "settings": signals.settings | {"rms_V": float(rms_V)}}))
-
-
-def largest_rms(crest: np.ndarray, limit_V: float) -> float:
-    """The common r.m.s. at which the highest peak reaches the limit."""
-    return float(limit_V / np.max(crest))
+        # Round-off must not put the peak beyond the limit.
+        u = np.clip(self.u * (rms_V / self.rms_V[:, None, :]), -self.limit_V, self.limit_V)
+        return replace(self, u=u, settings=self.settings | {"rms_V": float(rms_V)})
 
 
 @dataclass(frozen=True)
@@ -132,9 +116,8 @@ class MultisineSettings:
     scheme : how the inputs are told apart, see above.
     realisations : independent draws of the phases; the lines are the same in all.
     dealt : by how many places the zippered lines of the first realisation are dealt on.
-    shape : relative amplitude, a function of Hz, or one number for each line that is excited; flat when None.
     compensate_hold : divide the amplitudes by the sinc of the zero-order hold, so that the held voltage, not its
-        samples, has the shape asked.
+        samples, is flat.
     low_crest : minimise the crest factor; False keeps the phases drawn.
     seed : of all that is random.
 
@@ -155,26 +138,21 @@ class MultisineSettings:
     scheme: Scheme = "orthogonal"
     realisations: int = 1
     dealt: int = 0
-    shape: Shape | None = None
     compensate_hold: bool = False
     low_crest: bool = True
     seed: int = 1
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        for name in ("sample_rate_Hz", "period_s", "limit_V"):
-            require_positive(getattr(self, name), name)
-        if self.rms_V is not None:
-            require_positive(self.rms_V, "rms_V")
+        _check_common(self)
+        require_positive(self.period_s, "period_s")
         samples = self.period_s * self.sample_rate_Hz
         if abs(samples - round(samples)) > 1e-6 * samples or round(samples) < 4:
             raise InputError(f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is "
                              f"{samples:.6g}", field="period_s", value=self.period_s)
-        _check_band(self.band_Hz, self.sample_rate_Hz)
         for name, known in (("lines", get_args(Lines)), ("scheme", get_args(Scheme))):
             if getattr(self, name) not in known:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
-        for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("dealt", 0), ("seed", 0)):
+        for name, least in (("spacing", 1), ("group", 2), ("realisations", 1), ("dealt", 0)):
             require_whole(getattr(self, name), name, least)
         experiments = len(self.inputs) if self.scheme == "orthogonal" else 1
         _check_size(self.realisations * experiments * len(self.inputs) * self.samples, "period_s, realisations")
@@ -197,14 +175,11 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
 
     Raises
     ------
-    InputError : a band that leaves an input without lines, a shape that does not fit or is not positive, a level
-        beyond the limit.
+    InputError : a band that leaves an input without lines, a level beyond the limit.
     """
     rng, n_u, N = np.random.default_rng(settings.seed), len(settings.inputs), settings.samples
     lines, detection = choose_lines(settings, rng)
-    shape = _shape(settings, lines)
-    amplitude = shape / np.sinc(lines / N) if settings.compensate_hold else shape
-    plain = _plain(settings) | {"shape": None if settings.shape is None else shape.tolist()}
+    amplitude = np.ones(lines.size) / (np.sinc(lines / N) if settings.compensate_hold else 1.0)
     T = orthogonal_matrix(n_u) if settings.scheme == "orthogonal" else np.ones((1, 1))
     u, before = [], []
     for r in range(settings.realisations):
@@ -215,10 +190,10 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
             record[:, :, i], drawn[:, :, i] = _one_input(lines[own], amplitude[own], turns, N, settings.low_crest, rng)
         u.append(record)
         before.append(drawn)
-    return _finished(ExcitationSignals(
+    return ExcitationSignals(
         "multisine", settings.inputs, settings.sample_rate_Hz, np.concatenate(u), settings.period_s,
         lines / settings.period_s, detection / settings.period_s, settings.limit_V,
-        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)), plain), settings.rms_V)
+        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)), _plain(settings)).scaled_to(settings.rms_V)
 
 
 def _one_input(lines: np.ndarray, amplitude: np.ndarray, turns: np.ndarray, samples: int, low_crest: bool,
@@ -254,16 +229,6 @@ def orthogonal_matrix(n: int) -> np.ndarray:
     return hadamard(n).astype(float) if n & (n - 1) == 0 else dft(n)
 
 
-def _shape(settings: MultisineSettings, lines: np.ndarray) -> np.ndarray:
-    """(n_lines,) relative amplitudes."""
-    shape = np.ones(lines.size) if settings.shape is None else settings.shape
-    amplitude = np.asarray(shape(lines / settings.period_s) if callable(shape) else shape, float)
-    if amplitude.shape != lines.shape or not (np.all(np.isfinite(amplitude)) and np.all(amplitude > 0)):
-        raise InputError(f"expected {lines.size} finite, positive amplitudes, one for each excited line", field="shape",
-                         value=f"array of shape {amplitude.shape}")
-    return amplitude
-
-
 @dataclass(frozen=True)
 class NoiseSettings:
     """Gaussian noise, flat inside band_Hz and nothing outside it; as in `MultisineSettings`.
@@ -281,14 +246,9 @@ class NoiseSettings:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        _check_inputs(self.inputs)
-        for name in ("sample_rate_Hz", "duration_s", "limit_V"):
-            require_positive(getattr(self, name), name)
-        if self.rms_V is not None:
-            require_positive(self.rms_V, "rms_V")
-        _check_band(self.band_Hz, self.sample_rate_Hz)
+        _check_common(self)
+        require_positive(self.duration_s, "duration_s")
         require_whole(self.records, "records", 1)
-        require_whole(self.seed, "seed", 0)
         _check_size(self.records * len(self.inputs) * self.duration_s * self.sample_rate_Hz, "duration_s, records")
 
 
@@ -306,9 +266,9 @@ def noise(settings: NoiseSettings) -> ExcitationSignals:
     u = np.array([band_limited(N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs), rng)
                   for _ in range(settings.records)])
     u = u / np.sqrt(np.mean(u ** 2, axis=1, keepdims=True))
-    return _finished(ExcitationSignals("noise", settings.inputs, settings.sample_rate_Hz, u, None, np.zeros(0),
-                                       np.zeros(0), settings.limit_V, crest_factor(np.moveaxis(u, 1, -1)),
-                                       _plain(settings)), settings.rms_V)
+    return ExcitationSignals("noise", settings.inputs, settings.sample_rate_Hz, u, None, np.zeros(0), np.zeros(0),
+                             settings.limit_V, crest_factor(np.moveaxis(u, 1, -1)),
+                             _plain(settings)).scaled_to(settings.rms_V)
 
 
 def band_limited(samples: int, sample_rate_Hz: float, band_Hz: tuple[float, float], channels: int,
@@ -326,26 +286,26 @@ def band_limited(samples: int, sample_rate_Hz: float, band_Hz: tuple[float, floa
     return np.fft.irfft(spectrum, samples, axis=0)
 
 
-def _finished(signals: ExcitationSignals, rms_V: float | None) -> ExcitationSignals:
-    return signals.scaled_to_limit() if rms_V is None else signals.scaled_to(rms_V)
-
-
 def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
-    """Settings as numbers, strings and lists, for files; a shape is left to the caller."""
+    """Settings as numbers, strings and lists, for files."""
     values = {one.name: getattr(settings, one.name) for one in fields(settings)}
     values = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}
 
 
-def _check_inputs(inputs: tuple[str, ...]) -> None:
+def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
+    """What both kinds of signals ask."""
+    inputs, rate, band_Hz = settings.inputs, settings.sample_rate_Hz, settings.band_Hz
     if not inputs or len(set(inputs)) != len(inputs):
         raise InputError("expected different names of at least one drive", field="inputs", value=inputs)
-
-
-def _check_band(band_Hz: tuple[float, float], sample_rate_Hz: float) -> None:
-    if len(band_Hz) != 2 or not (np.all(np.isfinite(band_Hz)) and 0 < band_Hz[0] <= band_Hz[1] < sample_rate_Hz / 2):
-        raise InputError(f"expected two frequencies above 0 and below half the sample rate ({sample_rate_Hz / 2:g} "
-                         "Hz), the lower one first", field="band_Hz", value=tuple(band_Hz))
+    require_positive(rate, "sample_rate_Hz")
+    require_positive(settings.limit_V, "limit_V")
+    if settings.rms_V is not None:
+        require_positive(settings.rms_V, "rms_V")
+    require_whole(settings.seed, "seed", 0)
+    if len(band_Hz) != 2 or not (np.all(np.isfinite(band_Hz)) and 0 < band_Hz[0] <= band_Hz[1] < rate / 2):
+        raise InputError(f"expected two frequencies above 0 and below half the sample rate ({rate / 2:g} Hz), the "
+                         "lower one first", field="band_Hz", value=tuple(band_Hz))
 
 
 def _check_size(voltages: float, field: str) -> None:

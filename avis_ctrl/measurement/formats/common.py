@@ -10,17 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, RecordHeader
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
+PREFIXES = {"": 1.0, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "k": 1e3}
 # Label -> (SI unit, factor to it).
 UNITS: dict[str, tuple[str, float]] = {
-    "V": ("V", 1.0), "Volt": ("V", 1.0), "Volts": ("V", 1.0), "mV": ("V", 1e-3), "uV": ("V", 1e-6), "kV": ("V", 1e3),
-    "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3), "um": ("m", 1e-6), "nm": ("m", 1e-9), "in": ("m", 0.0254),
-    "m/s": ("m/s", 1.0), "cm/s": ("m/s", 1e-2), "mm/s": ("m/s", 1e-3), "um/s": ("m/s", 1e-6), "nm/s": ("m/s", 1e-9),
-    "in/s": ("m/s", 0.0254), "m/s^2": ("m/s^2", 1.0), "cm/s^2": ("m/s^2", 1e-2), "mm/s^2": ("m/s^2", 1e-3),
-    "um/s^2": ("m/s^2", 1e-6), "g": ("m/s^2", STANDARD_GRAVITY), "gn": ("m/s^2", STANDARD_GRAVITY),
-    "in/s^2": ("m/s^2", 0.0254), "N": ("N", 1.0), "mN": ("N", 1e-3), "kN": ("N", 1e3), "lbf": ("N", 4.4482216152605)}
+    f"{prefix}{unit}": (unit, factor)
+    for unit in ("V", "m", "m/s", "m/s^2", "N") for prefix, factor in PREFIXES.items()}
+UNITS |= {f"in{per}": (f"m{per}", 0.0254) for per in ("", "/s", "/s^2")}
+UNITS |= dict.fromkeys(("Volt", "Volts"), ("V", 1.0)) | dict.fromkeys(("g", "gn"), ("m/s^2", STANDARD_GRAVITY))
+UNITS["lbf"] = ("N", 4.4482216152605)
 INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"), ("m/s",)
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 
@@ -54,6 +53,18 @@ def reading(path: object, what: str = "the file") -> Iterator[None]:
                          file=path) from None
     except OSError as error:
         raise InputError(f"{what} cannot be read ({short(error)})", file=path) from error
+
+
+@contextmanager
+def within(where: str) -> Iterator[None]:
+    """Refusals inside say which part of the file is meant, such as "record 00"."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None or f"{error.field}:".startswith(f"{where}:"):
+            raise
+        raise InputError(error.expected, field=f"{where}: {error.field}" if error.field else where,
+                         value=error.value) from None
 
 
 def existing_file(path: str | Path) -> Path:
@@ -186,9 +197,9 @@ def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Uni
     return Unit(*known)
 
 
-def units_of(value: Any, role: str, where: str, count: int) -> tuple[str, tuple[float, ...]]:
+def units_of(value: Any, role: str, count: int) -> tuple[str, tuple[float, ...]]:
     """One SI unit and the factor of each of `count` channels, from one label or one per channel."""
-    field = f"{where}: {role} unit"
+    field = f"{role} unit"
     array = np.asarray(value, object).reshape(-1) if isinstance(value, (np.ndarray, list, tuple)) else [value]
     if len(array) not in (1, count):
         raise InputError(f"expected one unit, or one for each of {count} channels", field=field, value=brief(value))
@@ -200,38 +211,11 @@ def units_of(value: Any, role: str, where: str, count: int) -> tuple[str, tuple[
     return units[0].si, factors * count if len(factors) == 1 else factors
 
 
-def require(fields: Mapping[str, Any], name: str, where: str, expected: str) -> Any:
+def require(fields: Mapping[str, Any], name: str, expected: str) -> Any:
     """A field that has to be there."""
     if name not in fields or fields[name] is None:
-        raise InputError(f"missing; expected {expected}", field=f"{where}: {name}")
+        raise InputError(f"missing; expected {expected}", field=name)
     return fields[name]
-
-
-def header_from(fields: Mapping[str, Any], name: str, samples: int, channels: Mapping[str, tuple[str, ...]],
-                units: Mapping[str, str]) -> RecordHeader:
-    """The header of a record from the contract's attributes.
-
-    fields : sample_rate_Hz, excitation, level_V, start_s and, where periodic, period_s; channels : names of u, y and
-    floor; units : their SI units.
-
-    Raises
-    ------
-    InputError : an attribute that is missing, of another type, or out of range.
-    """
-    where = f"record {name}"
-    rate = as_number(require(fields, "sample_rate_Hz", where, "the sample rate in Hz"), f"{where}: sample_rate_Hz")
-    excitation = as_text(require(fields, "excitation", where, f"one of {', '.join(EXCITATIONS)}"),
-                         f"{where}: excitation")
-    level = as_number(require(fields, "level_V", where, "the r.m.s. of the driven voltages"), f"{where}: level_V")
-    start = as_number(require(fields, "start_s", where, "the time of the first sample in s"), f"{where}: start_s")
-    if level < 0:
-        raise InputError("expected 0 or more", field=f"{where}: level_V", value=level)
-    if channels.get("floor", FLOOR_NAMES) != FLOOR_NAMES:
-        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field=f"{where}: floor names",
-                         value=channels["floor"])
-    return RecordHeader(name, rate, samples, channels["u"], channels["y"], excitation, level, start,
-                        _period(fields.get("period_s"), excitation, where), units["u"], units["y"],
-                        channels.get("floor", ()), units.get("floor", "m/s"))
 
 
 def stated_period(value: Any, field: str) -> float | None:
@@ -245,11 +229,13 @@ def stated_period(value: Any, field: str) -> float | None:
     return as_number(single, field)
 
 
-def _period(value: Any, excitation: str, where: str) -> float | None:
-    period = stated_period(value, f"{where}: period_s")
-    if period is None and excitation == "multisine":
-        raise InputError("missing; expected the period in s of a multisine", field=f"{where}: period_s")
-    return period
+def is_number(text: str) -> bool:
+    """Whether a text is one number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def numbers(array: Any, field: str) -> np.ndarray:
@@ -269,12 +255,3 @@ def kind_of(dtype: np.dtype) -> str:
     """What an array holds, in words."""
     words = {"O": "objects", "S": "bytes", "U": "text", "c": "complex numbers", "b": "booleans", "V": "structures"}
     return words.get(dtype.kind, str(dtype))
-
-
-def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: int = 0) -> None:
-    """Refuse NaN and Inf, saying where: sample number counted from the start of the record."""
-    good = np.isfinite(array)
-    if not good.all():
-        row, column = np.argwhere(~good)[0]
-        raise InputError(f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at sample "
-                         f"{start + row} of channel {names[column]}", field=field, value=float(array[row, column]))

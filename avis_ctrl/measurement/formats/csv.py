@@ -14,7 +14,7 @@ from __future__ import annotations
 import codecs
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TextIO
@@ -22,15 +22,15 @@ from typing import TextIO
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
-from avis_ctrl.measurement.formats.common import as_number, existing_file, reading, require_small
-from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_record, mapped, one_clock, pick
+from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
+from avis_ctrl.measurement.formats.common import existing_file, is_number, reading, require_small, within
+from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
 CHUNK = 1 << 16  # lines that are turned into numbers at once
 LONGEST_LINE = 1 << 20  # characters
 USUAL = {"t": r"t|time|t_s|time_s", "u": r"u_?\w*|a[xyz]?\d+", "y": r"y_?\w*|s[xyz]?\d+"}
-STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s")
+STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s", "excitation")
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 
 
@@ -41,7 +41,6 @@ class Layout:
     names: list[str]
     units: list[str | None]
     separator: str
-    decimal_comma: bool
     stated: dict[str, str]
     lines: int  # above the first line of numbers
 
@@ -121,10 +120,10 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
     titles = [title.strip() for title in line.split(separator)]
     if titles and not titles[-1]:  # a separator that ends every line
         titles = titles[:-1]
-    if all(_is_number(title.replace(",", ".")) for title in titles):
+    if all(is_number(title.replace(",", ".")) for title in titles):
         if numbered:  # a file without a header line, whose columns are known by number
             names = [str(k + 1) for k in range(len(titles))]
-            return Layout(names, [None] * len(names), separator, False, stated, count - 1)
+            return Layout(names, [None] * len(names), separator, stated, count - 1)
         raise InputError("expected a header line with the names of the columns, found numbers", field=f"line {count}",
                          value=line[:60])
     names, units = [], []
@@ -135,21 +134,13 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
     for name in names:
         if not name or names.count(name) > 1:
             raise InputError("expected different names of columns, none empty", field=f"line {count}", value=name)
-    return Layout(names, units, separator, False, stated, count)
+    return Layout(names, units, separator, stated, count)
 
 
 def _numbered(columns: Mapped | None) -> bool:
     """Whether all columns are given by number."""
     names = [name for role in ("t", "u", "y", "floor") for name in mapped(columns, role) or []]
     return bool(names) and all(name.isdigit() for name in names)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list[str]]:
@@ -181,10 +172,10 @@ def _followed_by_numbers(path: Path, layout: Layout) -> bool:
     with _open(path) as stream:
         below = (line for line in islice(_lines(stream), layout.lines, None) if line.strip())
         entries = [entry.strip().replace(",", ".") for entry in next(below, "").split(layout.separator)]
-    return any(entries) and all(_is_number(entry) for entry in entries if entry)
+    return any(entries) and all(is_number(entry) for entry in entries if entry)
 
 
-def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[Record, list[str], str]:
+def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSource, list[str], str]:
     with _open(path) as stream:
         lines = _lines(stream)
         layout = _layout(lines, _numbered(columns))
@@ -192,36 +183,25 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[Record, l
             stream.seek(0)
             lines = islice(_lines(stream), layout.lines, None)
         roles = _roles(layout, columns, path)
-        wanted = [name for names in roles.values() for name in names]
-        table = _table(lines, layout, sorted({layout.names.index(name) for name in wanted}))
-    place = {layout.names.index(name): at for at, name in
-             enumerate(sorted(set(wanted), key=layout.names.index))}
-    parts = {}
-    for role in ("u", "y", "floor"):
-        if roles[role] or role != "floor":
-            index = [layout.names.index(name) for name in roles[role]]
-            parts[role] = (roles[role], [layout.units[i] for i in index], table[:, [place[i] for i in index]])
+        use = [k for k, name in enumerate(layout.names) if any(name in names for names in roles.values())]
+        table = _table(lines, layout, use)
+    at = {layout.names[k]: i for i, k in enumerate(use)}
+    unit = dict(zip(layout.names, layout.units, strict=True))
+    parts = {role: Part(names, [unit[name] for name in names], table[:, [at[name] for name in names]])
+             for role, names in roles.items() if role != "t" and (names or role != "floor")}
     hints = _with_stated(hints, layout.stated)
-    time, unit = None, None
-    if roles["t"]:
-        index_t = layout.names.index(roles["t"][0])
-        time, unit = table[:, place[index_t]], layout.units[index_t]
-    rate, start, note = _clock(time, unit, hints)
-    record, notes = flat_record(path.stem, parts, rate, start, hints)
+    time = roles["t"][0] if roles["t"] else ""
+    rate, start, note = _clock(table[:, at[time]] if time else None, unit.get(time), hints)
+    record, notes = record_from(path.stem, parts, rate, start, hints)
     notes += [f"record {path.stem}: {note}"] if note else []
     return record, notes, layout.stated.get("rig", "")
 
 
 def _with_stated(hints: Hints, stated: dict[str, str]) -> Hints:
     """Hints completed by the comments of the file."""
-    found: dict[str, float | str] = {}
-    for field in STATED:
-        if field in stated and getattr(hints, field) is None:
-            text = stated[field].replace(",", ".")
-            found[field] = as_number(float(text) if _is_number(text) else text, f"comment {field}")
-    if "excitation" in stated and hints.excitation is None:
-        found["excitation"] = stated["excitation"]
-    return replace(hints, **found)  # type: ignore[arg-type]
+    texts = {field: stated[field].replace(",", ".") for field in STATED if field in stated}
+    with within("comment"):
+        return hints.completed({field: float(text) if is_number(text) else text for field, text in texts.items()})
 
 
 def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[float, float, str]:
@@ -276,7 +256,7 @@ def _misfit(chunk: list[str], row: int, layout: Layout, use: list[int]) -> Input
     for number, line in enumerate(chunk, row + 1):
         entries = line.split(layout.separator)
         for column in use if line.strip() else ():
-            if not _is_number(entries[column]) or "_" in entries[column]:
+            if not is_number(entries[column]) or "_" in entries[column]:
                 found = entries[column].strip()
                 return InputError("expected a number" if found else "expected a number, found nothing",
                                   field=f"line {number}, column {layout.names[column]}", value=found[:40])

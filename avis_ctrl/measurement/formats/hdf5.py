@@ -1,11 +1,17 @@
 """HDF5 campaign: several records of one rig in one file, read in pieces, written whole or not at all.
 
 Layout: attributes format = "avis-campaign", version = 1, rig; groups /records/<name> with the data sets u, y and,
-where it was measured, floor. A frequency response lies in the group /frf (see `stored_response`).
+where it was measured, floor.
+
+A frequency response lies in the group /frf in their place: data sets frequency_Hz (n,), value (n, n_y, n_u) complex,
+and one of: variance (n, n_y, n_u); coherence with the attribute averages; noise (n, n_y, n_y) with gram (n, n_u, n_u),
+as `FrequencyResponse` holds them. Attributes inputs, outputs, input_unit, output_unit; optional method, dof, and data
+sets measurement_noise, distortion.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -14,23 +20,24 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordHeader, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
     as_text,
     existing_file,
-    header_from,
     kind_of,
     printable,
     reading,
     require,
-    units_of,
+    require_small,
+    within,
 )
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
+from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, record_from
+from avis_ctrl.measurement.formats.response import COVARIANCES, stated_response
 from avis_ctrl.measurement.formats.stored import (
     Columns,
-    StoredRecord,
     access,
     attributes,
     full_name,
@@ -38,53 +45,81 @@ from avis_ctrl.measurement.formats.stored import (
     member,
     members,
     open_hdf5,
+    values,
 )
+from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 FORMAT, VERSION = "avis-campaign", 1
 ROLES = ("u", "y", "floor")
+# What each record states.
+STATED = {"sample_rate_Hz": "the sample rate in Hz", "excitation": f"one of {', '.join(EXCITATIONS)}",
+          "level_V": "the r.m.s. of the driven voltages", "start_s": "the time of the first sample in s"}
+# Of a response: attributes that have to be there, and data sets with the kinds of numbers that they hold.
+NAMED = {"inputs": "the channels' names", "outputs": "the channels' names", "input_unit": "such as 'V'",
+         "output_unit": "such as 'V'"}
+DATASETS = {"frequency_Hz": "fiu", "value": "fiuc", "coherence": "fiu", "variance": "fiu",
+            **dict.fromkeys(COVARIANCES, "fiuc")}
 CHUNK = 1 << 14  # samples of a record that lie together on disk
 
 
-def read(path: str | Path, rig: str | None = None) -> Campaign:
-    """An HDF5 campaign; its samples stay in the file until they are loaded.
+def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
+         hints: Hints | None = None) -> Campaign | FrequencyResponse:
+    """An HDF5 campaign, whose samples stay in the file until they are loaded, or its frequency response.
 
-    rig : name of the rig, in the place of the file's.
+    columns, hints : none of those of records, which the file states itself; rig : in the place of the file's.
 
     Raises
     ------
     InputError : not such a file, a missing or wrong attribute or data set; names file, record and field.
     """
-    path = existing_file(path)
+    path, hints = existing_file(path), hints or Hints()
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        stated = check_root(file)
-        group = member(file, "records")
-        if group is None:
-            raise InputError(f"missing; expected a group with one group per record; the file holds {listed(file)}",
-                             field="/records")
+        names = members(file)
+        response = "frf" in names and "records" not in names
+        used = ("averages", "relative_standard_deviation") if response else ()
+        for name, value in {"columns": columns, **vars(hints)}.items():
+            if value is not None and name not in used:
+                raise InputError("an HDF5 campaign states this itself; expected no such argument", field=name,
+                                 value=value)
+        stated = _check_root(file)
+        group = member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
-            raise InputError("expected a group, found a data set", field="/records")
-        records = tuple(_record(group, name, str(path)) for name in _in_order(group))
+            words = ("missing; expected a group with one group per record" if group is None else
+                     "expected a group, found a data set")
+            raise InputError(f"{words}; the file holds {_listed(file)}", field="/frf" if response else "/records")
+        if response:
+            with within("/frf"):
+                return _response(path, group, hints)
+        records = []
+        for name in _in_order(group):
+            with within(f"record {printable(name)}"):
+                records.append(_record(group, name, str(path)))
         if not records:
             raise InputError("expected at least one record; the group is empty", field="/records")
-        return Campaign(rig or stated, records, str(path))
+        return Campaign(rig or stated, tuple(records), str(path))
 
 
-def listed(group: h5py.Group) -> str:
+def _listed(group: h5py.Group) -> str:
     """What a group holds, in words."""
     return ", ".join(sorted(map(printable, members(group)))) or "nothing"
 
 
-def check_root(file: h5py.File) -> str:
+def _check_root(file: h5py.File) -> str:
     """Name of the rig, after format and version were checked."""
     found = attributes(file, "format", "version", "rig")
-    stated = as_text(require(found, "format", "attributes of the file", f"{FORMAT!r}"), "attribute format")
-    if stated != FORMAT:
-        raise InputError(f"expected {FORMAT!r}", field="attribute format", value=stated)
-    version = as_number(require(found, "version", "attributes of the file", f"{VERSION}"), "attribute version")
-    if version != VERSION:
-        raise InputError(f"expected {VERSION}, the version that this release reads", field="attribute version",
-                         value=version)
-    return as_text(require(found, "rig", "attributes of the file", "the name of the rig"), "attribute rig")
+    with within("attributes of the file"):
+        require(found, "format", f"{FORMAT!r}")
+        require(found, "version", f"{VERSION}")
+        check_version(found["format"], found["version"])
+        return as_text(require(found, "rig", "the name of the rig"), "rig")
+
+
+def check_version(stated: Any, version: Any) -> None:
+    """Refuse another format than that of a campaign, and another version."""
+    if (name := as_text(stated, "format")) != FORMAT:
+        raise InputError(f"expected {FORMAT!r}", field="format", value=name)
+    if (number := as_number(version, "version")) != VERSION:
+        raise InputError(f"expected {VERSION}, the version that this release reads", field="version", value=number)
 
 
 def _in_order(group: h5py.Group) -> list[str]:
@@ -97,55 +132,70 @@ def _in_order(group: h5py.Group) -> list[str]:
                                            for part in re.split(r"(\d+)", name)])
 
 
-def _record(group: h5py.Group, name: str, path: str) -> StoredRecord:
-    where, record = f"record {printable(name)}", member(group, name)
+def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
+    record = member(group, name)
     if not isinstance(record, h5py.Group):
-        raise InputError("expected a group with u and y, found a data set", field=where)
-    channels: dict[str, tuple[str, ...]] = {}
-    units: dict[str, str] = {}
-    columns: dict[str, tuple[Columns, ...]] = {}
-    samples = {}
+        raise InputError("expected a group with u and y, found a data set")
+    parts = {}
     for role in ROLES:
         dataset = member(record, role)
-        if dataset is None:
-            if role == "floor":
-                continue
-            raise InputError(f"missing; expected a data set (samples, channels); the record holds {listed(record)}",
-                             field=f"{where}: {role}")
-        samples[role], count = _shape(dataset, f"{where}: {role}")
-        stated = attributes(dataset, "names", "unit")
-        channels[role] = as_names(require(stated, "names", f"{where}: {role}", "the channels' names"),
-                                  f"{where}: {role} names", count)
-        units[role], factors = units_of(require(stated, "unit", f"{where}: {role}", "such as 'V'"), role, where,
-                                        count)
-        columns[role] = (Columns(full_name(dataset), factors),)
-    require_one_length(samples, where)
-    stated = attributes(record, "sample_rate_Hz", "excitation", "level_V", "start_s", "period_s")
-    return StoredRecord(header_from(stated, name, samples["u"], channels, units), path, columns)
+        if dataset is not None:
+            parts[role] = _part(dataset, role)
+        elif role != "floor":
+            raise InputError(f"missing; expected a data set (samples, channels); the record holds {_listed(record)}",
+                             field=role)
+    if "floor" in parts and tuple(parts["floor"].names) != FLOOR_NAMES:
+        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names",
+                         value=parts["floor"].names)
+    found = attributes(record, *STATED, "period_s")
+    for field, expected in STATED.items():
+        require(found, field, expected)
+    hints = Hints().completed(found)
+    assert hints.sample_rate_Hz is not None
+    return record_from(name, parts, hints.sample_rate_Hz, 0.0, hints, path)[0]
 
 
-def require_one_length(samples: dict[str, int], where: str) -> None:
-    """All parts of a record are equally long."""
-    if len(set(samples.values())) > 1:
-        lengths = ", ".join(f"{role} has {count}" for role, count in samples.items())
-        raise InputError(f"expected equally many samples; {lengths}", field=where)
-
-
-def _shape(dataset: Any, field: str) -> tuple[int, int]:
-    """(samples, channels) of a data set of real numbers."""
+def _part(dataset: Any, role: str) -> Part:
+    """What a data set of (samples, channels) says of its channels; the samples stay where they are."""
     if not isinstance(dataset, h5py.Dataset):
-        raise InputError("expected a data set, found a group", field=field)
+        raise InputError("expected a data set, found a group", field=role)
     shape, dtype = layout(dataset)
     if dtype.kind not in "fiu":
-        raise InputError("expected real numbers", field=field, value=f"data set of {kind_of(dtype)}")
+        raise InputError("expected real numbers", field=role, value=f"data set of {kind_of(dtype)}")
     if shape is None or len(shape) not in (1, 2):
-        raise InputError("expected shape (samples, channels)", field=field, value=shape)
+        raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
         raise InputError(f"expected (samples, channels) with more samples than channels; {samples} samples of "
-                         f"{count} channels look transposed",
-                         field=field, value=shape)
-    return samples, count
+                         f"{count} channels look transposed", field=role, value=shape)
+    stated = attributes(dataset, "names", "unit")
+    with within(role):
+        names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
+    return Part(as_names(names, f"{role} names", count), unit, Columns(full_name(dataset), samples))
+
+
+def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
+    fields = {name: _numbers(path, group, name, kinds) for name, kinds in DATASETS.items()}
+    if fields["frequency_Hz"] is None or fields["value"] is None:
+        raise InputError(f"expected frequency_Hz and value; the group holds {_listed(group)}")
+    stated = attributes(group, *NAMED, "method", "dof", "averages")
+    for field, expected in NAMED.items():
+        require(stated, field, expected)
+    return stated_response(fields | stated, hints)
+
+
+def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
+    """The data set of that name, None if there is none."""
+    dataset = member(group, name)
+    if dataset is None:
+        return None
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError("expected numbers, found a group", field=name)
+    shape, dtype = layout(dataset)
+    if dtype.kind not in kinds:
+        raise InputError(f"expected numbers, found {kind_of(dtype)}", field=name)
+    require_small(path, math.prod(shape or ()) * dtype.itemsize)
+    return values(dataset)
 
 
 def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20) -> None:
@@ -193,3 +243,26 @@ def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None
 def _roles(header: RecordHeader) -> list[tuple[str, tuple[str, ...], str]]:
     roles = [("u", header.u_names, header.u_unit), ("y", header.y_names, header.y_unit)]
     return roles + ([("floor", header.floor_names, header.floor_unit)] if header.floor_names else [])
+
+
+def write_frequency_response(path: str | Path, response: FrequencyResponse, rig: str = "unnamed") -> None:
+    """Write a frequency response as an HDF5 campaign without records; under its name only when complete.
+
+    Raises
+    ------
+    InputError : a place that cannot be written; the file is then as it was.
+    ComputationError : the disk refuses; the file is then as it was.
+    """
+    with replacing(Path(path)) as file:
+        file.attrs.update({"format": FORMAT, "version": VERSION, "rig": rig})
+        group = file.create_group("frf")
+        group["frequency_Hz"], group["value"] = response.frequency_Hz, np.asarray(response.value, complex)
+        for field in COVARIANCES:
+            if getattr(response, field) is not None:
+                group[field] = getattr(response, field)
+        if response.entry_variance is not None:
+            group["variance"] = response.entry_variance
+        for field in ("inputs", "outputs"):
+            group.attrs[field] = np.array(getattr(response, field), dtype=h5py.string_dtype())
+        for field in ("input_unit", "output_unit", "method", "dof"):
+            group.attrs[field] = getattr(response, field)

@@ -1,44 +1,33 @@
-"""MATLAB .mat files, v5 and v7.3, in two layouts.
+"""MATLAB .mat files, v5 and v7.3: records in two layouts, or a frequency response.
 
 Layout A, the contract's: a struct array (or cell array of structs) `records` with the fields u, y and sample_rate_Hz,
 and excitation, level_V, start_s, period_s (empty, 0 or NaN where not periodic), floor, u_names, y_names, u_unit,
-y_unit, floor_unit, t where they are known; beside it `rig`. Records of v7.3 files stay on disk.
+y_unit, floor_unit, t where they are known; beside it `rig`.
 
 Layout B, flat variables of one record: u, y, t or fs (Fs, sample_rate_Hz) or Ts, optionally floor, u_names, y_names,
 u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a mapping of columns says which variable is what.
 
-Rows or columns may be the samples; what cannot be told apart is refused.
+A frequency response is frequency_Hz, H, variance or coherence with averages, inputs, outputs and their units.
+
+Samples of v7.3 files stay on disk. Rows or columns may be the samples; what cannot be told apart is refused.
 """
 
 from __future__ import annotations
 
-import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import matlab_records, matlab_v5, matlab_v73
-from avis_ctrl.measurement.formats.common import as_text, existing_file, reading, require_small
-from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_record, mapped, pick
-from avis_ctrl.measurement.formats.matlab_response import response
-from avis_ctrl.measurement.formats.matlab_shapes import (
-    USUAL,
-    clock,
-    empty,
-    matrix,
-    oriented,
-    sample_count,
-    stated_names,
-    unit_label,
-    usual,
-    with_stated,
-)
-from avis_ctrl.measurement.formats.matlab_tree import overview
+from avis_ctrl.measurement.formats.common import as_names, existing_file, reading
+from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe
+from avis_ctrl.measurement.formats.records import Hints, Mapped
+from avis_ctrl.measurement.formats.response import stated_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 # "MAT-File Format", level 4: thousands are the byte order (0 little, 1 big endian), tens the type of the numbers, ones
@@ -63,10 +52,8 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         if "records" in tree and usual_names:
             return matlab_records.campaign(path, tree, columns, rig, hints)
         if "frequency_Hz" in tree and "H" in tree and usual_names:
-            return response(tree, hints)
-        record, notes = _flat(path, tree, columns, hints)
-        stated = rig or (UNNAMED if empty(tree.get("rig")) else as_text(tree["rig"], "rig"))
-        return Campaign(stated, (record,), str(path), tuple(notes))
+            return _response(tree, hints)
+        return matlab_records.flat_campaign(path, tree, columns, rig, hints)
 
 
 def variables(path: Path) -> dict[str, Any]:
@@ -95,47 +82,62 @@ def is_version_4(head: bytes) -> bool:
     return False
 
 
-def _flat(path: Path, tree: Mapping[str, Any], columns: Mapped | None,
-          hints: Hints) -> tuple[Record, list[str]]:
-    """Layout B."""
-    chosen, hints = {}, with_stated(hints, tree)
-    for role in USUAL:
-        names = mapped(columns, role)
-        if names is None:
-            names = usual(tree, role)
-        if not role.endswith("_names"):  # those may be the names themselves
-            pick(names, list(tree), role)
-        chosen[role] = names
-    for role in ("u", "y"):
-        if not chosen[role] and (role == "y" or hints.excitation not in ("rest", "floor")):
-            raise InputError(f"which variable is it? The file has {overview(tree)}; say with columns (such as "
-                             "u=vir, y=qm, t=t)", field=role)
-    matrices = {role: [matrix(tree[name], name) for name in chosen[role]] for role in ("u", "y", "floor")
-                if chosen[role] or role == "u"}
-    require_small(path, 8 * sum(math.prod(item.shape) for items in matrices.values() for item in items))
-    rate, start, note, known = clock(tree, chosen, hints)
-    stated = {role: stated_names(chosen[f"{role}_names"], tree, f"{role}_names",
-                                 1 if len(matrices[role]) == 1 and 1 in matrices[role][0].shape else None)
-              for role in ("u", "y") if chosen[f"{role}_names"] and matrices[role]}
-    counts = {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1}
-    samples = sample_count(matrices, "flat variables", counts, known)
-    parts: dict[str, tuple[Sequence[str], Sequence[str | None], np.ndarray]] = {}
-    for role, items in matrices.items():
-        arrays = [oriented(item, samples, name) for item, name in zip(items, chosen[role], strict=True)]
-        array = np.hstack([np.zeros((samples, 0)), *arrays])
-        labels = stated.get(role) or _default_names(chosen[role], arrays)
-        if len(labels) != array.shape[1]:
-            raise InputError(f"expected {array.shape[1]} names, one per channel; there are {len(labels)}",
-                             field=f"{role}_names", value=labels)
-        parts[role] = (labels, [unit_label(tree, role)] * array.shape[1], array)
-    record, notes = flat_record("00", parts, rate, start, hints)
-    return record, notes + ([note] if note else [])
+def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
+    """The frequency response that the variables hold.
+
+    H is (n, n_y, n_u) or, as in an frd object's ResponseData, (n_y, n_u, n); MATLAB drops trailing ones.
+
+    Raises
+    ------
+    InputError : a variable that is missing, of another kind or shape, or whose dimensions cannot be told apart.
+    """
+    frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
+    n_y, n_u = _sizes(tree, H, len(frequency))
+    fields = {"input_unit": "V", "output_unit": "V", "outputs": [f"y{i + 1}" for i in range(n_y)],
+              "inputs": [f"u{i + 1}" for i in range(n_u)]}
+    fields |= {field: tree[field] for field in fields if field in tree}
+    for field, count in (("outputs", n_y), ("inputs", n_u)):
+        as_names(fields[field], field, count)
+    shaped = {field: _lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
+              for field in ("H", "variance", "coherence") if field in tree}
+    averages = {"averages": _array(tree, "averages")} if "averages" in tree else {}
+    return stated_response({"frequency_Hz": frequency, "value": shaped.pop("H"), **fields, **shaped, **averages}, hints)
 
 
-def _default_names(variables_: Sequence[str], arrays: Sequence[np.ndarray]) -> tuple[str, ...]:
-    """Variables of one channel give their own names; the columns of a matrix are numbered."""
-    names: list[str] = []
-    for variable, array in zip(variables_, arrays, strict=True):
-        count = array.shape[1]
-        names += [variable] if count == 1 else [f"{variable}{i + 1}" for i in range(count)]
-    return tuple(names)
+def _array(tree: Mapping[str, Any], name: str) -> np.ndarray:
+    value = tree[name]
+    if not isinstance(value, Matrix) or value.kind not in "fiuc":
+        raise InputError("expected a numeric array", field=name, value=describe(value))
+    return value.read()
+
+
+def _sizes(tree: Mapping[str, Any], H: np.ndarray, lines: int) -> tuple[int, int]:
+    """Numbers of outputs and inputs, from their names or from a three-dimensional H."""
+    if "outputs" in tree and "inputs" in tree:
+        return len(as_names(tree["outputs"], "outputs")), len(as_names(tree["inputs"], "inputs"))
+    if H.size == lines:
+        return 1, 1
+    if H.ndim == 3 and (H.shape[0] == lines) != (H.shape[2] == lines):
+        return H.shape[1:] if H.shape[0] == lines else H.shape[:2]
+    raise InputError("expected inputs and outputs, names that tell which dimension is what", field="H", value=H.shape)
+
+
+def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> np.ndarray:
+    """(n, n_y, n_u) of an array of that shape or of (n_y, n_u, n), trailing ones dropped."""
+    n, n_y, n_u = sizes
+
+    def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
+        while len(shape) > 2 and shape[-1] == 1:
+            shape = shape[:-1]
+        return shape
+    first = padded(array.shape) == padded((n, n_y, n_u))
+    last = padded(array.shape) == padded((n_y, n_u, n))
+    if n_y == n_u == 1 and array.size == n:
+        return array.reshape(sizes)
+    if first and last:
+        raise InputError(f"as many lines as channels ({n}): which dimension is the frequency cannot be told",
+                         field=field, value=array.shape)
+    if not first and not last:
+        raise InputError(f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field,
+                         value=array.shape)
+    return array.reshape(sizes) if first else np.moveaxis(array.reshape(n_y, n_u, n), 2, 0)

@@ -1,9 +1,12 @@
-"""Struct array `records` of a .mat file: a campaign. What a flat file may leave out, a record may leave out, too."""
+"""Campaigns in .mat files: the struct array `records`, or the flat variables of one record.
+
+What a flat file may leave out, a record may leave out, too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,29 +14,27 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordSource, ranges
-from avis_ctrl.measurement.formats.common import as_names, as_number, as_text, require_finite, units_of
-from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_header, mapped, one_clock, root_mean_square
-from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION
-from avis_ctrl.measurement.formats.matlab_shapes import (
-    PERIODS,
-    USUAL,
-    clock,
-    empty,
-    matrix,
-    oriented,
-    plain,
-    sample_count,
-    stated_names,
-    usual,
-    with_stated,
+from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
+from avis_ctrl.measurement.formats.common import (
+    as_names,
+    as_number,
+    as_text,
+    numbers,
+    require_small,
+    within,
 )
-from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe, overview
-from avis_ctrl.measurement.formats.stored import Columns, StoredRecord, open_hdf5
+from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
+from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
+from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
+from avis_ctrl.measurement.formats.stored import Columns
+from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
+MUCH_LONGER = 10  # a record has at least that many times more samples than channels, where names do not say
+USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output"), "t": ("t", "time"), "floor": ("floor",),
+         "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"), "u_names": ("u_names",), "y_names": ("y_names",)}
+PERIODS = ("Ts", "dt")
 # What may stand beside `records` for all of them.
 SHARED = ("u_names", "y_names", "u_unit", "y_unit", "floor_unit", *USUAL["sample_rate_Hz"], *PERIODS)
-PIECE = 1 << 18  # samples of u that are looked at together
 
 
 def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign:
@@ -46,37 +47,38 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
     ------
     InputError : everything that is missing, of all records, in one line; a field that is wrong, with its record.
     """
-    _check_version(tree)
+    check_version(tree.get("format", FORMAT), _plain(tree.get("version", VERSION)))
     records = _structs(tree)
-    names = [as_text(record["name"], f"records({i + 1}).name") if not empty(record.get("name")) else f"{i:02d}"
+    names = [as_text(record["name"], f"records({i + 1}).name") if not _empty(record.get("name")) else f"{i:02d}"
              for i, record in enumerate(records)]
     for name in names:
         if names.count(name) > 1:
             raise InputError("expected different names of records", field="records: name", value=name)
-    beside = {key: tree[key] for key in SHARED if not empty(tree.get(key))}
-    complete = [beside | {key: value for key, value in record.items() if not empty(value)} for record in records]
+    beside = {key: tree[key] for key in SHARED if not _empty(tree.get(key))}
+    complete = [beside | {key: value for key, value in record.items() if not _empty(value)} for record in records]
     _require(dict(zip(names, complete, strict=True)), hints)
     built: list[RecordSource] = []
-    notes = [] if rig or not empty(tree.get("rig")) else [f"rig not stated; taken as {UNNAMED!r}"]
+    notes = [] if rig or not _empty(tree.get("rig")) else [f"rig not stated; taken as {UNNAMED!r}"]
     for name, fields in zip(names, complete, strict=True):
-        with _within(f"record {name}"):
-            naming = {role: given for role in ("u", "y") if (given := mapped(columns, f"{role}_names"))}
-            end = built[-1].header.start_s + built[-1].header.duration_s if built else None
-            own = hints if not built else replace(hints, start_s=None)
-            record, assumed = _record(path, name, {**tree, **fields}, fields, naming, own, end)
+        end = built[-1].header.start_s + built[-1].header.duration_s if built else None
+        with within(f"record {name}"):
+            own = _own_hints(hints if not built else replace(hints, start_s=None), fields)
+            record, assumed = _record(path, name, {**tree, **fields}, fields, columns, own, end)
         built.append(record)
         notes += assumed
     harmonised, assumed = one_clock(built)
-    stated = rig or (UNNAMED if empty(tree.get("rig")) else as_text(tree["rig"], "rig"))
-    return Campaign(stated, harmonised, str(path), (*notes, *assumed))
+    return Campaign(_rig(rig, tree), harmonised, str(path), (*notes, *assumed))
 
 
-def _check_version(tree: Mapping[str, Any]) -> None:
-    stated = as_text(tree.get("format", FORMAT), "format")
-    if stated != FORMAT:
-        raise InputError(f"expected {FORMAT!r}", field="format", value=stated)
-    if "version" in tree and (version := as_number(plain(tree["version"]), "version")) != VERSION:
-        raise InputError(f"expected {VERSION}, the version that this release reads", field="version", value=version)
+def flat_campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None,
+                  hints: Hints) -> Campaign:
+    """The campaign of one record whose fields are the variables of the file; columns : which variable is what."""
+    record, notes = _record(path, "00", tree, tree, columns, _with_stated(hints, tree), None)
+    return Campaign(_rig(rig, tree), (record,), str(path), tuple(notes))
+
+
+def _rig(rig: str | None, tree: Mapping[str, Any]) -> str:
+    return rig or (UNNAMED if _empty(tree.get("rig")) else as_text(tree["rig"], "rig"))
 
 
 def _structs(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -93,112 +95,209 @@ def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
     missing: dict[str, list[str]] = {}
     for name, fields in records.items():
         excitation = hints.excitation or (fields.get("excitation") if isinstance(fields.get("excitation"), str) else "")
-        with _within(f"record {name}"):
-            period = with_stated(hints, {"period_s": fields.get("period_s")}).period_s
+        with within(f"record {name}"):
+            period = _with_stated(hints, {"period_s": fields.get("period_s")}).period_s
         timed = hints.sample_rate_Hz or any(key in fields for key in (*USUAL["t"], *USUAL["sample_rate_Hz"], *PERIODS))
-        for what, there in (("u, the voltages played (zeros at rest)", usual(fields, "u")),
-                            ("y, what the sensors gave", usual(fields, "y")),
+        for what, there in (("u, the voltages played (zeros at rest)", _usual(fields, "u")),
+                            ("y, what the sensors gave", _usual(fields, "y")),
                             ("sample_rate_Hz, fs or a time vector t", timed),
                             ("period_s, the period in s of a multisine (not 0 or NaN)",
                              period or excitation != "multisine")):
             if not there:
                 missing.setdefault(what, []).append(name)
     if missing:
-        everywhere = len(records)
-        words = [what if len(names) == everywhere else f"{what} (record{'s' if len(names) > 1 else ''} "
+        words = [what if len(names) == len(records) else f"{what} (record{'s' if len(names) > 1 else ''} "
                  f"{', '.join(names)})" for what, names in missing.items()]
         held = overview({key: 0 for fields in records.values() for key in fields})
         raise InputError(f"missing: {'; '.join(words)}; the records have {held}", field="records")
 
 
-@contextmanager
-def _within(where: str) -> Iterator[None]:
-    """Refusals inside name the record."""
-    try:
-        yield
-    except InputError as error:
-        if error.file is not None or (error.field or "").startswith(where):
-            raise
-        raise InputError(error.expected, field=f"{where}: {error.field}" if error.field else where,
-                         value=error.value) from None
-
-
-def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str, Any], naming: Mapping[str, list[str]],
-            hints: Hints, end_s: float | None) -> tuple[RecordSource, list[str]]:
-    """A record, on disk where the file is v7.3, in memory otherwise.
-
-    tree : where the names that the caller gives are looked up; end_s : of the record before, None for the first.
-    """
-    where, notes = f"record {name}", []
-    chosen = {role: usual(fields, role) for role in USUAL}
-    matrices = {role: matrix(fields[chosen[role][0]], role) for role in ("u", "y", "floor") if chosen[role]}
-    rate, start, note, known = clock(fields, chosen, hints)
-    notes += [f"{where}: {note}"] if note else []
-    if not chosen["sample_rate_Hz"] and hints.sample_rate_Hz is None and chosen["t"]:
-        notes.append(f"{where}: sample rate not stated; {rate:.9g} Hz by {chosen['t'][0]}")
-    channels = _channels(matrices, tree, fields, naming)
-    samples = sample_count({role: [item] for role, item in matrices.items()}, where,
-                           {role: len(some) for role, some in channels.items()}, known)
-    for role, item in matrices.items():
-        if role not in channels:
-            count = item.shape[1] if item.shape[0] == samples else item.shape[0]
-            channels[role] = tuple(f"{role}{i + 1}" for i in range(count))
-            notes.append(f"{where}: {role}_names not stated; numbered {role}1 to {role}{count}")
-    units, factors = {}, {}
-    for role in matrices:
-        label: Any = {"u": hints.u_unit, "y": hints.y_unit}.get(role) or plain(fields.get(f"{role}_unit"))
-        if label is None:
-            label = "m/s" if role == "floor" else "V"
-            notes.append(f"{where}: {role}_unit not stated; taken as {label}")
-        units[role], factors[role] = units_of(label, role, where, len(channels[role]))
-    hints = _own_hints(hints, fields)
-    if hints.start_s is None and end_s is not None and (not chosen["t"] or start < end_s):
-        start = end_s
-        notes.append(f"{where}: start_s not stated; it follows the record before it")
-    if all(item.dataset for item in matrices.values()):
-        places = {role: (Columns(str(item.dataset), factors[role], channels_first=item.shape[0] == samples),)
-                  for role, item in matrices.items()}
-        rms = _stored_rms(path, places["u"][0], channels["u"], samples, hints)
-        header, assumed = flat_header(name, samples, rate, start, channels, units, rms, hints)
-        return StoredRecord(header, str(path), places), notes + assumed
-    arrays = {}
-    for role, item in matrices.items():
-        arrays[role] = oriented(item, samples, role) * np.array(factors[role])
-        require_finite(arrays[role], channels[role], role)
-    header, assumed = flat_header(name, samples, rate, start, channels, units, root_mean_square(arrays["u"]), hints)
-    return Record(header, arrays["u"], arrays["y"], arrays.get("floor")), notes + assumed
-
-
-def _channels(matrices: Mapping[str, Matrix], tree: Mapping[str, Any], fields: Mapping[str, Any],
-              naming: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
-    """Names of the channels of each role, where somebody states them."""
-    channels: dict[str, tuple[str, ...]] = {}
-    for role, item in matrices.items():
-        count = 1 if 1 in item.shape else None
-        if role == "floor":
-            channels[role] = FLOOR_NAMES
-        elif role in naming:
-            channels[role] = stated_names(naming[role], tree, f"{role}_names", count)
-        elif f"{role}_names" in fields:
-            channels[role] = as_names(plain(fields[f"{role}_names"]), f"{role}_names", count)
-    return channels
-
-
 def _own_hints(hints: Hints, fields: Mapping[str, Any]) -> Hints:
     """Hints completed by the record; a period that the caller gives is that of the multisines."""
-    stated = with_stated(replace(hints, period_s=None), fields)
+    stated = _with_stated(replace(hints, period_s=None), fields)
     given = hints.period_s if stated.excitation in (None, "multisine") else None
     return replace(stated, period_s=stated.period_s if given is None else given)
 
 
-def _stored_rms(path: Path, place: Columns, names: Sequence[str], samples: int, hints: Hints) -> float | None:
-    """R.m.s. of u on disk, piece by piece; None where nobody asks for it."""
-    if hints.level_V is not None and (hints.excitation is not None or hints.period_s is not None):
-        return None
-    total = 0.0
-    with open_hdf5(path) as file:
-        for start, stop in ranges(samples, PIECE):
-            u = place.rows(file, start, stop)
-            require_finite(u, names, "u", start)
-            total = float(np.hypot(total, root_mean_square(u) * np.sqrt((stop - start) / samples)))
-    return total
+def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str, Any], columns: Mapped | None,
+            hints: Hints, end_s: float | None) -> tuple[RecordSource, list[str]]:
+    """A record, on disk where the file is v7.3 and each role has one variable, in memory otherwise.
+
+    tree : where names of channels are looked up; end_s : of the record before, None for the first.
+    """
+    notes, chosen = [], _chosen(fields, columns)
+    flat = fields is tree
+    for role in ("u", "y"):
+        if not chosen[role] and (role == "y" or hints.excitation not in ("rest", "floor")):
+            raise InputError(f"which variable is it? The file has {overview(fields)}; say with columns (such as "
+                             "u=vir, y=qm, t=t)", field=role)
+    matrices = {role: [_matrix(fields[variable], variable) for variable in chosen[role]]
+                for role in ("u", "y", "floor") if chosen[role] or role == "u"}
+    rate, start, note, known = _clock(fields, chosen, hints)
+    notes += [note] if note else []
+    if not chosen["sample_rate_Hz"] and hints.sample_rate_Hz is None and chosen["t"]:
+        notes.append(f"sample rate not stated; {rate:.9g} Hz by {chosen['t'][0]}")
+    stated = _stated_names(matrices, chosen, tree)
+    samples = _sample_count(matrices, {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1},
+                           known)
+    if hints.start_s is None and end_s is not None and (not chosen["t"] or start < end_s):
+        start = end_s
+        notes.append("start_s not stated; it follows the record before it")
+    stored = all(len(items) == 1 and items[0].dataset for items in matrices.values())
+    if not stored:
+        require_small(path, 8 * sum(math.prod(item.shape) for items in matrices.values() for item in items))
+    parts = {}
+    for role, items in matrices.items():
+        counts = [math.prod(item.shape) // samples for item in items]
+        names = stated.get(role)
+        if names is None:
+            # Variables of one channel give their own names; the columns of a matrix are numbered.
+            names = tuple(variable if flat and count == 1 else f"{variable if flat else role}{i + 1}"
+                          for variable, count in zip(chosen[role], counts, strict=True) for i in range(count))
+            notes += [] if flat else [f"{role}_names not stated; numbered {names[0]} to {names[-1]}"]
+        elif len(names) != sum(counts):
+            raise InputError(f"expected {sum(counts)} names, one per channel; there are {len(names)}",
+                             field=f"{role}_names", value=names)
+        label = _plain(fields.get(f"{role}_unit"))
+        place = Columns(str(items[0].dataset), samples, items[0].shape[0] == samples) if stored else np.hstack(
+            [np.zeros((samples, 0)), *(_oriented(item, samples, role) for item in items)])
+        parts[role] = Part(names, None if _empty(label) else label, place)
+    record, assumed = record_from(name, parts, rate, start, hints, str(path) if stored else "")
+    return record, [*(f"record {name}: {note}" for note in notes), *assumed]
+
+
+def _chosen(fields: Mapping[str, Any], columns: Mapped | None) -> dict[str, list[str]]:
+    """Variables of each role, as the caller mapped them or as they are usually called."""
+    chosen = {}
+    for role in USUAL:
+        names = mapped(columns, role)
+        if names is None:
+            names = _usual(fields, role)
+        elif not role.endswith("_names"):  # those may be the names themselves
+            pick(names, list(fields), role)
+        chosen[role] = names
+    return chosen
+
+
+def _stated_names(matrices: Mapping[str, Sequence[Matrix]], chosen: Mapping[str, list[str]],
+                  tree: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Names of the channels of each role, where somebody states them."""
+    stated: dict[str, tuple[str, ...]] = {"floor": FLOOR_NAMES} if "floor" in matrices else {}
+    for role in ("u", "y"):
+        items = matrices[role]
+        if items and (given := chosen[f"{role}_names"]):
+            one = len(items) == 1 and 1 in items[0].shape
+            stated[role] = _names(given, tree, f"{role}_names", 1 if one else None)
+    return stated
+
+
+def _plain(value: Any) -> Any:
+    """A small matrix as an array."""
+    return value.read() if isinstance(value, Matrix) and math.prod(value.shape) <= 1000 else value
+
+
+def _empty(value: Any) -> bool:
+    """Nothing, an array of no elements, an empty cell array, an empty text: how struct arrays leave a field out."""
+    if isinstance(value, Matrix):
+        return 0 in value.shape
+    return value is None or (isinstance(value, (list, str)) and not value)
+
+
+def _usual(tree: Mapping[str, Any], role: str) -> list[str]:
+    """The variable or field that is called what a role usually is, if there is one."""
+    return [name for name in USUAL[role] if not _empty(tree.get(name))][:1]
+
+
+def _matrix(value: Any, field: str) -> Matrix:
+    """A real matrix with samples in it, or an InputError that says what it is."""
+    if not isinstance(value, Matrix) or value.kind not in "fiu" or len(value.shape) != 2:
+        words = f"a {value.kind}" if isinstance(value, Unreadable) else describe(value)
+        raise InputError("expected a real matrix, samples by channels", field=field, value=words)
+    if 0 in value.shape:
+        raise InputError("expected samples, found an empty array", field=field)
+    return value
+
+
+def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[str, int],
+                 known: int | None = None) -> int:
+    """Number of samples that all matrices share, whichever way round they are.
+
+    channels : number of channels of a role, where names tell it; known : length of the time vector.
+
+    Raises
+    ------
+    InputError : no common length; square matrices; rows and columns that could both be the samples.
+    """
+    shapes = {role: [item.shape for item in items] for role, items in matrices.items()}
+    shown = ", ".join(f"{role} is {' and '.join('x'.join(map(str, shape)) for shape in some)}"
+                      for role, some in shapes.items())
+    possible = None if known is None else {known}
+    for role, some in shapes.items():
+        for rows, columns in some:
+            lengths = {rows, columns} if min(rows, columns) > 1 else {max(rows, columns)}
+            if role in channels:
+                lengths = {length for length, others in ((rows, columns), (columns, rows)) if others == channels[role]}
+                if not lengths:
+                    raise InputError(f"expected {channels[role]} channels, as there are names; it is {rows}x{columns}",
+                                     field=role)
+            possible = lengths if possible is None else possible & lengths
+    if not possible:
+        also = "" if known is None else f", t has {known}"
+        raise InputError(f"expected equally many samples; {shown}{also}")
+    samples = max(possible)
+    square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
+    if square or (len(possible) > 1 and samples < MUCH_LONGER * min(possible)):
+        raise InputError(f"rows and columns could both be the samples: {shown}; expected names of the channels or a "
+                         "time vector that distinguishes them")
+    return samples
+
+
+def _oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
+    """(samples, channels) float64."""
+    array = numbers(item.read(), field)
+    return array if array.shape[0] == samples else array.T
+
+
+def _with_stated(hints: Hints, tree: Mapping[str, Any]) -> Hints:
+    """Hints completed by variables or fields of the same names."""
+    return hints.completed({field: _plain(tree[field]) for field in ("level_V", "start_s", "period_s", "excitation")
+                            if not _empty(tree.get(field))})
+
+
+def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int | None) -> tuple[str, ...]:
+    """Channel names from a variable of that name, or the names that the caller wrote instead of one."""
+    if len(value) == 1 and value[0] in tree:
+        return as_names(_plain(tree[value[0]]), field, count)
+    if len(value) == 1 and count is None:
+        raise InputError("no variable of that name, and too few for names of the channels themselves (A+B+...); the "
+                         f"file has {overview(tree)}", field=field, value=value[0])
+    return as_names(list(value), field, count)
+
+
+def _clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],
+           hints: Hints) -> tuple[float, float, str, int | None]:
+    """Sample rate [Hz], first time [s], note, number of samples (None where there is no time vector)."""
+    start, note, known, rate = 0.0, "", None, None
+    if chosen["t"]:
+        name = chosen["t"][0]
+        times = _matrix(tree[name], name)
+        if 1 not in times.shape:
+            raise InputError("expected a vector of time stamps in s", field=name, value=describe(times))
+        rate, start, note = sample_rate_from(numbers(times.read(), name).reshape(-1), field=name)
+        known = max(times.shape)
+    stated, source = hints.sample_rate_Hz, "hint sample_rate_Hz"
+    if stated is None and chosen["sample_rate_Hz"]:
+        source = chosen["sample_rate_Hz"][0]
+        stated = as_number(_plain(tree[source]), source)
+    for name in PERIODS:
+        if stated is None and rate is None and name in tree:
+            source, period = name, as_number(_plain(tree[name]), name)
+            if period <= 0:
+                raise InputError("expected a positive sampling period in s", field=name, value=period)
+            stated = 1 / period
+    if stated is not None and rate is not None and abs(stated / rate - 1) > 1e-3:
+        raise InputError(f"expected {rate:.9g} Hz, as the time vector says", field=source, value=stated)
+    result = stated if stated is not None else rate
+    if result is None:
+        raise InputError(f"expected t, fs or sample_rate_Hz; the file has {overview(tree)}", field="sample rate")
+    return result, start, note, known

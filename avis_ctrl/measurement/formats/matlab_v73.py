@@ -17,13 +17,13 @@ from avis_ctrl.measurement.formats.common import printable, reading, require_sma
 from avis_ctrl.measurement.formats.matlab_tree import DEEPEST, EMPTY, MOST_CELLS, TOO_DEEP, Matrix, Unreadable
 from avis_ctrl.measurement.formats.stored import (
     attributes,
-    dataset_of,
     full_name,
     layout,
     member,
     members,
     open_hdf5,
     values,
+    values_in,
 )
 
 MOST_ITEMS = 200_000  # of a file: references may lead in circles
@@ -121,9 +121,9 @@ class Tree:
         complex_parts = dtype.names == ("real", "imag")
 
         def read() -> np.ndarray:
-            with reading(path, printable(name)), open_hdf5(path) as file:
+            with reading(path, printable(name)):
                 require_small(path, math.prod(stored) * dtype.itemsize)
-                array = values(dataset_of(file, name)).T
+                array = values_in(path, name).T
             if array.shape == stored[::-1] and array.dtype == dtype:
                 if not complex_parts:
                     return array

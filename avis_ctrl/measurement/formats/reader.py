@@ -14,14 +14,14 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
-from avis_ctrl.measurement.formats.flat import ROLES, Hints, hints_from, mapped, with_header
+from avis_ctrl.measurement.formats.records import ROLES, hints_from, mapped, with_header
 from avis_ctrl.measurement.formats.stored import attributes, member, members, open_hdf5
-from avis_ctrl.measurement.formats.stored_response import read_frequency_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.layouts import FORMATS
 
 __all__ = ["FORMATS", "parse_columns", "read_measurements"]
 
+NAMING = ("u_names", "y_names")
 # Suffixes of texts that would pass for CSV.
 NO_MEASUREMENT = {".py", ".m", ".md", ".rst", ".toml", ".json", ".yaml", ".yml", ".html", ".ipynb", ".tex", ".sh"}
 
@@ -50,40 +50,53 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
 
     columns : roles (t, u, y, floor, ...) to names, for files of flat columns; u_names and y_names to the name of a
     MATLAB variable or, in any format, to the channels' names themselves in the order of the file; rig : name of the
-    rig, in the place of the file's; hints : what the file does not say, see `flat.Hints` (sample_rate_Hz, excitation,
-    period_s, level_V, start_s, u_unit, y_unit, averages, relative_standard_deviation). A self-describing HDF5 campaign
-    takes none of the hints for records: it states them.
+    rig, in the place of the file's; hints : what the file does not say, see `records.Hints`. A self-describing HDF5
+    campaign takes none of the hints for records: it states them.
 
     Raises
     ------
     InputError : one line that names the file, the field, its value and what was expected.
     """
-    known = hints_from(hints)
-    path = Path(path)
-    naming = {role: names for role in ("u_names", "y_names") if (names := mapped(columns, role))}
-    plain = {role: names for role, names in (columns or {}).items() if role not in naming} or None
+    known, path = hints_from(hints), Path(path)
+    naming = {role: names for role in NAMING if (names := mapped(columns, role))}
+    plain = {role: names for role, names in (columns or {}).items() if role not in NAMING} or None
     with reading(path):
         if os.path.isdir(path):  # False, not an error, for names that no file can have
             return renamed(csv.read(path, plain, rig, known), naming)
         path = existing_file(path)
         if path.suffix.lower() in NO_MEASUREMENT:
-            raise InputError(f"not a measurement file ({path.suffix}); expected HDF5, MATLAB .mat, UFF 58 or CSV",
-                             file=path)
+            raise InputError(f"not a measurement file ({path.suffix}); expected HDF5, MATLAB .mat, UFF 58 or CSV")
         with path.open("rb") as stream:
             head = stream.read(4096)
+        kind = _format(path, head)
+        if kind == "matlab":
+            measured = matlab.read(path, columns, rig, known)
+            if isinstance(measured, Campaign):
+                return measured  # names told which way round a matrix is, or named the variable that holds them
+        else:
+            measured = {"hdf5": hdf5.read, "uff": uff.read, "csv": csv.read}[kind](path, plain, rig, known)
+        return renamed(measured, naming)
+
+
+def _format(path: Path, head: bytes) -> str:
+    """Which reader a file is for, by its content."""
     if head.startswith(b"MATLAB "):
-        return _matlab(path, columns, naming, rig, known)
+        return "matlab"
     if matlab.is_version_4(head):
-        raise InputError("a MATLAB v4 file; expected version 5 to 7.3: load it in MATLAB and save it with -v7",
-                         file=path)
-    with reading(path):
-        if _is_hdf5(path, head):
-            return _hdf5(path, columns, plain, naming, rig, hints)
-        if _is_uff(head):
-            return renamed(uff.read(path, plain, rig, known), naming)
-        if csv.is_text(head):
-            return renamed(csv.read(path, plain, rig, known), naming)
-    raise InputError("expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of them", file=path)
+        raise InputError("a MATLAB v4 file; expected version 5 to 7.3: load it in MATLAB and save it with -v7")
+    if _is_hdf5(path, head):
+        with open_hdf5(path) as file:
+            # A v7.3 file that lost its text header.
+            found = not attributes(file, "format") and any(
+                item is not None and attributes(item, "MATLAB_class")
+                for item in (member(file, name) for name in members(file)))  # None: a broken link
+        return "matlab" if found else "hdf5"
+    lines = head.lstrip().splitlines()
+    if len(lines) > 1 and lines[0].strip() == b"-1" and lines[1][:6].strip().rstrip(b"bB").isdigit():
+        return "uff"
+    if csv.is_text(head):
+        return "csv"
+    raise InputError("expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of them")
 
 
 def _is_hdf5(path: Path, head: bytes) -> bool:
@@ -94,11 +107,6 @@ def _is_hdf5(path: Path, head: bytes) -> bool:
         return bool(h5py.is_hdf5(path))
     except (OSError, RuntimeError, ValueError):
         return False
-
-
-def _is_uff(head: bytes) -> bool:
-    lines = head.lstrip().splitlines()
-    return len(lines) > 1 and lines[0].strip() == b"-1" and lines[1][:6].strip().rstrip(b"bB").isdigit()
 
 
 def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[str]]) -> Campaign | FrequencyResponse:
@@ -122,31 +130,3 @@ def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[st
     if isinstance(measured, FrequencyResponse):
         return replace(measured, **changes)
     return replace(measured, records=tuple(with_header(record, **changes) for record in measured.records))
-
-
-def _matlab(path: Path, columns: Mapping[str, Any] | None, naming: Mapping[str, list[str]], rig: str | None,
-            known: Hints) -> Campaign | FrequencyResponse:
-    """Records take the names themselves: those tell which way round a matrix is."""
-    measured = matlab.read(path, columns, rig, known)
-    with reading(path):
-        return renamed(measured, naming) if isinstance(measured, FrequencyResponse) else measured
-
-
-def _hdf5(path: Path, columns: Mapping[str, Any] | None, plain: Mapping[str, Any] | None,
-          naming: Mapping[str, list[str]], rig: str | None, hints: Mapping[str, Any]) -> Campaign | FrequencyResponse:
-    with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        names = members(file)
-        matlab_classes = not attributes(file, "format") and any(
-            item is not None and attributes(item, "MATLAB_class")
-            for item in (member(file, name) for name in names))  # None: a broken link
-        response = "frf" in names and "records" not in names
-    if matlab_classes:  # a v7.3 file that lost its text header
-        return _matlab(path, columns, naming, rig, hints_from(hints))
-    used = ("averages", "relative_standard_deviation") if response else ()
-    for name, value in {"columns": plain, **hints}.items():
-        if value is not None and name not in used:
-            raise InputError("an HDF5 campaign states this itself; expected no such argument", file=path, field=name,
-                             value=value)
-    if response:
-        return renamed(read_frequency_response(path, **{name: hints.get(name) for name in used}), naming)
-    return renamed(hdf5.read(path, rig), naming)

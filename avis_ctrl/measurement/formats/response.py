@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.formats.common import kind_of
+from avis_ctrl.measurement.formats.common import (
+    INPUT_UNITS,
+    OUTPUT_UNITS,
+    as_names,
+    as_number,
+    as_text,
+    kind_of,
+    unit_of,
+)
+from avis_ctrl.measurement.formats.records import Hints
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
+COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
 SINGLE_PRECISION = 2.0 ** -24
 ROUNDING = 1e-5  # a coherence that far above 1 is one that was printed
 
@@ -28,6 +39,40 @@ def coherence_variance(value: np.ndarray, coherence: np.ndarray, averages: float
     """
     lost = np.maximum(1.0 - coherence, SINGLE_PRECISION)
     return np.abs(value) ** 2 * lost / (coherence * (averages - 1.0))
+
+
+def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
+    """The frequency response of a self-describing file.
+
+    fields : frequency_Hz (n,), value (n, n_y, n_u), inputs, outputs, input_unit, output_unit; one of variance,
+    coherence with averages, noise with gram; optional: method, dof, measurement_noise, distortion.
+
+    Raises
+    ------
+    InputError : a unit that is none of a response; noise in other units than SI; as in `response_from`.
+    """
+    frequency, value = fields["frequency_Hz"], fields["value"]
+    inputs, outputs = (as_names(fields[field], field) for field in ("inputs", "outputs"))
+    over = unit_of(hints.y_unit or as_text(fields["output_unit"], "output_unit"), "output_unit", OUTPUT_UNITS)
+    under = unit_of(hints.u_unit or as_text(fields["input_unit"], "input_unit"), "input_unit", INPUT_UNITS)
+    factor = over.factor / under.factor
+    common: dict[str, Any] = {"input_unit": under.si, "output_unit": over.si,
+                              "method": as_text(fields.get("method", ""), "method")}
+    coherence, variance = fields.get("coherence"), fields.get("variance")
+    if fields.get("noise") is not None and fields.get("gram") is not None:
+        if factor != 1.0:
+            raise InputError("expected SI units beside noise and gram", field="units",
+                             value=str(fields["output_unit"]))
+        dof = fields.get("dof", np.inf)
+        common |= {field: fields.get(field) for field in COVARIANCES}
+        return FrequencyResponse(frequency, value, inputs=inputs, outputs=outputs, **common,
+                                 dof=np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof"))
+    averages = hints.averages
+    if averages is None and fields.get("averages") is not None:
+        averages = as_number(fields["averages"], "averages")
+    return response_from(frequency, value * factor, inputs, outputs, coherence=coherence, averages=averages,
+                         variance=None if variance is None else variance * factor ** 2,
+                         relative_standard_deviation=hints.relative_standard_deviation, **common)
 
 
 def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[str], outputs: Sequence[str], *,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Record, RecordHeader, RecordSource
-from avis_ctrl.measurement.formats.common import existing_file, numbers, printable, reading, require_finite, short
+from avis_ctrl.measurement.campaign import Record, RecordHeader, RecordSource, require_finite
+from avis_ctrl.measurement.formats.common import existing_file, numbers, printable, reading, short
 
 # What h5py raises over a damaged file.
 DAMAGE = (OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError)
@@ -53,19 +53,6 @@ def member(group: h5py.Group, name: Any) -> Any:
         return group[name]
 
 
-def dataset_of(file: h5py.File, name: str) -> h5py.Dataset:
-    """The data set of that name.
-
-    Raises
-    ------
-    InputError : there is none, in a file that is damaged or changed since it was opened first.
-    """
-    found = member(file, name)
-    if not isinstance(found, h5py.Dataset):
-        raise InputError("expected a data set; damaged, or changed since it was opened?", field=printable(name))
-    return found
-
-
 def attributes(item: h5py.Group | h5py.Dataset, *names: str) -> dict[str, Any]:
     """Those of the named attributes that are there."""
     found = {}
@@ -94,36 +81,54 @@ def values(dataset: h5py.Dataset, selection: Any = ()) -> np.ndarray:
         return np.asarray(dataset[selection])
 
 
+def values_in(path: str | Path, name: str, selection: Any = ()) -> np.ndarray:
+    """The same of a data set by its name in a file, which is opened for it.
+
+    Raises
+    ------
+    InputError : there is none, in a file that is damaged or changed since it was opened first.
+    """
+    with open_hdf5(existing_file(path)) as file:
+        found = member(file, name)
+        if not isinstance(found, h5py.Dataset):
+            raise InputError("expected a data set; damaged, or changed since it was opened?", field=printable(name))
+        return values(found, selection)
+
+
 @dataclass(frozen=True)
 class Columns:
     """Channels of a record in one data set.
 
-    dataset : its name in the file; factors : to SI, one per channel; channels_first : stored as (channels, samples),
-    as MATLAB v7.3 writes a matrix of (samples, channels); a one-dimensional data set holds one channel.
+    dataset : its name in the file; samples : of each channel; channels_first : stored as (channels, samples), as MATLAB
+    v7.3 writes a matrix of (samples, channels); a one-dimensional data set holds one channel; factors : to SI, one per
+    channel.
     """
 
     dataset: str
-    factors: tuple[float, ...]
+    samples: int
     channels_first: bool = False
+    factors: tuple[float, ...] = ()
 
-    def rows(self, file: h5py.File, start: int, stop: int) -> np.ndarray:
-        """(stop - start, channels) in SI units; only these rows are read."""
-        stored = dataset_of(file, self.dataset)
-        shape = layout(stored)[0]
-        if shape is None or len(shape) not in (1, 2):
-            raise InputError("expected a data set of samples by channels", field=self.dataset, value=shape)
-        if len(shape) == 1:
-            block = values(stored, slice(start, stop))[:, None]
-        elif self.channels_first:
-            block = values(stored, (slice(None), slice(start, stop))).T
-        else:
-            block = values(stored, slice(start, stop))
-        array = numbers(block, self.dataset)
+    def __len__(self) -> int:
+        return self.samples
+
+    def load(self, path: str, names: Sequence[str], field: str, start: int, stop: int) -> np.ndarray:
+        """(stop - start, channels) in SI units; only these rows are read.
+
+        Raises
+        ------
+        InputError : samples that are not finite numbers, a file that is damaged or has changed.
+        """
+        rows = slice(start, stop)
+        block = values_in(path, self.dataset, (..., rows) if self.channels_first else rows)
+        array = numbers(block.T if self.channels_first else block, self.dataset)
+        array = array[:, None] if array.ndim == 1 else array
         if array.shape != (stop - start, len(self.factors)):
             raise InputError(f"expected {stop - start} samples of {len(self.factors)} channels", field=self.dataset,
                              value=array.shape)
-        if any(factor != 1.0 for factor in self.factors):
-            array = array * np.array(self.factors)
+        if set(self.factors) != {1.0}:
+            array *= self.factors
+        require_finite(array, names, field, start)
         return array
 
 
@@ -133,12 +138,12 @@ class StoredRecord(RecordSource):
 
     The file is opened for each load and closed again, so that the record can be pickled and sent to another process.
 
-    path : the file; columns : where "u", "y" and, where measured, "floor" lie; several data sets stand side by side.
+    path : the file; columns : where "u", "y" and, where measured, "floor" lie.
     """
 
     header: RecordHeader
     path: str
-    columns: Mapping[str, tuple[Columns, ...]]
+    columns: Mapping[str, Columns]
 
     def load(self, start: int = 0, stop: int | None = None) -> Record:
         """Samples start .. stop (end of the record by default) in memory; reads only these rows.
@@ -147,19 +152,12 @@ class StoredRecord(RecordSource):
         ------
         InputError : samples that are not finite numbers, a range outside the record, a file that ends early.
         """
-        stop = self.header.samples if stop is None else stop
-        if not 0 <= start < stop <= self.header.samples:
-            raise InputError(f"expected 0 <= start < stop <= {self.header.samples}", file=self.path,
-                             field=f"record {self.header.name}: samples", value=(start, stop))
-        header = replace(self.header, samples=stop - start,
-                         start_s=self.header.start_s + start / self.header.sample_rate_Hz)
-        with reading(self.path, f"record {self.header.name}"), open_hdf5(existing_file(self.path)) as file:
-            arrays = {role: self._role(file, role, start, stop) for role in self.columns}
-            return Record(header, arrays["u"], arrays["y"], arrays.get("floor"))
-
-    def _role(self, file: h5py.File, role: str, start: int, stop: int) -> np.ndarray:
-        blocks = [columns.rows(file, start, stop) for columns in self.columns[role]]
-        array = blocks[0] if len(blocks) == 1 else np.hstack([np.zeros((stop - start, 0)), *blocks])
-        names = {"u": self.header.u_names, "y": self.header.y_names, "floor": self.header.floor_names}[role]
-        require_finite(array, names, f"record {self.header.name}: {role}", start)
-        return array
+        h, stop = self.header, self.header.samples if stop is None else stop
+        if not 0 <= start < stop <= h.samples:
+            raise InputError(f"expected 0 <= start < stop <= {h.samples}", file=self.path,
+                             field=f"record {h.name}: samples", value=(start, stop))
+        names = {"u": h.u_names, "y": h.y_names, "floor": h.floor_names}
+        with reading(self.path, f"record {h.name}"):
+            return Record(h.part(start, stop), **{
+                role: columns.load(self.path, names[role], f"record {h.name}: {role}", start, stop)
+                for role, columns in self.columns.items()})

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record
+from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
 from avis_ctrl.measurement.formats.common import ALLOWED, Unit, existing_file, reading, require_small, unit_of
-from avis_ctrl.measurement.formats.flat import UNNAMED, Hints, Mapped, flat_record, mapped, one_clock, pick
+from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.formats.time_axis import rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
@@ -178,7 +178,7 @@ def _roles(takes: Mapping[Point, list[Function]], names: Mapping[Point, str], co
 
 
 def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str, list[str]],
-            hints: Hints) -> tuple[Record, list[str]]:
+            hints: Hints) -> tuple[RecordSource, list[str]]:
     every = [function for some in chosen.values() for function in some]
     rate, start, note = _clock(every[0])
     for function in every[1:]:
@@ -188,7 +188,7 @@ def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str,
         if not np.allclose(function.abscissa, every[0].abscissa, rtol=0, atol=0.1 / rate):
             raise InputError(f"expected the times of {every[0].response.channel()}",
                              field=f"record {name}, channel {function.response.channel()}")
-    parts: dict[str, tuple[list[str], list[str | None], np.ndarray]] = {}
+    parts = {}
     for role, some in chosen.items():
         hint = {"u": hints.u_unit, "y": hints.y_unit}.get(role)
         if any(np.iscomplexobj(function.value) for function in some):
@@ -196,9 +196,9 @@ def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str,
         units = [axis_unit(function.axes[1], function.response, function, role, hint) for function in some]
         array = np.stack([function.value * unit.factor for function, unit in zip(some, units, strict=True)], axis=1) \
             if some else np.zeros((len(every[0].value), 0))
-        parts[role] = (roles[role], [unit.si for unit in units], array)
+        parts[role] = Part(roles[role], [unit.si for unit in units], array)
     # The units have been used.
-    record, notes = flat_record(name, parts, hints.sample_rate_Hz or rate, start,
+    record, notes = record_from(name, parts, hints.sample_rate_Hz or rate, start,
                                 replace(hints, u_unit=None, y_unit=None))
     notes += [f"record {name}: {note}"] if note and hints.sample_rate_Hz is None else []
     notes += [f"record {name}: channel {function.response.name} is measured along "

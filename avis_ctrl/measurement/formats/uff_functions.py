@@ -7,13 +7,16 @@ Definitions: Universal Dataset Numbers 58 and 164, Structural Dynamics Research 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.formats.common import is_number
 
 MARK = b"-1"
 HEADER_LINES = 11
@@ -21,13 +24,9 @@ DIRECTIONS = {1: "X", 2: "Y", 3: "Z", 4: "RX", 5: "RY", 6: "RZ"}
 
 
 class Axis(NamedTuple):
-    """Specific data type, exponents of length, force and temperature, label and unit of an axis ("" if not used)."""
+    """Specific data type and unit of an axis ("" if not used)."""
 
     kind: int
-    length: int
-    force: int
-    temperature: int
-    label: str
     unit: str
 
 
@@ -122,11 +121,11 @@ def _closing(text: bytes, at: int, place: str) -> int:
 
 def _units(body: bytes, place: str) -> tuple[float, float]:
     """Factors of length and force of data set 164."""
-    factors = [float(word.replace("D", "E").replace("d", "e"))
-               for line in body.decode("latin-1").splitlines()[1:] for word in line.split()]
-    if len(factors) < 2 or not (0 < factors[0] < np.inf and 0 < factors[1] < np.inf):
-        raise InputError("expected positive factors of length and force in data set 164", field=place,
-                         value=factors[:2])
+    words = [word.upper().replace("D", "E") for line in body.decode("latin-1").splitlines()[1:]
+             for word in line.split()][:2]
+    factors = [float(word) for word in words if is_number(word)]
+    if len(factors) < 2 or not all(0 < factor < np.inf for factor in factors):
+        raise InputError("expected positive factors of length and force in data set 164", field=place, value=words)
     return factors[0], factors[1]
 
 
@@ -173,11 +172,7 @@ _AXIS = (10, 5, 5, 5, 21, 21)
 
 def _words(line: str, widths: tuple[int, ...]) -> list[str]:
     """Fields of fixed width."""
-    words, at = [], 0
-    for width in widths:
-        words.append(line[at:at + width].strip())
-        at += width
-    return words
+    return [line[start:stop].strip() for start, stop in pairwise(accumulate(widths, initial=0))]
 
 
 def _real(word: str) -> float:
@@ -189,9 +184,9 @@ def _used(word: str) -> str:
 
 
 def _axis(line: str) -> Axis:
+    """Exponents of units and the label are for programs that convert units themselves."""
     words = _words(line, _AXIS)
-    kind, length, force, temperature = (int(word or 0) for word in words[:4])
-    return Axis(kind, length, force, temperature, _used(words[4]), _used(words[5]))
+    return Axis(int(words[0] or 0), _used(words[5]))
 
 
 Form = tuple[int, bool, bool, int]  # number of values, even spacing, double precision, 1 real or 2 complex
@@ -226,13 +221,10 @@ def _binary(text: bytes, title: bytes, at: int, form: Form, place: str) -> tuple
 
 
 def _ascii(body: bytes, form: Form, place: str) -> np.ndarray:
-    """(count, columns) of a data set 58 in text; fields of fixed width that run together are told apart."""
-    count, even, double, parts = form
+    """(count, columns) of a data set 58 in text; a number that fills its field runs into the one before by its sign."""
+    count, even, _, parts = form
     columns = parts + (not even)
-    text = body.decode("latin-1").replace("D", "E").replace("d", "e")
-    words = text.split()
-    if len(words) < count * columns:
-        words = [word for line in text.splitlines() for word in _fixed(line, even, double, parts)]
+    words = re.sub(r"(?<=\d)(?=[+-])", " ", body.decode("latin-1").upper().replace("D", "E")).split()
     if len(words) < count * columns:
         raise InputError(f"cut short: {len(words)} of {count * columns} numbers are there", field=place)
     if len(words) > count * columns:
@@ -240,25 +232,5 @@ def _ascii(body: bytes, form: Form, place: str) -> np.ndarray:
     try:
         return np.array(words, dtype=float).reshape(count, columns)
     except ValueError:
-        bad = next(word for word in words if not _is_number(word))
+        bad = next(word for word in words if not is_number(word))
         raise InputError("expected a number", field=place, value=bad[:40]) from None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _fixed(line: str, even: bool, double: bool, parts: int) -> list[str]:
-    """Numbers of a line by the format's field widths: 13 in single, 20 in double precision, abscissae 13."""
-    width = 20 if double else 13
-    cycle = [width] if even else [13, *[width] * parts]
-    words, at, field = [], 0, 0
-    while at < len(line.rstrip()):
-        words.append(line[at:at + cycle[field % len(cycle)]].strip())
-        at += cycle[field % len(cycle)]
-        field += 1
-    return words

@@ -33,14 +33,7 @@ from avis_ctrl.measurement.frequency_response.periodic import (
     settled_after,
 )
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.spectra import (
-    Band,
-    Channels,
-    channels,
-    checked_band,
-    hermitian_solve,
-    lines,
-)
+from avis_ctrl.measurement.frequency_response.spectra import Band, Channels, channels, checked_band, lines
 
 Transient = Literal["auto", "drop", "remove", "none"]
 
@@ -176,7 +169,7 @@ def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, ac
     U, Y = np.moveaxis(data.U[:, line][:, :, active], 0, 1), np.moveaxis(data.Y[:, line], 0, 1)
     gram = np.swapaxes(U, 1, 2) @ U.conj()
     _check_rank(gram, names, len(data.U), frequency_Hz[line])
-    G = hermitian_solve(np.swapaxes(Y, 1, 2) @ U.conj(), gram)
+    G = np.swapaxes(np.linalg.pinv(U) @ Y, 1, 2)  # least squares of Y = U G^T
     dof, n_y = len(data.U) - len(active), Y.shape[2]
     noise = None
     if data.covariance is not None:

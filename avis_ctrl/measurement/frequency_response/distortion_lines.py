@@ -45,11 +45,6 @@ class DistortionLevels:
         share = np.sum(self.kind != "even") / np.sum(here) if kind == "odd" else 1.0
         return np.sqrt(np.maximum(share * np.sum(self.power[here] - self.noise[here], axis=0), 0.0))
 
-    def above_noise_dB(self, kind: Kind) -> np.ndarray:
-        """(n_y,) total power of a kind of lines, noise included, over that of noise alone."""
-        here = self.kind == kind
-        return 10 * np.log10(np.sum(self.power[here], axis=0) / np.sum(self.noise[here], axis=0))
-
 
 def distortion_levels(campaign: Campaign, record: str, *, transient: Transient = "auto") -> DistortionLevels:
     """Even and odd distortion of one record of an odd multisine with detection lines.

@@ -150,7 +150,7 @@ class LocalFit:
             rows = np.moveaxis(rows, 0, 1).reshape(index.shape[0], -1, self._size)
             if self.records:
                 rows = np.concatenate([self._factor[keep], rows], axis=1)
-            factor = _triangle(rows)
+            factor = np.asarray(np.linalg.qr(rows, mode="r"))
             self._factor[keep, :factor.shape[1]] = factor
         self.records += U.shape[0]
 
@@ -183,98 +183,56 @@ class LocalFit:
             raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom are left on "
                              f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
                              field="half_width", value=self.half_width)
-        names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
-        dof = self.dof
-        if partial and np.any(self._weakest() < SETTINGS.span_tolerance):
-            value, noise, gram, dof = self._spanned()
-        else:
-            self._check_rank(names)
-            value, noise, gram = self._polynomial()
-        unit_u, unit_y = self._unit
-        return LocalEstimate(self.frequency_Hz, value * unit_y[:, None] / unit_u,
-                             noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, dof,
-                             self.half_width)
-
-    def _spanned(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """As `_polynomial` where inputs depend on each other, and the least degrees of freedom of a line.
-
-        The triangular factor has the Gram matrix of all columns, whatever their rank; of dependent columns its rows
-        alone are not what each adds to those before. So the slopes are taken out by an orthonormal basis of what they
-        span, and G by the pseudo-inverse of what is left of the inputs.
-        """
         lead, first = self._lead, self._lead + self.n_u
         slopes, own, outputs = self._factor[:, :, :lead], self._factor[:, :, lead:first], self._factor[:, :, first:]
-        size = self._sizes()
-        Q, found = _basis(slopes / np.tile(size, self.order)[:, None, :])
-        own, outputs = (part - Q @ (np.swapaxes(Q.conj(), 1, 2) @ part) for part in (own, outputs))
+        # Of each input in the window, no less than what counts as silent.
+        size = np.maximum(np.linalg.norm(own, axis=1), SETTINGS.silent * np.sqrt(
+            self.records * (2 * self.half_width - self.order)))
+        # Rows of the triangular factor below the slopes are what the inputs add to these. Where slopes depend on each
+        # other that is not so: they are then taken out by an orthonormal basis of what they span.
+        spent: int | np.ndarray = lead
+        if partial:
+            left, s, _ = np.linalg.svd(slopes / np.tile(size, self.order)[:, None, :], full_matrices=False)
+            bent = s > SETTINGS.span_tolerance
+            Q, spent = left * bent[:, None, :], np.sum(bent, axis=1)
+            own, outputs = (part - Q @ (np.swapaxes(Q.conj(), 1, 2) @ part) for part in (own, outputs))
+        else:
+            own, outputs = own[:, lead:], outputs[:, lead:]
         left, s, right = np.linalg.svd(own / size[:, None, :], full_matrices=False)
-        known = s > SETTINGS.span_tolerance
-        along = np.swapaxes(left.conj(), 1, 2) @ outputs * known[:, :, None]
+        known = s > (SETTINGS.span_tolerance if partial else SETTINGS.rank_tolerance)
+        if not partial and not np.all(known):
+            self._refuse(~np.all(known, axis=1), s, right, names)
         inverse = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+        along = np.swapaxes(left.conj(), 1, 2) @ outputs * known[:, :, None]
         value = np.swapaxes(right.conj(), 1, 2) @ (inverse[:, :, None] * along) / size[:, :, None]
-        dof = self.records * (2 * self.half_width - self.order) - found - np.sum(known, axis=1)
+        dof = self.records * (2 * self.half_width - self.order) - spent - np.sum(known, axis=1)
         noise = _covariance(outputs - left @ along) / dof[:, None, None]
-        spanned = (s * known)[:, :, None] * right * size[:, None, :]
-        return np.swapaxes(value, 1, 2), noise, _covariance(spanned), int(dof.min())
+        gram = _covariance((s * known)[:, :, None] * right * size[:, None, :])
+        unit_u, unit_y = self._unit
+        return LocalEstimate(self.frequency_Hz, np.swapaxes(value, 1, 2) * unit_y[:, None] / unit_u,
+                             noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, int(dof.min()),
+                             self.half_width)
 
-    def _sizes(self) -> np.ndarray:
-        """(n, n_u) of each input in the window, no less than what counts as silent."""
-        raw = np.linalg.norm(self._factor[:, :, self._lead:self._lead + self.n_u], axis=1)
-        return np.maximum(raw, SETTINGS.silent * np.sqrt(self.records * (2 * self.half_width - self.order)))
-
-    def _weakest(self) -> np.ndarray:
-        """(n,) relative size of the weakest direction's own part."""
-        if not self.n_u:
-            return np.ones(self.frequency_Hz.size)
-        return np.linalg.svd(self._corner()[0] / self._sizes()[:, None, :], compute_uv=False)[:, -1]
-
-    def _corner(self) -> tuple[np.ndarray, np.ndarray]:
-        """Triangular factor of the inputs' own part (n, n_u, n_u) and the outputs along it (n, n_u, n_y)."""
-        lead, first = self._lead, self._lead + self.n_u
-        return self._factor[:, lead:first, lead:first], self._factor[:, lead:first, first:]
-
-    def _polynomial(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        own, along = self._corner()
-        value = np.swapaxes(np.linalg.solve(own, along), 1, 2)
-        residual = self._factor[:, self._lead + self.n_u:, self._lead + self.n_u:]
-        return value, _covariance(residual) / self.dof, _covariance(own)
-
-    def _check_rank(self, names: tuple[str, ...]) -> None:
-        if not self.n_u:
-            return
-        own, size, weakest = self._corner()[0], self._sizes(), self._weakest()
-        bad = np.flatnonzero(weakest < SETTINGS.rank_tolerance)
-        if bad.size == 0:
-            return
-        null = np.linalg.svd(own[bad[0]] / size[bad[0]])[2][-1]
-        which = ", ".join(name for name, part in zip(names, np.abs(null), strict=True) if part > 0.03)
+    def _refuse(self, bad: np.ndarray, s: np.ndarray, right: np.ndarray, names: tuple[str, ...] | None) -> None:
+        """Inputs that cannot be distinguished on some lines, by singular values and right vectors of their own part."""
+        names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
+        null = np.abs(right[np.flatnonzero(bad)[0], -1])
         f = self.frequency_Hz[bad]
         raise ComputationError(
-            f"the responses to {which} cannot be distinguished or are not excited",
-            measured=f"{bad.size} of {self.frequency_Hz.size} lines from {f[0]:.6g} to {f[-1]:.6g} Hz, relative size "
-                     f"of their own part {weakest[bad].min():.1e}",
+            f"the responses to {', '.join(n for n, part in zip(names, null, strict=True) if part > 0.03)} cannot be "
+            "distinguished or are not excited",
+            measured=f"{f.size} of {self.frequency_Hz.size} lines from {f[0]:.6g} to {f[-1]:.6g} Hz, relative size of "
+                     f"their own part {s[bad, -1].min():.1e}",
             cause="inputs that are silent there, or driven by the same signal, or too few excited lines in a window "
                   f"of {2 * self.half_width + 1}",
             next_step="keep to the excited band, leave out the inputs that no record excites, take in records that "
                       "drive them differently, or widen the window")
 
 
-def _basis(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, m, k) orthonormal columns, zero beyond the rank, that span columns (n, m, k); (n,) their rank."""
-    left, s, _ = np.linalg.svd(columns, full_matrices=False)
-    known = s > SETTINGS.span_tolerance
-    return left * known[:, None, :], np.sum(known, axis=1)
-
-
 def _scale(x: np.ndarray) -> np.ndarray:
     """Root mean square of each channel, 1 where it is silent."""
     rms = np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 1)))
     return np.where(rms > 0, rms, 1.0)
-
-
-def _triangle(rows: np.ndarray) -> np.ndarray:
-    """Triangular factors of stacked matrices."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _covariance(rows: np.ndarray) -> np.ndarray:

@@ -7,14 +7,13 @@ separates nonlinear distortion as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS, LocalFit, least_half_width
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.spectra import (
@@ -33,28 +32,12 @@ from avis_ctrl.measurement.frequency_response.spectra import (
 class NoiseCovariance:
     """Covariance of the outputs' noise on one line of a transform over sqrt(samples).
 
-    frequency_Hz : (n,); covariance : (n, n_y, n_y) Hermitian, positive definite; dof : (n,) complex degrees of
-    freedom; sample_rate_Hz : a one-sided power spectral density is 2 covariance / sample_rate_Hz.
+    covariance : (n, n_y, n_y) Hermitian, positive definite; dof : (n,) complex degrees of freedom. A one-sided power
+    spectral density is 2 covariance over the sample rate.
     """
 
-    frequency_Hz: np.ndarray
     covariance: np.ndarray
     dof: np.ndarray
-    outputs: tuple[str, ...]
-    sample_rate_Hz: float
-
-    @property
-    def density(self) -> np.ndarray:
-        """(n, n_y, n_y) one-sided cross power spectral density, squared unit of y per Hz."""
-        return 2 * self.covariance / self.sample_rate_Hz
-
-
-class _Spectra(NamedTuple):
-    """Spectra of records or pieces of one length, (n_records, lines, n_u) and (n_records, lines, n_y)."""
-
-    U: np.ndarray
-    Y: np.ndarray
-    line_Hz: np.ndarray
 
 
 def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
@@ -85,29 +68,21 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     InputError : bands, windows or records that do not allow an estimate.
     ComputationError : inputs that cannot be distinguished, unless `partial`.
     """
-    records = taking_part(campaign, floor)
-    used = channels(campaign, records, floor)
-    band = checked_band(band_Hz, campaign.sample_rate_Hz)
-    plan = _Plan.of(campaign, records, longest_piece)
-    driven, spacing, rank = _driven(records, used, band, plan)
-    names = tuple(used.inputs[j] for j in driven)
+    data = _Data.of(campaign, taking_part(campaign, floor), floor, band_Hz, longest_piece)
+    names = data.names
     if not names:
-        raise InputError("expected at least one input that is not zero in the band", field="inputs", value=used.inputs)
-    n_y = len(used.outputs)
-    width = half_width
-    if width is None:
-        width = least_half_width(plan.count, min(rank, len(names)), n_y, order, spacing)
-    where = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
-    fit = LocalFit(where, len(names), n_y, order, width, width * campaign.sample_rate_Hz / plan.shortest)
-    for part in _spectra(records, used, driven, band, width, plan):
-        fit.add(*part)
+        raise InputError("expected at least one input that is not zero in the band", field="inputs",
+                         value=data.used.inputs)
+    width = data.width(order) if half_width is None else half_width
+    where = data.grid(frequency_Hz, width)
+    fit = data.fit(where, order, width)
     found = fit.estimate(names, partial)
-    left_out = [name for name in used.inputs if name not in names]
+    left_out = [name for name in data.used.inputs if name not in names]
     method = (f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
               + (f"; not excited and left out: {', '.join(left_out)}" if left_out else ""))
-    return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, used.outputs,
-                             used.input_unit, used.output_unit, float(found.dof), method=method,
-                             shared=_shared(where, width, order, campaign.sample_rate_Hz / plan.shortest))
+    return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, data.used.outputs,
+                             data.used.input_unit, data.used.output_unit, float(found.dof), method=method,
+                             shared=_shared(where, width, order, data.step_Hz))
 
 
 def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -> float:
@@ -144,32 +119,20 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     records = tuple(r for r in campaign.records if r.header.excitation != "sine")
     if not records:
         raise InputError("expected a record other than a stepped sine", field="records")
-    used = channels(campaign, records, floor)
-    band = checked_band(band_Hz, campaign.sample_rate_Hz)
-    plan = _Plan.of(campaign, records, longest_piece)
-    driven, spacing, rank = _driven(records, used, band, plan)
-    n_y = len(used.outputs)
-    width = half_width
-    if width is None:
-        width = least_half_width(plan.count, rank, n_y, order, spacing=spacing)
-    step = campaign.sample_rate_Hz / plan.shortest
-    every = _grid(None, band, plan.shortest, campaign.sample_rate_Hz, width)
-    asked = _grid(frequency_Hz, band, plan.shortest, campaign.sample_rate_Hz, width)
+    data = _Data.of(campaign, records, floor, band_Hz, longest_piece)
+    width = data.width(order) if half_width is None else half_width
     if smooth_Hz is not None and not smooth_Hz > 0:
         raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
+    asked, every = data.grid(frequency_Hz, width), data.grid(None, width)
     centres = every[width:every.size - width:2 * width + 1]  # windows that share no line
-    fit = LocalFit(centres, len(driven), n_y, order, width, width * step)
-    for part in _spectra(records, used, driven, band, width, plan):
-        fit.add(*part)
     # What the outputs hold beside the inputs is known whether or not these are told apart.
-    found = fit.estimate(tuple(used.inputs[j] for j in driven), partial=True)
-    least = min(-(-(n_y + 2) // found.dof), centres.size)
-    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * step, least,
-                     used.outputs, campaign.sample_rate_Hz)
+    found = data.fit(centres, order, width).estimate(data.names, partial=True)
+    least = min(-(-(len(data.used.outputs) + 2) // found.dof), centres.size)
+    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * data.step_Hz, least)
 
 
-def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float, least: int,
-              outputs: tuple[str, ...], sample_rate_Hz: float) -> NoiseCovariance:
+def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float,
+              least: int) -> NoiseCovariance:
     """Means over the centres near each frequency, at least `least` of them."""
     low = np.searchsorted(centres, frequency_Hz - smooth_Hz)
     high = np.searchsorted(centres, frequency_Hz + smooth_Hz, side="right")
@@ -183,84 +146,95 @@ def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np
     if least * dof < noise.shape[1]:
         raise InputError(f"expected longer records: {least * dof} degrees of freedom cannot give a definite covariance "
                          f"of {noise.shape[1]} outputs", field="records")
-    return NoiseCovariance(frequency_Hz, mean, (count * dof).astype(float), outputs, sample_rate_Hz)
+    return NoiseCovariance(mean, (count * dof).astype(float))
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """How the records are cut: pieces in all, samples of the shortest, longest allowed."""
+class _Data:
+    """What an estimate takes in.
 
-    count: int
-    shortest: int
-    longest: int | None
+    pieces : (record, start, stop) with a transient each; used : channels; band : Hz; rate : of the samples, Hz;
+    step_Hz : from line to line of the shortest record's pieces; driven : places of the inputs that some record excites;
+    spacing : lines from one excited line to the next, more than one for periodic records; rank : how many directions
+    the inputs span in all.
+    """
+
+    pieces: list[tuple[RecordSource, int, int]]
+    used: Channels
+    band: Band
+    rate: float
+    step_Hz: float
+    driven: list[int]
+    spacing: int
+    rank: int
 
     @staticmethod
-    def of(campaign: Campaign, records: Sequence[RecordSource], longest: int | None) -> _Plan:
+    def of(campaign: Campaign, records: Sequence[RecordSource], floor: bool | None, band_Hz: Band | None,
+           longest: int | None) -> _Data:
+        used, rate = channels(campaign, records, floor), campaign.sample_rate_Hz
+        band = checked_band(band_Hz, rate)
         if longest is not None and longest < 16:
             raise InputError("expected at least 16 samples", field="longest_piece", value=longest)
-        sizes: list[int] = []
-        for record in records:
-            whole, period = record.header.samples, record.header.period_samples
-            parts = 1 if longest is None else -(-whole // longest)
-            share = -(-whole // parts)
-            if parts > 1 and period:
-                share = max(share // period, 1) * period
-                parts = whole // share
-            sizes += [share] * parts
-        return _Plan(len(sizes), min(sizes), longest)
+        cuts = [equal_pieces(record, longest) for record in records]
+        shortest = min(stop - start for (start, stop), *_ in cuts)
+        firsts = (record.load(*some[0]) for record, some in zip(records, cuts, strict=True))
+        return _Data([(record, *one) for record, some in zip(records, cuts, strict=True) for one in some], used, band,
+                     rate, rate / shortest, *_driven(firsts, used, band))
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the driven inputs."""
+        return tuple(self.used.inputs[j] for j in self.driven)
 
-def _grid(frequency_Hz: np.ndarray | None, band: Band, samples: int, rate: float, half_width: int) -> np.ndarray:
-    keep = lines(samples, rate, band)
-    every = np.arange(keep.start, keep.stop) * rate / samples
-    if every.size < 2 * half_width + 1:
-        raise InputError(f"expected at least {2 * half_width + 1} lines for the local models; the band {band[0]:g} to "
-                         f"{band[1]:g} Hz has {every.size} at {rate / samples:g} Hz: longer records, a wider band or "
-                         "fewer inputs", field="band_Hz", value=band)
-    if frequency_Hz is None:
-        return every
-    asked = np.asarray(frequency_Hz, float)
-    if asked.ndim != 1 or not np.all(np.diff(asked) > 0) or not (
-            asked.size and every[0] * (1 - 1e-9) <= asked[0] and asked[-1] <= every[-1] * (1 + 1e-9)):
-        raise InputError(f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band",
-                         field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
-    return asked
+    def width(self, order: int) -> int:
+        """The least half width [lines] of a window."""
+        return least_half_width(len(self.pieces), self.rank, len(self.used.outputs), order, self.spacing)
 
+    def grid(self, frequency_Hz: np.ndarray | None, half_width: int) -> np.ndarray:
+        """(n,) the frequencies asked for, by default all lines in the band."""
+        keep = lines(round(self.rate / self.step_Hz), self.rate, self.band)
+        every = np.arange(keep.start, keep.stop) * self.step_Hz
+        if every.size < 2 * half_width + 1:
+            raise InputError(f"expected at least {2 * half_width + 1} lines for the local models; the band "
+                             f"{self.band[0]:g} to {self.band[1]:g} Hz has {every.size} at {self.step_Hz:g} Hz: longer "
+                             "records, a wider band or fewer inputs", field="band_Hz", value=self.band)
+        if frequency_Hz is None:
+            return every
+        asked = np.asarray(frequency_Hz, float)
+        if asked.ndim != 1 or not np.all(np.diff(asked) > 0) or not (
+                asked.size and every[0] * (1 - 1e-9) <= asked[0] and asked[-1] <= every[-1] * (1 + 1e-9)):
+            raise InputError(f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the "
+                             "band", field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
+        return asked
 
-def _spectra(records: Sequence[RecordSource], used: Channels, driven: list[int], band: Band, half_width: int,
-             plan: _Plan) -> Iterator[_Spectra]:
-    """Spectra of one length after the other; the band is widened by half a window, so that its ends are not
-    extrapolated."""
-    held: list[_Spectra] = []
-    for record in records:
-        rate = record.header.sample_rate_Hz
-        for piece in equal_pieces(record, plan.longest):
-            n = piece.header.samples
-            margin = half_width * rate / n
-            keep = lines(n, rate, (max(band[0] - margin, 0.0), min(band[1] + margin, rate / 2)))
-            u, y = used.of(piece)
-            new = _Spectra(transform(u[:, driven], keep)[None], transform(y, keep)[None],
-                           np.arange(keep.start, keep.stop) * rate / n)
-            full = sum(part.U.nbytes + part.Y.nbytes for part in held) > SETTINGS.together_bytes
-            if held and (full or not np.array_equal(held[0].line_Hz, new.line_Hz)):
-                yield _together(held)
+    def fit(self, where: np.ndarray, order: int, half_width: int) -> LocalFit:
+        """The least-squares problems at (n,) Hz. The band is widened by half a window, so that its ends are not
+        extrapolated; pieces of one length are taken in together."""
+        fit = LocalFit(where, len(self.driven), len(self.used.outputs), order, half_width, half_width * self.step_Hz)
+        held: list[tuple[np.ndarray, np.ndarray]] = []
+        line_Hz = np.zeros(0)
+        for record, start, stop in self.pieces:
+            n = stop - start
+            margin = half_width * self.rate / n
+            keep = lines(n, self.rate, (max(self.band[0] - margin, 0.0), min(self.band[1] + margin, self.rate / 2)))
+            own_Hz = np.arange(keep.start, keep.stop) * self.rate / n
+            full = sum(U.nbytes + Y.nbytes for U, Y in held) > SETTINGS.together_bytes
+            if held and (full or not np.array_equal(line_Hz, own_Hz)):
+                fit.add(np.stack([U for U, _ in held]), np.stack([Y for _, Y in held]), line_Hz)
                 held = []
-            held.append(new)
-    if held:
-        yield _together(held)
+            u, y = self.used.of(record.load(start, stop))
+            held.append((transform(u[:, self.driven], keep), transform(y, keep)))
+            line_Hz = own_Hz
+        fit.add(np.stack([U for U, _ in held]), np.stack([Y for _, Y in held]), line_Hz)
+        return fit
 
 
-def _together(held: list[_Spectra]) -> _Spectra:
-    return _Spectra(np.concatenate([p.U for p in held]), np.concatenate([p.Y for p in held]), held[0].line_Hz)
-
-
-def _driven(records: Sequence[RecordSource], used: Channels, band: Band, plan: _Plan) -> tuple[list[int], int, int]:
-    """Inputs that are not silent in the band in every record, relative to their samples; how many lines lie from one
-    excited line to the next, more than one for periodic records; and how many directions the inputs span in all."""
+def _driven(records: Iterable[Record], used: Channels, band: Band) -> tuple[list[int], int, int]:
+    """`driven`, `spacing` and `rank` of `_Data`: inputs that are not silent in the band, relative to their samples."""
     moving, spacing = np.zeros(len(used.inputs), bool), 1
     gram = np.zeros((len(used.inputs),) * 2, complex)
     for record in records:
-        u, _ = used.of(next(equal_pieces(record, plan.longest)))
+        u, _ = used.of(record)
         spectrum = transform(u, lines(u.shape[0], record.header.sample_rate_Hz, band))
         gram += spectrum.conj().T @ spectrum
         U = np.abs(spectrum)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -33,7 +33,6 @@ class FrequencyResponse:
     measurement_noise : the part of `noise` that does not repeat from period to period, where separated.
     distortion : the part of `noise` that repeats: stochastic nonlinear distortion, where separated; may be indefinite
         by chance where there is none.
-    coherence : (n, n_y) multiple coherence where it was computed.
     entry_variance : (n, n_y, n_u) E|error|^2 of each entry, for files that know no more (coherence, or variances);
         entries then count as independent, and `noise` and `gram` are None.
     shared : of how many neighbouring lines the errors go together, because their estimates rest on the same data: the
@@ -52,7 +51,6 @@ class FrequencyResponse:
     dof: float = np.inf
     measurement_noise: np.ndarray | None = None
     distortion: np.ndarray | None = None
-    coherence: np.ndarray | None = None
     entry_variance: np.ndarray | None = None
     method: str = ""
     shared: float = 1.0
@@ -60,8 +58,7 @@ class FrequencyResponse:
     def __post_init__(self) -> None:
         n, n_y, n_u = len(self.frequency_Hz), len(self.outputs), len(self.inputs)
         shapes = {"value": (n, n_y, n_u), "noise": (n, n_y, n_y), "gram": (n, n_u, n_u),
-                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "coherence": (n, n_y),
-                  "entry_variance": (n, n_y, n_u)}
+                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "entry_variance": (n, n_y, n_u)}
         for field, shape in shapes.items():
             array = getattr(self, field)
             if array is None:
@@ -155,9 +152,6 @@ class FrequencyResponse:
 
     def at(self, keep: np.ndarray) -> FrequencyResponse:
         """Some of the lines, by mask or index."""
-        def cut(array: np.ndarray | None) -> np.ndarray | None:
-            return None if array is None else array[keep]
-        return FrequencyResponse(self.frequency_Hz[keep], self.value[keep], cut(self.noise), cut(self.gram),
-                                 self.inputs, self.outputs, self.input_unit, self.output_unit, self.dof,
-                                 cut(self.measurement_noise), cut(self.distortion), cut(self.coherence),
-                                 cut(self.entry_variance), self.method, self.shared)
+        by_line = {field.name: array[keep] for field in fields(self)
+                   if isinstance(array := getattr(self, field.name), np.ndarray)}
+        return replace(self, **by_line)

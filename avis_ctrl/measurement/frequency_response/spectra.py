@@ -6,14 +6,14 @@ the record; a one-sided power spectral density is then 2/f_s times the mean squa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource, ranges
 
 Band = tuple[float, float]
 
@@ -101,25 +101,15 @@ def transform(x: np.ndarray, keep: slice) -> np.ndarray:
     return fft.rfft(x, axis=0)[keep] / np.sqrt(x.shape[0])
 
 
-def equal_pieces(record: RecordSource, longest: int | None) -> Iterator[Record]:
-    """A record in pieces of nearly the same length (the whole of it where longest is None): a short last piece would
-    have a coarse resolution; one below half the others' length is left out."""
-    if longest is None or record.header.samples <= longest:
-        yield record.load()
-        return
-    count = -(-record.header.samples // longest)
-    # Whole periods round a piece's length down, so that an even share might lie below one period.
-    share = max(-(-record.header.samples // count), record.header.period_samples or 2)
-    longest_seen = 0
-    for piece in record.pieces(share):
-        longest_seen = max(longest_seen, piece.header.samples)
-        if 2 * piece.header.samples >= longest_seen:
-            yield piece
+def equal_pieces(record: RecordSource, longest: int | None) -> list[tuple[int, int]]:
+    """(start, stop) of pieces of nearly the same length (the whole record where longest is None), of whole periods.
 
-
-def hermitian_solve(numerator: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """numerator inv(gram) for stacks of matrices, gram Hermitian; columns scaled, units differ by orders."""
-    size = np.sqrt(np.real(np.einsum("...ii->...i", gram)))
-    scaled = gram / (size[..., :, None] * size[..., None, :])
-    right = np.linalg.solve(scaled, np.swapaxes(numerator.conj() / size[..., None, :], -1, -2))
-    return np.swapaxes(right.conj(), -1, -2) / size[..., None, :]
+    A short last piece would have a coarse resolution; one below half the others' length is left out.
+    """
+    samples, period = record.header.samples, record.header.period_samples
+    if longest is None or samples <= longest:
+        return [(0, samples)]
+    share = -(-samples // -(-samples // longest))
+    if period:
+        share = max(share // period, 1) * period
+    return [(start, stop) for start, stop in ranges(samples, share) if 2 * (stop - start) >= share]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1
+from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, thirds
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,9 @@ def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray
     C = np.einsum("fik,fij,fkl->ikjl", turned, M, E.conj(), optimize=True).real
     B = np.einsum("f,fka,fkb->kab", w, E, E.conj(), optimize=True).real
     rows_M = np.sqrt(np.einsum("f,fij->i", w, np.abs(M) ** 2))
-    thirds = len(np.unique(np.floor(3 * np.log2(measured.f / measured.f[0]))))
     tried, span_s = len(settings.delays_s), settings.delay_s[1] - settings.delay_s[0]
     delays = min(tried, 1 + int(np.ceil(2 * span_s * (measured.f[-1] - measured.f[0]))))
-    return Comparison(C, B, P, rows_M, delay_s, delays, measured.rank + thirds - 1, measured, settings)
+    return Comparison(C, B, P, rows_M, delay_s, delays, measured.rank + len(thirds(measured.f)) - 1, measured, settings)
 
 
 def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
@@ -257,12 +256,8 @@ def _steps(n_y: int, n_u: int) -> list[tuple[str, int, int, tuple[float, float]]
     """(row or column, i, k, signs): flips have i = k."""
     signs = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
     steps = [(what, i, i, (-1.0, 1.0)) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)]
-    return steps + [(what, i, k, flips)
-                    for what,
-                    n in (("row", n_y), ("column", n_u))
-          for i in range(n)
-          for k in range(i)
-          for flips in signs]
+    return steps + [(what, i, k, flips) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)
+                    for k in range(i) for flips in signs]
 
 
 def _after(order: dict[str, np.ndarray], sign: dict[str, np.ndarray], what: str, i: int, k: int,

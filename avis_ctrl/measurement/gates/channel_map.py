@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -10,8 +11,19 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_faults import Comparison, Faults, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, quoted
+from avis_ctrl.measurement.gates.finding import (
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Response,
+    Series,
+    Severity,
+    quoted,
+)
 from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
+
+ORDER, POLARITY = "channel order", "polarity"  # what the findings go under
 
 
 @dataclass(frozen=True)
@@ -43,14 +55,29 @@ class _Kept:
 
 
 class ChannelMap(Gate):
-    """`ChannelOrder` and `Polarity`, which use the same comparison.
+    """Exchanged, mislabelled and copied channels ("channel order"), and flipped signs ("polarity").
+
+    Without a model, copies only: a channel that equals another one times one constant within 0.1 % of its r.m.s. in
+    every record. A motion along one axis makes sensors of a symmetric table read alike, in the records of that motion;
+    where the model expects that of every record, it is a note.
 
     With a model: the fewest exchanges and flips that explain the measured rows (sensors) and columns (drives), see
     `explain`; for settings and the probability of a false stop see `MapSettings`. If another order fits better without
-    such evidence, that is a note.
+    such evidence, that is a note. Flipping all sensors cannot be told from flipping all drives: the explanation with
+    fewer flips is named, and the sentence says so where both have equally many.
     """
 
     name = "channel map"
+
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+        copies = _copies(seen)
+        if not seen.driven or expectation.response is None:
+            return _Kept(seen.header.name, copies)
+        u, y, wrap = usable(seen)
+        rate = seen.header.sample_rate_Hz
+        model = predicted(expectation.response, u, rate, seen.header.u_names, wrap)
+        order = _order(seen.header.y_names, expectation.y_names, model.shape[1])
+        return _Kept(seen.header.name, copies, rate, wrap, u, y, None if order is None else model[:, order])
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         def response(f: np.ndarray) -> np.ndarray:
@@ -58,171 +85,134 @@ class ChannelMap(Gate):
             G = expectation.response(2 * np.pi * f, campaign.u_names)
             return G[:, _order(campaign.y_names, expectation.y_names, G.shape[1])]
 
-        comparison = compare(_pairs(kept), response)
-        faults = None if comparison is None else explain(comparison)
-        why = "no model was given" if expectation.response is None else "too few driven samples"
-        return [*ChannelOrder().conclude(kept, campaign, comparison, faults, why),
-                *Polarity().conclude(campaign, comparison, faults, why)]
-
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
-        copies = _copies(seen)
-        if not seen.driven:
-            return _Kept(seen.header.name, copies)
-        u, y, wrap = usable(seen)
-        rate = seen.header.sample_rate_Hz
-        if expectation.response is None:
-            return _Kept(seen.header.name, copies)
-        model = predicted(expectation.response, u, rate, seen.header.u_names, wrap)
-        order = _order(seen.header.y_names, expectation.y_names, model.shape[1])
-        return _Kept(seen.header.name, copies, rate, wrap, u, y, None if order is None else model[:, order])
+        copied, comparison = list(_copied(kept, campaign)), compare(_pairs(kept), response)
+        if comparison is None:
+            known = expectation.response is not None
+            return _not_compared(kept, copied, campaign, "too few driven samples" if known else "no model was given",
+                                 "note" if known else "ok")
+        faults = explain(comparison)
+        exchanged = list(_exchanged(faults, campaign, comparison))
+        order = copied + exchanged or [_right(faults, campaign, comparison)]
+        return order + (list(_flipped(faults, campaign, comparison)) or [_signs_agree(faults, campaign, comparison)])
 
 
-class ChannelOrder:
-    """Exchanged or mislabelled channels, and copies of one channel under two names.
+def _not_compared(kept: list[_Kept], copied: list[Finding], campaign: Campaign, why: str,
+                  severity: Severity) -> list[Finding]:
+    x = np.arange(len(campaign.y_names))
+    picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]",
+                      (Series("not known", x, 0.0 * x, "points"),))
+    order = copied or [Finding(ORDER, severity, "No channel is a copy of another; their order was not compared with a "
+                               f"model ({why}).", picture=_copy_picture(kept))]
+    return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).", picture=picture)]
 
-    Without a model, copies only: a channel that equals another one times one constant within 0.1 % of its r.m.s. in
-    every record. A motion along one axis makes sensors of a symmetric table read alike, in the records of that motion;
-    where the model expects that of every record, it is a note.
-    """
 
-    name = "channel order"
+def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
+    names = campaign.y_names
+    for i, k in sorted({(i, k) for of in kept for i, k, _, _ in of.copies}):
+        hits = [(of.record, scale, rest) for of in kept for a, b, scale, rest in of.copies if (a, b) == (i, k)]
+        _, scale, rest = hits[0]
+        if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
+            continue
+        alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike for of in kept)
+        cause = ("the model expects that of these records, so they do not show whether one signal was recorded twice. "
+                 "Excite other axes, too." if alike else
+                 "one signal was recorded twice. Check the wiring and the channel list; leave one of them out.")
+        yield Finding(ORDER, "note" if alike else "stop",
+                      f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. "
+                      f"in every record: {cause}", (names[i], names[k]), tuple(h[0] for h in hits), float(rest),
+                      COPIES.different, _copy_picture(kept))
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, comparison: Comparison | None, faults: Faults | None,
-                 why: str) -> list[Finding]:
-        found = self._copied(kept, campaign)
-        if comparison is None or faults is None:
-            if not found:
-                found.append(
-                    Finding(self.name, "ok" if why.startswith("no model") else "note",
-                            f"No channel is a copy of another; their order was not compared with a model ({why}).",
-                            picture=_copy_picture(kept)))
-            return found
-        agreement = comparison.agreement(faults.q, faults.c)
-        picture = _picture(faults.r[:, None] * agreement, campaign.y_names, comparison.settings.least_agreement)
-        found += self._exchanged(faults, "row", campaign.y_names, campaign.y_names, comparison, picture)
-        found += self._exchanged(faults, "column", campaign.u_names, campaign.y_names, comparison, picture)
-        if not found:
-            found.append(self._right(faults, campaign, comparison, picture))
-        return found
 
-    def _right(self, faults: Faults, campaign: Campaign, comparison: Comparison, picture: Picture) -> Finding:
-        worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
-        low, high = comparison.settings.delay_s
-        alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
-        if alone and not faults.doubtful and 2 * len(alone) < len(faults.other):
-            return Finding(self.name, "warning",
-                           f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as "
-                           f"{faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} "
-                           f"ms late or {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an "
-                           "effect there.", alone, value=float(faults.other[worst]), limit=enough, picture=picture)
-        least = f"the lowest correlation is {faults.other[worst]:.2f}, of {campaign.y_names[worst]!r}"
-        if faults.doubtful:
-            names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
-            sentence = (f"The agreement of model and records is too poor to check the order of the channels ({least}; "
-                        f"another order or sign of {quoted(names)} would agree better, but an inaccurate model can "
-                        "cause that, too). Check the channel list by hand.")
-        else:
-            sentence = f"No other order of the channels agrees better with the model ({least})."
-        return Finding(self.name, "note" if faults.doubtful else "ok", sentence, value=float(faults.other[worst]),
-                       limit=comparison.settings.least_agreement, picture=picture)
-
-    def _exchanged(self, faults: Faults, kind: str, names: tuple[str, ...], sensors: tuple[str, ...],
-                   comparison: Comparison, picture: Picture) -> list[Finding]:
-        p, what = (faults.p, "Sensor") if kind == "row" else (faults.q, "Drive")
-        found: list[Finding] = []
-        done: set[int] = set()
+def _exchanged(faults: Faults, campaign: Campaign, comparison: Comparison) -> Iterator[Finding]:
+    sensors, drives = campaign.y_names, campaign.u_names
+    for kind, what, p, names in (("row", "Sensor", faults.p, sensors), ("column", "Drive", faults.q, drives)):
         for i in range(len(p)):
-            if p[i] == i or i in done:
-                continue
             cycle = cycle_of(p, i)
-            done.update(cycle)
-            pair = tuple(names[j] for j in cycle)
+            if len(cycle) == 1 or i > min(cycle):
+                continue
             if kind == "row":
                 gain = min(faults.other[j] - faults.own[j] for j in cycle)
-                listed = "; ".join(
-                    f"the correlation of {names[j]!r} with the model's {names[int(p[j])]!r} is {faults.other[j]:.2f},"
-                    f" with its own {faults.own[j]:.2f}"
-                    for j in cycle)
+                listed = "; ".join(f"the correlation of {names[j]!r} with the model's {names[int(p[j])]!r} is "
+                                   f"{faults.other[j]:.2f}, with its own {faults.own[j]:.2f}" for j in cycle)
             else:
                 of, before, after = faults.columns[i]
                 gain = after - before
                 listed = f"exchanging them raises the correlation of {sensors[of]!r} from {before:.2f} to {after:.2f}"
-            chance = max(faults.chance[kind, j] for j in cycle)
+            pair = tuple(names[j] for j in cycle)
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
-            found.append(
-                Finding(self.name, "stop",
-                        f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
-                        f"fitted; p-value at most {chance:.1g}). Exchange their names or their cables.", pair,
-                        value=float(gain), limit=comparison.settings.least_agreement, picture=picture))
-        return found
-
-    def _copied(self, kept: list[_Kept], campaign: Campaign) -> list[Finding]:
-        found, names = [], campaign.y_names
-        pairs = {(i, k) for of in kept for i, k, _, _ in of.copies}
-        for i, k in sorted(pairs):
-            hits = [(of.record, scale, rest) for of in kept for a, b, scale, rest in of.copies if (a, b) == (i, k)]
-            _, scale, rest = hits[0]
-            if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
-                continue
-            alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike
-                        for of in kept)
-            cause = ("the model expects that of these records, so they do not show whether one signal was recorded"
-                     " twice. Excite other axes, too." if alike else
-                     "one signal was recorded twice. Check the wiring and the channel list; leave one of them out.")
-            found.append(
-                Finding(self.name, "note" if alike else "stop",
-                        f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its "
-                        f"r.m.s. in every record: {cause}", (names[i], names[k]), tuple(h[0] for h in hits),
-                        float(rest), COPIES.different, _copy_picture(kept)))
-        return found
+            yield Finding(ORDER, "stop",
+                          f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
+                          f"fitted; p-value at most "
+                          f"{max(faults.chance[kind, j] for j in cycle):.1g}). Exchange their names or their cables.",
+                          pair, value=float(gain), limit=comparison.settings.least_agreement,
+                          picture=_order_picture(faults, campaign, comparison))
 
 
-class Polarity:
-    """Flipped signs of drives (columns) and sensors (rows).
+def _right(faults: Faults, campaign: Campaign, comparison: Comparison) -> Finding:
+    worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
+    least = f"the lowest correlation is {faults.other[worst]:.2f}, of {campaign.y_names[worst]!r}"
+    alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
+    severity: Severity = "ok"
+    channels: tuple[str, ...] = ()
+    if faults.doubtful:
+        names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
+        severity = "note"
+        sentence = (f"The agreement of model and records is too poor to check the order of the channels ({least}; "
+                    f"another order or sign of {quoted(names)} would agree better, but an inaccurate model can cause "
+                    "that, too). Check the channel list by hand.")
+    elif alone and 2 * len(alone) < len(faults.other):
+        severity, channels = "warning", alone
+        low, high = comparison.settings.delay_s
+        sentence = (f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as "
+                    f"{faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late "
+                    f"or {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there.")
+    else:
+        sentence = f"No other order of the channels agrees better with the model ({least})."
+    return Finding(ORDER, severity, sentence, channels, value=float(faults.other[worst]), limit=enough,
+                   picture=_order_picture(faults, campaign, comparison))
 
-    Found by `explain` with the exchanges. Flipping all sensors cannot be told from flipping all drives: the explanation
-    with fewer flips is named, and the sentence says so where both have equally many.
-    """
 
-    name = "polarity"
+def _order_picture(faults: Faults, campaign: Campaign, comparison: Comparison) -> Picture:
+    a = faults.r[:, None] * comparison.agreement(faults.q, faults.c)
+    x = np.arange(len(a))
+    others = np.max(np.where(np.eye(len(a), dtype=bool), -np.inf, a), axis=1) if len(a) > 1 else np.zeros(1)
+    return Picture(
+        "Sensors against the model", "sensor", "correlation [-]",
+        (Series("own expected response", x, np.diag(a), "points"), Series("best other", x, others, "points")),
+        (Limit("least that counts as evidence", comparison.settings.least_agreement),), x_names=campaign.y_names)
 
-    def conclude(self, campaign: Campaign, comparison: Comparison | None, faults: Faults | None, why: str
-                 ) -> list[Finding]:
-        if comparison is None or faults is None:
-            x = np.arange(len(campaign.y_names))
-            picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]",
-                              (Series("not known", x, 0.0 * x, "points"),))
-            return [Finding(self.name, "ok" if why.startswith("no model") else "note",
-                            f"Polarity was not compared with a model ({why}).", picture=picture)]
-        r, c = faults.r, faults.c
-        picture = Picture("Signed correlation with the model", "sensor", "correlation [-]",
-                          (Series("sensors", np.arange(len(r)), r * faults.other, "bars"),),
-                          (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)
-        both = np.count_nonzero(r < 0) + np.count_nonzero(c < 0)
-        total = len(r) + np.count_nonzero(comparison.moving)
-        doubt = " It is equally possible that all other channels are reversed." if 2 * both == total else ""
-        said = [(campaign.y_names[k], "Sensor", -float(faults.other[k]),
-                 f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", int(k)])
-                for k in np.flatnonzero(r < 0)] + [
-                    (campaign.u_names[k], "Drive", faults.columns[k][1] - faults.columns[k][2],
-                     f"reversing it raises the correlation of sensor {campaign.y_names[faults.columns[k][0]]!r} from"
-                     f" {faults.columns[k][1]:.2f} to {faults.columns[k][2]:.2f}", faults.chance["column", k])
-                    for k in map(int, np.flatnonzero(c < 0))]
-        found = [
-            Finding(self.name, "stop",
-                    f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its "
-                    "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
-                    f"reverse the sign of the channel.{doubt}", (name,), value=value,
-                    limit=-comparison.settings.least_agreement, picture=picture)
-            for name, what, value, how, chance in said]
-        if not found:
-            found.append(
-                Finding(self.name, "note" if faults.doubtful else "ok",
-                        "The signs could not be checked: the agreement of model and records is too poor."
-                        if faults.doubtful else
-                        f"All signs agree with the model (lowest correlation of a sensor {faults.other.min():.2f}).",
-                        value=float(faults.other.min()), limit=comparison.settings.least_agreement, picture=picture))
-        return found
+
+def _flipped(faults: Faults, campaign: Campaign, comparison: Comparison) -> Iterator[Finding]:
+    rows, columns = ([int(k) for k in np.flatnonzero(signs < 0)] for signs in (faults.r, faults.c))
+    doubt = (" It is equally possible that all other channels are reversed."
+             if 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving) else "")
+    said = [("Sensor", campaign.y_names[k], -float(faults.other[k]),
+             f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", k]) for k in rows]
+    for k in columns:
+        of, before, after = faults.columns[k]
+        said.append(("Drive", campaign.u_names[k], before - after, "reversing it raises the correlation of sensor "
+                     f"{campaign.y_names[of]!r} from {before:.2f} to {after:.2f}", faults.chance["column", k]))
+    for what, name, value, how, chance in said:
+        yield Finding(POLARITY, "stop",
+                      f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its "
+                      "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
+                      f"reverse the sign of the channel.{doubt}", (name,), value=value,
+                      limit=-comparison.settings.least_agreement, picture=_sign_picture(faults, campaign, comparison))
+
+
+def _signs_agree(faults: Faults, campaign: Campaign, comparison: Comparison) -> Finding:
+    lowest = float(faults.other.min())
+    return Finding(POLARITY, "note" if faults.doubtful else "ok",
+                   "The signs could not be checked: the agreement of model and records is too poor."
+                   if faults.doubtful else
+                   f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f}).", value=lowest,
+                   limit=comparison.settings.least_agreement, picture=_sign_picture(faults, campaign, comparison))
+
+
+def _sign_picture(faults: Faults, campaign: Campaign, comparison: Comparison) -> Picture:
+    return Picture("Signed correlation with the model", "sensor", "correlation [-]",
+                   (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
+                   (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)
 
 
 def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str, ...], wrap: bool) -> np.ndarray:
@@ -234,17 +224,11 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
     power = np.sum(np.abs(U) ** 2, axis=1)
     keep = power > 1e-6 * power.max(initial=0.0)
     keep[0] = False
-    Y: np.ndarray | None = None
-    lines = np.flatnonzero(keep)
-    for part in np.array_split(lines, max(1, len(lines) // 8192 + 1)):
-        if not len(part):
-            continue
-        G = response(2 * np.pi * f[part], inputs)
-        if Y is None:
-            Y = np.zeros((len(f), G.shape[1]), complex)
-        Y[part] = np.einsum("fij,fj->fi", G, U[part])
-    if Y is None:
+    if not keep.any():
         return np.zeros((len(u), 0))
+    G = response(2 * np.pi * f[keep], inputs)
+    Y = np.zeros((len(f), G.shape[1]), complex)
+    Y[keep] = np.einsum("fij,fj->fi", G, U[keep])
     return np.fft.irfft(Y, n, axis=0)[: len(u)]
 
 
@@ -291,12 +275,3 @@ def _copy_picture(kept: list[_Kept]) -> Picture:
     count = np.array([len(k.copies) for k in kept])
     return Picture("Pairs of channels that are copies", "record number", "pairs [-]",
                    (Series("pairs", np.arange(len(count)), count, "points"),))
-
-
-def _picture(a: np.ndarray, names: tuple[str, ...], limit: float) -> Picture:
-    x = np.arange(len(names))
-    others = np.max(np.where(np.eye(len(a), dtype=bool), -np.inf, a), axis=1) if len(a) > 1 else np.zeros(1)
-    return Picture(
-        "Sensors against the model", "sensor", "correlation [-]",
-        (Series("own expected response", x, np.diag(a), "points"), Series("best other", x, others, "points")),
-        (Limit("least that counts as evidence", limit),), x_names=tuple(names))

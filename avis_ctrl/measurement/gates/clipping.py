@@ -10,17 +10,7 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    quoted,
-    thinned,
-)
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
 
 # A noise-free sine's top code is hit up to 2.42 times as often as the next one.
 SINE_TOP = 2.42
@@ -104,24 +94,22 @@ class Clipping(Gate):
         names = tuple(dict.fromkeys(row.channel for row in wrong))
         found = [self._unit(wrong, names, expectation, campaign)] if wrong else []
         bad = [row for row in rows if row.count and row.p < level and row.channel not in names]
-        for channel in dict.fromkeys(row.channel for row in bad):
-            found.append(self._finding([row for row in bad if row.channel == channel]))
-        if found:
-            return found
+        found += [self._finding([row for row in bad if row.channel == channel])
+                  for channel in dict.fromkeys(row.channel for row in bad)]
         peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
         top = max(peaks, key=lambda n: peaks[n])
         limits = () if expectation.y_range_V is None else (Limit("converter", expectation.y_range_V[1]),)
-        x = np.arange(len(peaks))
         picture = Picture("Largest absolute value of each channel", "channel", f"largest value [{campaign.y_unit}]",
-                          (Series("peak", x, np.array(list(peaks.values())), "bars"),), limits, x_names=tuple(peaks))
-        return [Finding(self.name, "ok", f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
-                        value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
+                          (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),), limits,
+                          x_names=tuple(peaks))
+        return found or [
+            Finding(self.name, "ok", f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
+                    value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
 
     def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
         """Most samples at or beyond the range, in some record."""
         row = max(rows, key=lambda r: r.count)
         assert row.t is not None and row.x is not None and expectation.y_range_V is not None
-        t, x = thinned(row.t, row.x)
         return Finding(
             self.name, "stop",
             f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record} "
@@ -131,17 +119,15 @@ class Clipping(Gate):
             "be checked.", names, tuple(dict.fromkeys(r.record for r in rows)), row.count / row.samples,
             SETTINGS.wrong_unit,
             Picture(f"Record {row.record}, {row.channel}", "time [s]", f"{row.channel} [{campaign.y_unit}]",
-                    (Series(row.channel, t, x),), (Limit("converter", expectation.y_range_V[1]),)))
+                    (Series(row.channel, row.t, row.x),), (Limit("converter", expectation.y_range_V[1]),)))
 
     def _finding(self, of: list[_Ends]) -> Finding:
         """Of the records in which one channel is clipped."""
         row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
-        severity: Severity = "stop" if part > 1e-3 else "warning"
         assert row.t is not None and row.x is not None
-        t, x = thinned(row.t, row.x)
-        picture = Picture(f"Record {row.record}, {row.channel}", "time [s]", row.channel, (Series(row.channel, t, x),),
-                          (Limit("clipped at", row.value),))
+        picture = Picture(f"Record {row.record}, {row.channel}", "time [s]", row.channel,
+                          (Series(row.channel, row.t, row.x),), (Limit("clipped at", row.value),))
         bursts = f" in {row.bursts} bursts" if row.bursts > 1 else ""
         others = [f"{r.record} ({r.count} samples at {r.value:.4g})" for r in of if r is not row]
         also = f" Also in record {', '.join(others)}." if others else ""
@@ -149,7 +135,8 @@ class Clipping(Gate):
                     f"%){bursts} at {row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the "
                     "record; until then leave the record out.")
         records = tuple(r.record for r in of)
-        return Finding(self.name, severity, sentence, (row.channel,), records, float(row.count), 0.0, picture)
+        return Finding(self.name, "stop" if part > 1e-3 else "warning", sentence, (row.channel,), records,
+                       float(row.count), 0.0, picture)
 
 
 def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple[float, float] | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,18 +10,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    quoted,
-    thinned,
-)
-from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
+from avis_ctrl.measurement.gates.h1 import h1, moving, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
 
@@ -54,13 +45,11 @@ class _Kept:
 class DeadChannel(Gate):
     """Sensors that do not sense and drives that are never driven.
 
-    Constant channels need no statistics. A stuck code is a run of equal samples, at least 50 and five times as long as
-    any other such run of the channel. A channel is noise alone where its largest multiple coherence over the driven
-    lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records and lines) while
-    half of the channels exceed ten times as much in terms of coherence / (1 - coherence); that is judged over all
-    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). On
-    clean data the channel's signal-to-noise ratio would have to be at fault, so false alarms come from small signals
-    only.
+    Constant channels and stuck codes need no statistics. A channel is noise alone where its largest multiple coherence
+    over the driven lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records
+    and lines) while half of the channels respond, in terms of coherence / (1 - coherence); that is judged over all
+    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). False
+    alarms come from small signals only.
     """
 
     name = "dead channel"
@@ -82,79 +71,61 @@ class DeadChannel(Gate):
                      longest, stuck, _excess(seen), traces)
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        names = campaign.y_names
         rms = np.array([k.rms for k in kept])
-        found = []
+        picture = Picture("R.m.s. of each channel by record", "record number", f"r.m.s. [{campaign.y_unit}]",
+                          tuple(Series(name, np.arange(len(kept)), rms[:, j], "points")
+                                for j, name in enumerate(campaign.y_names)), y_scale="log")
+        found = [*self._sensors(kept, campaign, rms, picture), *self._never_driven(kept, campaign, picture)]
+        strongest = rms.max(axis=0)
+        quietest = int(np.argmin(strongest))
+        return found or [
+            Finding(self.name, "ok", f"All {len(strongest)} channels move; the quietest is "
+                    f"{campaign.y_names[quietest]!r} with {strongest[quietest]:.3g} {campaign.y_unit} r.m.s. in its "
+                    "strongest record.", value=float(strongest[quietest]), limit=0.0, picture=picture)]
+
+    def _sensors(self, kept: list[_Kept], campaign: Campaign, rms: np.ndarray, picture: Picture) -> Iterator[Finding]:
         responses = [k.response for k in kept if k.response is not None]
-        picture = self._picture(kept, rms, campaign)
         # Drift looks like a slow sine: of many sine records the middle one counts.
         sines = all(record.header.excitation == "sine" for record in campaign.records)
         excess = (np.median if sines else np.max)(responses, axis=0) if responses else None
-        constant: set[str] = set()
-        for j, name in enumerate(names):
+        for j, name in enumerate(campaign.y_names):
             dead = tuple(k.record for k in kept if k.rms[j] == 0)
             if dead:
-                constant.add(name)
-                found.append(
-                    Finding(self.name, "stop",
-                            f"Channel {name!r} is constant in {_records(dead, kept)}: the sensor is not connected or "
-                            "not recorded. Check its cable and input, or leave the channel out.", (name,), dead, 0.0,
-                            0.0, picture))
+                where = "every record" if len(dead) == len(kept) else f"record {', '.join(dead[:5])}"
+                yield Finding(self.name, "stop",
+                              f"Channel {name!r} is constant in {where}: the sensor is not connected or not recorded. "
+                              "Check its cable and input, or leave the channel out.", (name,), dead, 0.0, 0.0, picture)
             for k in kept:
                 if j in k.stuck:
-                    found.append(self._stuck(name, j, k, campaign))
-            if name not in constant and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
-                found.append(
-                    Finding(self.name, "stop",
-                            f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
-                            f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
-                            "record while the other channels respond (its ratio of response to noise is "
-                            f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
-                            f"{np.median(excess):.3g} times it): not connected, or recorded under another name. Check "
-                            "its cable, or leave it out.", (name,),
-                            tuple(k.record for k in kept if k.response is not None), float(excess[j]), 1.0, picture))
-        found += self._never_driven(kept, campaign, picture)
-        if not found:
-            found.append(
-                Finding(self.name, "ok",
-                        f"All {len(names)} channels move; the quietest is {names[int(np.argmin(rms.max(axis=0)))]!r} "
-                        f"with {rms.max(axis=0).min():.3g} {campaign.y_unit} r.m.s. in its strongest record.",
-                        value=float(rms.max(axis=0).min()), limit=0.0, picture=picture))
-        return found
+                    yield self._stuck(name, j, k, campaign)
+            if not dead and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
+                yield Finding(self.name, "stop",
+                              f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
+                              f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
+                              "record while the other channels respond (its ratio of response to noise is "
+                              f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
+                              f"{np.median(excess):.3g} times it): not connected, or recorded under another name. "
+                              "Check its cable, or leave it out.", (name,),
+                              tuple(k.record for k in kept if k.response is not None), float(excess[j]), 1.0, picture)
 
-    def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> list[Finding]:
-        driven = [k for k in kept if k.driven]
-        if not driven:
-            return []
-        idle = tuple(n for j, n in enumerate(campaign.u_names) if not any(k.spread[j] > 0 for k in driven))
-        if not idle:
-            return []
-        return [
-            Finding(self.name, "note",
-                    f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. Drive "
-                    "it in a further record, or leave it out.", idle, picture=picture)]
+    def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> Iterator[Finding]:
+        driven = [k.spread for k in kept if k.driven]
+        idle = tuple(n for j, n in enumerate(campaign.u_names) if not any(spread[j] > 0 for spread in driven))
+        if driven and idle:
+            yield Finding(self.name, "note",
+                          f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
+                          "Drive it in a further record, or leave it out.", idle, picture=picture)
 
     def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
         n, at = kept.stuck[j]
         rate = campaign.sample_rate_Hz
         t, x = kept.traces[j]
-        severity: Severity = "warning"
         picture = Picture(f"Record {kept.record}, {name}", "time [s]", f"{name} [{campaign.y_unit}]",
-                          (Series(name, *thinned(t, x)),), (Limit("stuck from", at / rate, "x"),))
-        return Finding(self.name, severity,
+                          (Series(name, t, x),), (Limit("stuck from", at / rate, "x"),))
+        return Finding(self.name, "warning",
                        f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
                        f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
                        "repeat the record.", (name,), (kept.record,), float(n), float(SETTINGS.stuck_samples), picture)
-
-    def _picture(self, kept: list[_Kept], rms: np.ndarray, campaign: Campaign) -> Picture:
-        x = np.arange(len(kept))
-        return Picture("R.m.s. of each channel by record", "record number", f"r.m.s. [{campaign.y_unit}]",
-                       tuple(Series(name, x, rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
-                       y_scale="log")
-
-
-def _records(names: tuple[str, ...], kept: list[_Kept]) -> str:
-    return "every record" if len(names) == len(kept) else f"record {', '.join(names[:5])}"
 
 
 def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:
@@ -172,10 +143,9 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
     if seen.header.excitation == "sine":
         return _sine_excess(seen)
     u, y, wrap = usable(seen)
-    moving = np.ptp(u, axis=0) > 0
-    if not moving.any():
+    if not moving(u):
         return None
-    of = spectra(u, y, seen.header.sample_rate_Hz, segment_length(len(u), int(moving.sum())), wrap)
+    of = spectra(u, y, seen.header.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
     estimate = h1([of])
     if estimate is None:
         return None

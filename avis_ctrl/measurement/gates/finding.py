@@ -15,16 +15,28 @@ SEVERITIES: tuple[str, ...] = ("ok", "note", "warning", "stop")
 Response = Callable[[np.ndarray, tuple[str, ...]], np.ndarray]
 # Chance that a gate raises an alarm on clean data of one campaign, over all its channels and records.
 FALSE_ALARM = 0.01
+MOST_POINTS = 2000  # of a line in a plot
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A curve of a picture: x and y of equal length; style "line", "points" or "bars"."""
+    """A curve of a picture: x and y of equal length; style "line", "points" or "bars".
+
+    Of a longer line the smallest and the largest point of each of `MOST_POINTS` / 2 bins are kept.
+    """
 
     name: str
     x: np.ndarray
     y: np.ndarray
     style: str = "line"
+
+    def __post_init__(self) -> None:
+        if self.style == "line" and len(self.x) > MOST_POINTS:
+            x, y = np.asarray(self.x), np.asarray(self.y)
+            bins = np.array_split(np.arange(len(x)), MOST_POINTS // 2)
+            keep = np.unique([k for part in bins for k in (part[np.argmin(y[part])], part[np.argmax(y[part])])])
+            object.__setattr__(self, "x", x[keep])
+            object.__setattr__(self, "y", y[keep])
 
 
 @dataclass(frozen=True)
@@ -130,12 +142,3 @@ def times(ratio: float, most: float = 1000.0) -> str:
 def percent(part: float) -> str:
     """"0.12 %", "12 %", "230 %" or "over 1000 %"."""
     return "over 1000 %" if part > 10 else f"{100 * part:.0f} %" if part >= 0.1 else f"{100 * part:.2g} %"
-
-
-def thinned(x: np.ndarray, y: np.ndarray, most: int = 2000) -> tuple[np.ndarray, np.ndarray]:
-    """At most about `most` points of a curve for a plot, keeping smallest and largest of each bin."""
-    if len(x) <= most:
-        return np.asarray(x), np.asarray(y)
-    bins = np.array_split(np.arange(len(x)), most // 2)
-    keep = np.unique([k for part in bins for k in (part[np.argmin(y[part])], part[np.argmax(y[part])])])
-    return np.asarray(x)[keep], np.asarray(y)[keep]

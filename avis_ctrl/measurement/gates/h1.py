@@ -88,6 +88,10 @@ class H1:
         """How many directions of u are excited."""
         return self.basis.shape[1]
 
+    def unbiased_coherence(self) -> np.ndarray:
+        """(n, n_y) coherence less what chance gives it."""
+        return self.coherence - (1 - self.coherence) * self.rank / self.dof
+
 
 def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
     """u, y and whether they wrap around: the mean period after the first, or the first piece of the record."""
@@ -96,6 +100,11 @@ def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
         if u.shape[1] <= SETTINGS.most_samples:
             return u[1:].mean(axis=0), y[1:].mean(axis=0), True
     return seen.first.u[:SETTINGS.most_samples], seen.first.y[:SETTINGS.most_samples], False
+
+
+def moving(u: np.ndarray) -> int:
+    """Number of the columns of u (samples, n_u) that are not constant."""
+    return int(np.count_nonzero(np.ptp(u, axis=0)))
 
 
 def segment_length(samples: int, inputs: int) -> int:
@@ -184,3 +193,9 @@ def octaves(f: np.ndarray) -> list[np.ndarray]:
     edges[-1] = np.nextafter(max(edges[-1], f[-1]), np.inf)
     masks = [(f >= low) & (f < high) for low, high in pairwise(edges)]
     return [mask for mask in masks if mask.any()] or [np.ones(len(f), bool)]
+
+
+def thirds(f: np.ndarray) -> list[np.ndarray]:
+    """Masks of thirds of octaves that hold a line."""
+    place = np.floor(3 * np.log2(f / f[0]) + 1e-9).astype(int)
+    return [place == k for k in np.unique(place)]

@@ -9,16 +9,7 @@ from scipy import signal, stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    thinned,
-)
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
 
 MAINS_HZ = (50.0, 60.0)
 
@@ -59,7 +50,6 @@ class _Line:
 class _Kept:
     record: str
     lines: list[_Line]
-    tested: int
     passed_over: int
     rms: np.ndarray
     f: np.ndarray
@@ -70,12 +60,10 @@ class Hum(Gate):
     """Narrow lines at k 50 Hz and k 60 Hz, k = 1 .. 6, within 0.4 %.
 
     Power spectra are means over K Hann segments without overlap (K from 4 to 32). The largest bin within the tolerance
-    is compared with 16 bins on either side, the first three next to it left out; the louder side is the floor. Their
-    ratio is F(2K, 2 16 K) distributed where the floor is locally flat, so that 1 % shared over bins, lines, channels
-    and records controls false alarms; a line must moreover exceed its floor by a factor of 3, for floors that are not
-    quite flat. Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins) are
-    passed over: they are the experiment. A line is a warning where it makes more than 1 % of the channel's r.m.s. in
-    that record, otherwise a note.
+    is compared with the reference bins on either side; the louder side is the floor. Their ratio is F(2K, 2 m K)
+    distributed for m bins of a locally flat floor, so that 1 % shared over bins, lines, channels and records controls
+    false alarms. Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins)
+    are passed over: they are the experiment. A line is a warning where it is large, otherwise a note.
     """
 
     name = "hum"
@@ -94,46 +82,40 @@ class Hum(Gate):
                 made = _tested(f, P, driven, k * mains, mains, K)
                 lines += made or []
                 passed += made is None
-        return _Kept(h.name, lines, len(lines), passed, y.std(axis=0), f, np.sqrt(P))
+        return _Kept(h.name, lines, passed, y.std(axis=0), f, np.sqrt(P))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        tested = sum(k.tested for k in kept)
-        found = []
-        names = campaign.y_names
-        for j, name in enumerate(names):
-            for mains in MAINS_HZ:
-                hits = [(k, line) for k in kept for line in k.lines if line.channel == j and line.mains_Hz == mains
-                        and line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio]
-                if hits:
-                    found.append(self._finding(name, mains, hits, campaign.y_unit))
-        passed = sum(k.passed_over for k in kept)
-        if not found:
-            note = f"; {passed} lines are excited by u and were not tested" if passed else ""
-            what = "No mains hum was found" if tested else "No line of the mains could be tested"
-            last = kept[-1]
-            found.append(
-                Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", value=None,
-                        limit=FALSE_ALARM, picture=self._picture(last, 0, names[0], campaign.y_unit, [])))
-        return found
+        tested, passed = sum(len(k.lines) for k in kept), sum(k.passed_over for k in kept)
+        hits: dict[tuple[int, float], list[tuple[_Kept, _Line]]] = {}
+        for k in kept:
+            for line in k.lines:
+                if line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio:
+                    hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
+        found = [self._finding(campaign.y_names[j], mains, some, campaign.y_unit)
+                 for (j, mains), some in sorted(hits.items())]
+        note = f"; {passed} lines are excited by u and were not tested" if passed else ""
+        what = "No mains hum was found" if tested else "No line of the mains could be tested"
+        return found or [
+            Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", limit=FALSE_ALARM,
+                    picture=self._picture(kept[-1], 0, campaign.y_names[0], campaign.y_unit, []))]
 
     def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)
         part = max(hit.rms / max(k.rms[hit.channel], 1e-300) for k, hit in hits)
-        severity: Severity = "warning" if part > SETTINGS.large else "note"
         records = tuple(dict.fromkeys(k.record for k, _ in hits))
         at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
         harmonics = ", ".join(f"{k * mains:g}" for k in at)
         picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
-        return Finding(self.name, severity,
+        return Finding(self.name, "warning" if part > SETTINGS.large else "note",
                        f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
                        f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
                        f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
                        "lines out of the fit.", (name,), records, float(line.ratio), SETTINGS.least_ratio, picture)
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
-        f, a = thinned(kept.f[1:], kept.asd[1:, j])
         return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/√Hz]",
-                       (Series(name, f, a),), tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
+                       (Series(name, kept.f[1:], kept.asd[1:, j]),),
+                       tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
 
 
 def _length(samples: int, rate: float) -> int:

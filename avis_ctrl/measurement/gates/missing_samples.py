@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from scipy import stats
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
-from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, segment_length, spectra
+from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, moving, segment_length, spectra
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,10 @@ class MissingSamples(Gate):
     Lost samples shift y against the commanded u. In each segment the delay of y behind H1 u is fitted to the phase of
     the driven lines, weighted by the residual; the largest step between means of the segments before and after any
     instant is tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three
-    estimates of H1; few segments), must exceed half a sample, and must explain the record: with the step undone the
-    residual of H1 falls by a tenth. A delay that runs away is no step. In a swept sine the delay changes with the
-    frequency, and so with time: steps are not looked for there. Where rows were lost from u and y together, a periodic
-    u shows it: each period is compared with the first by circular correlation, exactly, for u is commanded.
-    A repeated block is 16 or more rows equal in every channel of y to earlier ones, not a whole number of periods away
-    where the record is periodic; noise in one channel alone makes that impossible by chance.
+    estimates of H1; few segments), and must explain the record. A delay that runs away is no step. In a swept sine the
+    delay changes with the frequency, and so with time: steps are not looked for there. Where rows were lost from u and
+    y together, a periodic u shows it: each period is compared with the first by circular correlation, exactly, for u is
+    commanded. A repeated block is rows equal in every channel of y to earlier ones, not a whole number of periods away.
     """
 
     name = "missing samples"
@@ -76,49 +74,45 @@ class MissingSamples(Gate):
         return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        found = self._overlaps(kept)
         level = FALSE_ALARM / max(1, sum(k.delay.size for k in kept))
-        for k in kept:
-            picture = _picture(k)
-            rate, name = k.header.sample_rate_Hz, k.header.name
-            if k.block:
-                at, back, n = k.block
-                found.append(
-                    Finding(self.name, "stop",
-                            f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples "
-                            "before: a buffer was written twice. Repeat the record.", (), (name,), float(n),
-                            float(SETTINGS.block_rows), picture))
-            if k.clock is not None and np.any(k.clock != 0):
-                p = int(np.flatnonzero(k.clock)[0])
-                found.append(
-                    Finding(self.name, "stop",
-                            f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off "
-                            f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or "
-                            "doubled, or the stated period is wrong. Check period_s, or repeat the record.", (),
-                            (name,), float(k.clock[p]), 0.0, picture))
-            step = largest_step(k.stepped, level)
-            if step is not None and abs(step[1]) > SETTINGS.jump_samples:
-                at, size = step
-                found.append(
-                    Finding(self.name, "stop",
-                            f"In record {name} the delay of the measured channels after the commanded voltage becomes "
-                            f"{abs(size):.1f} samples {'shorter' if size < 0 else 'longer'} at about "
-                            f"{k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were "
-                            f"{'lost' if size < 0 else 'doubled'}. Repeat the record, or use only the part before.", (),
-                            (name,), float(size), SETTINGS.jump_samples, picture))
-        if not found:
-            longest = max(kept, key=lambda k: len(k.t))
-            told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
-            vague = sum(len(k.t) > 3 for k in kept) - len(told)
-            scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
-            said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
-            said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
-            found.append(
-                Finding(self.name, "ok",
-                        f"No lost or repeated samples were found ({len(told)} of {len(kept)} records could be compared "
-                        f"with a moving commanded voltage{said}).", value=scatter if told else None,
-                        limit=SETTINGS.jump_samples, picture=_picture(longest)))
-        return found
+        found = [*self._overlaps(kept), *(f for k in kept for f in self._faults(k, level))]
+        longest = max(kept, key=lambda k: len(k.t))
+        told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
+        vague = sum(len(k.t) > 3 for k in kept) - len(told)
+        scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
+        said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
+        said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
+        return found or [
+            Finding(self.name, "ok", f"No lost or repeated samples were found ({len(told)} of {len(kept)} records "
+                    f"could be compared with a moving commanded voltage{said}).", value=scatter if told else None,
+                    limit=SETTINGS.jump_samples, picture=_picture(longest))]
+
+    def _faults(self, k: _Kept, level: float) -> Iterator[Finding]:
+        """Of one record."""
+        rate, name, picture = k.header.sample_rate_Hz, k.header.name, _picture(k)
+        if k.block:
+            at, back, n = k.block
+            yield Finding(self.name, "stop",
+                          f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples "
+                          "before: a buffer was written twice. Repeat the record.", (), (name,), float(n),
+                          float(SETTINGS.block_rows), picture)
+        if k.clock is not None and np.any(k.clock != 0):
+            p = int(np.flatnonzero(k.clock)[0])
+            yield Finding(self.name, "stop",
+                          f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off "
+                          f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, "
+                          "or the stated period is wrong. Check period_s, or repeat the record.", (), (name,),
+                          float(k.clock[p]), 0.0, picture)
+        steps = [step for one in k.stepped if (step := delay_step(one, level)) is not None]
+        at, size = max(steps, key=lambda step: abs(step[1]), default=(0, 0.0))
+        if abs(size) > SETTINGS.jump_samples:
+            fewer = size < 0
+            yield Finding(self.name, "stop",
+                          f"In record {name} the delay of the measured channels after the commanded voltage becomes "
+                          f"{abs(size):.1f} samples {'shorter' if fewer else 'longer'} at about "
+                          f"{k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were "
+                          f"{'lost' if fewer else 'doubled'}. Repeat the record, or use only the part before.", (),
+                          (name,), float(size), SETTINGS.jump_samples, picture)
 
     def _overlaps(self, kept: list[_Kept]) -> list[Finding]:
         if len(kept) < 2 or len({k.header.start_s for k in kept}) == 1:
@@ -145,7 +139,7 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     """
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
-    rate, n_u = seen.header.sample_rate_Hz, int(np.count_nonzero(np.ptp(seen.first.u, axis=0)))
+    rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
     u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
     length = segment_length(len(u), n_u)
     of = spectra(u, y, rate, length, wrap=False)
@@ -183,7 +177,7 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     lines that are driven before and after it count (`both_sides` of the settings); if these are too few (`showing`),
     nothing is explained.
     """
-    rate, n_u = seen.header.sample_rate_Hz, int(np.count_nonzero(np.ptp(seen.first.u, axis=0)))
+    rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
     u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
     count, length = max(1, round(abs(size))), segment_length(len(u), n_u)
     of = spectra(u, y, rate, length, wrap=False)
@@ -204,12 +198,6 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
                 noise, left = (np.maximum(one.noise[..., np.isin(one.f, f), :], 1e-300) for one in (before, after))
                 most = max(most, float(np.mean(np.log(noise / left))))
     return most
-
-
-def largest_step(delay: Iterable[np.ndarray], level: float) -> tuple[int, float] | None:
-    """The largest significant step among the estimates (m, K) of the delay; None where none is."""
-    steps = [step for one in delay if (step := delay_step(one, level)) is not None]
-    return max(steps, key=lambda step: abs(step[1]), default=None)
 
 
 def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:

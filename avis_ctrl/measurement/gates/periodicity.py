@@ -41,9 +41,8 @@ class _Kept:
 
     record: str
     period_s: float
-    whole: bool
-    T: np.ndarray | None
-    relative: np.ndarray | None
+    T: np.ndarray
+    relative: np.ndarray
     lines: int
     dof: int
     drift: tuple[np.ndarray, np.ndarray] | None = None
@@ -62,77 +61,72 @@ class Periodicity(Gate):
 
     name = "periodicity"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
-        period_s = seen.header.period_s or 0.0
-        none = _Kept(seen.header.name, period_s, seen.whole, None, None, 0, 0)
-        if not seen.periodic or not seen.driven:
-            return none
-        y = seen.periods("y")
-        P = len(y)
-        if P < 4:
-            return none
+    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
+        if not seen.periodic or not seen.driven or len(y := seen.periods("y")) < 4:
+            return None
         T, relative, lines, R = compared(y)
-        drift = trend(y[P - R :]) if R > 2 else None
-        return _Kept(seen.header.name, period_s, seen.whole, T, relative, lines, R - 1, drift)
+        return _Kept(seen.header.name, seen.header.period_s or 0.0, T, relative, lines, R - 1,
+                     trend(y[len(y) - R :]) if R > 2 else None)
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        judged = [k for k in kept if k.T is not None]
+    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+        judged = [k for k in kept if k is not None]
         if not judged:
-            why = "no record is periodic with four periods or more"
-            return [Finding(self.name, "ok", f"Periodicity was not tested: {why}.",
-                            picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()))]
-        tests = sum(k.T.size for k in judged if k.T is not None)
-        found, drops = [], {}
+            return [Finding(self.name, "ok", "Periodicity was not tested: no record is periodic with four periods or "
+                            "more.", picture=Picture("Periods against the last ones", "period", "ratio to noise [-]",
+                                                     ()))]
+        level = FALSE_ALARM / sum(k.T.size for k in judged)
+        found: list[Finding] = []
+        drops: list[tuple[int, _Kept, float, Picture]] = []
         for k in judged:
-            assert k.T is not None and k.relative is not None
-            limit = float(stats.f.isf(FALSE_ALARM / tests, k.lines, k.lines * k.dof))
-            failed = np.flatnonzero((limit < k.T).any(axis=1))
-            P = len(k.T)
-            reference = P - P // 2
+            limit = float(stats.f.isf(level, k.lines, k.lines * k.dof))
             picture = Picture(
-                f"Record {k.record}: periods against the last {P // 2}", "period", "difference by noise, power [-]",
-                tuple(Series(n, np.arange(1, P + 1), k.T[:, j], "points") for j, n in enumerate(campaign.y_names)),
-                (Limit("1 % limit for noise", limit),), y_scale="log")
-            if (drifting := self._drifting(k, tests, campaign, picture)) is not None:
-                found.append(drifting)
-                continue
+                f"Record {k.record}: periods against the last {len(k.T) // 2}", "period",
+                "difference by noise, power [-]",
+                tuple(Series(n, np.arange(1, len(k.T) + 1), k.T[:, j], "points")
+                      for j, n in enumerate(campaign.y_names)), (Limit("1 % limit for noise", limit),), y_scale="log")
+            failed = np.flatnonzero((limit < k.T).any(axis=1))
             drop = int(failed[-1]) + 1 if len(failed) else 0
-            if drop > reference:
-                bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
-                found.append(
-                    Finding(self.name, "warning",
-                            f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: "
-                            f"{quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise, "
-                            f"{percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is "
-                            "longer than the record. Wait longer before recording, or look for drift.", bad,
-                            (k.record,), float(k.T[drop - 1].max()), limit, picture))
+            warned = self._drifting(k, level, campaign, picture)
+            warned = warned or self._unsettled(k, drop, limit, campaign, picture)
+            if warned:
+                found.append(warned)
             else:
-                drops[k.record] = (drop, k, limit, picture)
-        late = {r: d for r, d in drops.items() if d[0] > 0}
-        if late:
-            most, k, limit, picture = max(late.values(), key=lambda d: d[0])
+                drops.append((drop, k, limit, picture))
+        if not drops:
+            return found
+        most, k, limit, picture = max(drops, key=lambda d: d[0])
+        if most:
             periods = f"{most} period{'s' if most > 1 else ''}"
-            assert k.relative is not None and k.T is not None
             found.append(
                 Finding(self.name, "note",
                         f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first "
                         f"differs from the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that "
                         "includes the transient, as in avis identify, needs no change; otherwise leave out the "
-                        f"beginning of each record, {periods}.", (), tuple(late), float(most), 0.0, picture))
-        elif drops and not found:
-            _, k, limit, picture = next(iter(drops.values()))
-            assert k.T is not None
-            found.append(
-                Finding(self.name, "ok",
-                        f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for noise alone "
-                        f"{limit:.2f}).", value=float(k.T.max()), limit=limit, picture=picture))
-        return found
+                        f"beginning of each record, {periods}.", (), tuple(d[1].record for d in drops if d[0]),
+                        float(most), 0.0, picture))
+        return found or [
+            Finding(self.name, "ok", f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for "
+                    f"noise alone {limit:.2f}).", value=float(k.T.max()), limit=limit, picture=picture)]
 
-    def _drifting(self, k: _Kept, tests: int, campaign: Campaign, picture: Picture) -> Finding | None:
-        if k.drift is None or k.T is None:
+    def _unsettled(self, k: _Kept, drop: int, limit: float, campaign: Campaign, picture: Picture) -> Finding | None:
+        """Periods of the reference itself differ."""
+        P = len(k.T)
+        reference = P - P // 2
+        if drop <= reference:
+            return None
+        bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
+        return Finding(self.name, "warning",
+                       f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: "
+                       f"{quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise, "
+                       f"{percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is "
+                       "longer than the record. Wait longer before recording, or look for drift.", bad, (k.record,),
+                       float(k.T[drop - 1].max()), limit, picture)
+
+    def _drifting(self, k: _Kept, level: float, campaign: Campaign, picture: Picture) -> Finding | None:
+        if k.drift is None:
             return None
         T, drift = k.drift
-        limit = float(stats.f.isf(FALSE_ALARM / tests, k.lines, k.lines * (k.dof - 1)))
+        limit = float(stats.f.isf(level, k.lines, k.lines * (k.dof - 1)))
         bad = (limit < T) & (drift > SETTINGS.drift)
         if not bad.any():
             return None

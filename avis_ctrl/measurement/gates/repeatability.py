@@ -18,11 +18,10 @@ from avis_ctrl.measurement.gates.finding import (
     Limit,
     Picture,
     Series,
-    Severity,
     percent,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, h1, moving, octaves, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -109,7 +108,7 @@ class Comparison(Gate):
         if not seen.driven or h.excitation == "sine":
             return None
         u, y, wrap = usable(seen)
-        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0)))), wrap)
+        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
             return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
         P = len(periods)
@@ -160,10 +159,10 @@ def _judged(gate: str, differences: list[Difference], campaign: Campaign,
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
         if bad.any():
             names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-            severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
+            large = d.relative[bad].max() > SETTINGS.large
             sentence, records = said(d, bad, names)
-            found.append(Finding(gate, severity, sentence, names, records, float(d.T[bad].max()), 1.0,
-                                 _picture(d, campaign.y_names)))
+            found.append(Finding(gate, "warning" if large else "note", sentence, names, records, float(d.T[bad].max()),
+                                 1.0, _picture(d, campaign.y_names)))
     if found:
         return found
     d = max(differences, key=lambda d: d.noise)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,17 +10,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    quoted,
-)
-from avis_ctrl.measurement.gates.h1 import H1, h1, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
+from avis_ctrl.measurement.gates.h1 import H1, h1, moving, octaves, segment_length, spectra, thirds, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
 
@@ -43,14 +35,13 @@ SETTINGS = QualitySettings()
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """f (n,) Hz; snr (n, n_y) signal power by noise power of one period; noise_rms (n_y,); wide: noise at rest;
-    segment_s: of a record that is not periodic, whose segments leak; 0 of a periodic one."""
+    """f (n,) Hz; snr (n, n_y) signal power by noise power of one period; segment_s : of a record that is not periodic,
+    whose segments leak, 0 of a periodic one; noise_rms (n_y,) : at rest."""
 
-    record: str
     f: np.ndarray
     snr: np.ndarray | None
+    segment_s: float
     noise_rms: np.ndarray | None
-    segment_s: float = 0.0
 
 
 class SignalToNoise(Gate):
@@ -58,77 +49,72 @@ class SignalToNoise(Gate):
 
     Of a periodic record: power of the mean of the periods after the first by the variance between them, over the driven
     lines; of others coherence / (1 - coherence) without its bias. No alarm is raised by a test: the numbers are
-    estimates with an error of less than 1 dB where a band holds 30 lines x periods. A note is below 10 dB in some band,
-    a warning below 0 dB in every band. Where the sensors' noise is known, records at rest are compared with it: white
-    noise of 3 times the stated r.m.s. above half the Nyquist frequency is a warning (chi-square with thousands of
-    degrees of freedom: chance has no part).
+    estimates with an error of less than 1 dB where a band holds 30 lines x periods. Where the sensors' noise is known,
+    records at rest are compared with it above half the Nyquist frequency: chance has no part, the degrees of freedom
+    are thousands.
     """
 
     name = "signal to noise"
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Noise:
-        f, snr, segment_s = _snr(seen)
         noise = _high_noise(seen) if expectation.sensor_noise_rms_V else None
-        return _Noise(seen.header.name, f, snr, noise, segment_s)
+        return _Noise(*_snr(seen), noise)
 
     def conclude(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        found = self._noisy(kept, campaign, expectation)
-        measured = [(k.f, k.snr, k.segment_s) for k in kept if k.snr is not None and len(k.f)]
+        noisy = list(self._noisy(kept, campaign, expectation))
+        measured = [k for k in kept if k.snr is not None and len(k.f)]
         if not measured:
-            picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
-            return found or [Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
-                                     picture=picture)]
-        f, snr, segment_s = max(measured, key=lambda m: float(np.median(m[1])))
-        advice = (f". Causes are noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. "
-                  "A periodic excitation would distinguish them; a higher level helps only against noise."
-                  if segment_s
-                  else ". Such bands have little weight in a fit; excite them more if they are important.")
+            return noisy or [Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
+                                     picture=Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ()))]
+        best = max(measured, key=lambda k: float(np.median(np.asarray(k.snr))))
+        f, snr = best.f, np.asarray(best.snr)
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])
         picture = Picture("Signal to noise of the best record", "frequency [Hz]", "ratio [dB]",
                           tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
                           (Limit("low", SETTINGS.low_dB),), "log")
-        for j, name in enumerate(campaign.y_names):
-            weakest = int(np.argmin(dB[:, j]))
-            if dB[:, j].max() < SETTINGS.poor_dB:
-                found.append(
-                    Finding(self.name, "warning",
-                            f"Channel {name!r} has more noise than signal in every band (at best {dB[:, j].max():.1f} "
-                            f"dB at {middle[np.argmax(dB[:, j])]:.3g} Hz). Raise the level, or average longer.",
-                            (name,), value=float(dB[:, j].max()), limit=SETTINGS.poor_dB, picture=picture))
-            elif dB[weakest, j] < SETTINGS.low_dB:
-                weak = np.flatnonzero(dB[:, j] < SETTINGS.low_dB)
-                low = ", ".join(f"{round(float(dB[b, j]))} dB at {middle[b]:.3g} Hz" for b in weak)
-                found.append(
-                    Finding(self.name, "note", f"Channel {name!r} has little signal: {low}{advice}", (name,),
-                            value=float(dB[weakest, j]), limit=SETTINGS.low_dB, picture=picture))
-        if not found:
-            b, j = divmod(int(np.argmin(dB)), dB.shape[1])
-            found.append(
-                Finding(self.name, "ok",
-                        f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r} "
-                        f"around {middle[b]:.3g} Hz).", value=float(dB[b, j]), limit=SETTINGS.low_dB, picture=picture))
-        return found
+        found = noisy + list(self._weak(campaign.y_names, middle, dB, best.segment_s, picture))
+        b, j = divmod(int(np.argmin(dB)), dB.shape[1])
+        return found or [
+            Finding(self.name, "ok", f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest "
+                    f"{campaign.y_names[j]!r} around {middle[b]:.3g} Hz).", value=float(dB[b, j]),
+                    limit=SETTINGS.low_dB, picture=picture)]
 
-    def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def _weak(self, names: tuple[str, ...], middle: np.ndarray, dB: np.ndarray, segment_s: float,
+              picture: Picture) -> Iterator[Finding]:
+        advice = (f". Causes are noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. "
+                  "A periodic excitation would distinguish them; a higher level helps only against noise."
+                  if segment_s else
+                  ". Such bands have little weight in a fit; excite them more if they are important.")
+        for name, levels in zip(names, dB.T, strict=True):
+            weak = np.flatnonzero(levels < SETTINGS.low_dB)
+            if levels.max() < SETTINGS.poor_dB:
+                yield Finding(self.name, "warning",
+                              f"Channel {name!r} has more noise than signal in every band (at best {levels.max():.1f} "
+                              f"dB at {middle[np.argmax(levels)]:.3g} Hz). Raise the level, or average longer.",
+                              (name,), value=float(levels.max()), limit=SETTINGS.poor_dB, picture=picture)
+            elif weak.size:
+                low = ", ".join(f"{round(float(levels[b]))} dB at {middle[b]:.3g} Hz" for b in weak)
+                yield Finding(self.name, "note", f"Channel {name!r} has little signal: {low}{advice}", (name,),
+                              value=float(levels.min()), limit=SETTINGS.low_dB, picture=picture)
+
+    def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> Iterator[Finding]:
         stated = expectation.sensor_noise_rms_V
         levels = [k.noise_rms for k in kept if k.noise_rms is not None]
         if stated is None or not levels:
-            return []
+            return
         rms = np.median(levels, axis=0)
-        x = np.arange(len(rms))
         picture = Picture("Noise of each channel, from above half the Nyquist frequency", "channel",
-                          f"r.m.s. [{campaign.y_unit}]", (Series("measured", x, rms, "bars"),),
+                          f"r.m.s. [{campaign.y_unit}]", (Series("measured", np.arange(len(rms)), rms, "bars"),),
                           (Limit("stated", stated),), y_scale="log", x_names=campaign.y_names)
-        return [
-            Finding(self.name, "warning",
-                    f"Channel {name!r} has sensor noise of {rms[j]:.3g} {campaign.y_unit} r.m.s., {rms[j] / stated:.1f}"
-                    " times what the rig file states. Check its preamplifier and cable, or correct the rig file.",
-                    (name,), value=float(rms[j]), limit=SETTINGS.noise_factor * stated, picture=picture)
-            for j, name in enumerate(campaign.y_names)
-            if rms[j] > SETTINGS.noise_factor * stated
-        ]
+        for name, one in zip(campaign.y_names, rms, strict=True):
+            if one > SETTINGS.noise_factor * stated:
+                yield Finding(self.name, "warning",
+                              f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., "
+                              f"{one / stated:.1f} times what the rig file states. Check its preamplifier and cable, "
+                              "or correct the rig file.", (name,), value=float(one),
+                              limit=SETTINGS.noise_factor * stated, picture=picture)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +131,12 @@ class _Coherence:
 class Coherence(Gate):
     """Multiple coherence of each channel with all inputs, over the driven records near the largest level.
 
-    Records within a factor 1.4 of the largest level count together, which leaves long segments; the lowest frequency is
-    that of the second line of a segment, and the sentence says so where the voltage begins lower. Estimates are freed
-    of their bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what
-    is judged. A mean under 0.5 is a note. A channel that is low in all bands by more than chance (normal approximation
-    of the mean, 1 % shared over bands and channels) is a warning. Segments leak where a mode decays longer than they
-    last, which lowers the coherence there without any fault; the sentence states their length.
+    Records near the largest level count together, which leaves long segments; the lowest frequency is that of the
+    second line of a segment, and the sentence says so where the voltage begins lower. Estimates are freed of their
+    bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what is judged.
+    A channel that is low in all bands by more than chance (normal approximation of the mean, 1 % shared over bands and
+    channels) is a warning. Segments leak where a mode decays longer than they last, which lowers the coherence there
+    without any fault; the sentence states their length.
     """
 
     name = "coherence"
@@ -168,8 +154,7 @@ class Coherence(Gate):
         if best is None:
             return [Finding(self.name, "ok", "No driven record is long enough for a coherence of all inputs together.",
                             picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()))]
-        n_u = best.rank
-        free = best.coherence - (1 - best.coherence) * n_u / best.dof
+        free = best.unbiased_coherence()
         bands = thirds(best.f)
         middle = np.array([np.sqrt(best.f[b][0] * best.f[b][-1]) for b in bands])
         mean = np.array([free[b].mean(axis=0) for b in bands])
@@ -187,8 +172,7 @@ class Coherence(Gate):
         low = np.any(mean < SETTINGS.low_coherence, axis=0)
         groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
         found = [self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
-                 for group in groups
-                 if group]
+                 for group in groups if group]
         if found:
             return found
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
@@ -201,7 +185,6 @@ class Coherence(Gate):
     def _low(self, names: tuple[str, ...], group: list[int], middle: np.ndarray, mean: np.ndarray, surely: bool,
              seconds: float, below: str, picture: Picture) -> Finding:
         """One channel that is low everywhere, or all those that are low somewhere."""
-        severity: Severity = "warning" if surely else "note"
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
@@ -210,7 +193,7 @@ class Coherence(Gate):
             said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in "
                         f"{count} band{'s' * (count > 1)})")
         more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
-        return Finding(self.name, severity,
+        return Finding(self.name, "warning" if surely else "note",
                        f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
                        f"the {len(middle)} third-octave bands: {'; '.join(said)}{more}. Causes are noise, an input "
                        "that is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
@@ -246,12 +229,6 @@ def _lowest_driven(chosen: list[_Coherence]) -> float:
     return min(lowest)
 
 
-def thirds(f: np.ndarray) -> list[np.ndarray]:
-    """Masks of thirds of octaves that hold a line."""
-    place = np.floor(3 * np.log2(f / f[0]) + 1e-9).astype(int)
-    return [place == k for k in np.unique(place)]
-
-
 def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
     """Driven lines (n,) Hz, signal by noise power (n, n_y), and the length of segments [s] where they leak, else 0."""
     if not seen.driven or seen.header.excitation == "sine":
@@ -270,12 +247,11 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
     u, y, wrap = usable(seen)
-    n_u = int(np.count_nonzero(np.ptp(u, axis=0)))
-    length = segment_length(len(u), n_u)
+    length = segment_length(len(u), moving(u))
     estimate = h1([spectra(u, y, rate, length, wrap)])
     if estimate is None:
         return np.zeros(0), None, 0.0
-    free = np.maximum(estimate.coherence - (1 - estimate.coherence) * estimate.rank / estimate.dof, 0.0)
+    free = np.maximum(estimate.unbiased_coherence(), 0.0)
     return estimate.f, free / np.maximum(1 - free, 1e-12), length / rate
 
 

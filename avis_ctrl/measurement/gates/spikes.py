@@ -53,13 +53,11 @@ class _Kept:
 class Spikes(Gate):
     """Single samples away from the cubic through their four neighbours.
 
-    The departure is compared with the median departure of the 512 samples around, so that quiet and loud stretches are
-    judged alike. 20 times it is 13.5 standard deviations of Gaussian noise, which chance never reaches (1e-40 for each
-    sample); the margin is for noise whose level changes within the 512 samples. A smooth signal leaves a small
-    departure, one with power up to the Nyquist frequency a large one: the least spike that is found is
-    20 times the median departure, which the message states. Neighbours must fit the cubic once the sample is taken
-    out, and better than a corner does, as of a flat top; steps, lost samples and runs of two or more are for other
-    gates. The outer four samples of a piece are not judged.
+    The departure is compared with the median departure around, so that quiet and loud stretches are judged alike;
+    chance never reaches the limit (1e-40 for each sample). A smooth signal leaves a small departure, one with power up
+    to the Nyquist frequency a large one: the message states the least spike that would be found. Neighbours must fit
+    the cubic once the sample is taken out, and better than a corner does, as of a flat top; steps, lost samples and
+    runs of two or more are for other gates. The outer four samples of a piece are not judged.
     """
 
     name = "spikes"

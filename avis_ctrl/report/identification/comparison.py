@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.identification.ekf_result import EkfResult, ParameterCurves, parameter_curves
+from avis_ctrl.identification.ekf_result import EkfResult, kinds
+from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
 from avis_ctrl.report.pieces import Bullets, Heading, Mark, Paragraph, Piece, Section, Table, table
@@ -22,7 +23,7 @@ def ways(found: Identification) -> Section:
         note = found.kalman_note or "the extended Kalman filter was not run"
         return Section(TITLE, "ways", (Paragraph(f"{note[:1].upper()}{note[1:]}.", "note"), _sequential(found)))
     pieces: list[Piece] = [_agreement(found, result), _table(found, result)]
-    pieces += [_figure(found, curves, k) for k, curves in enumerate(parameter_curves(result))]
+    pieces += [_figure(found, result, title, index, k) for k, (title, index) in enumerate(kinds(result).items())]
     pieces += [_consistency(found, result), Heading("Influence of the filter's tuning"), Bullets(_hidden(result)),
                _sequential(found)]
     return Section(TITLE, "ways", tuple(pieces))
@@ -85,12 +86,13 @@ def _table(found: Identification, result: EkfResult) -> Table:
                  ("combination", "likelihood", "± 1 σ", "Kalman", "± 1 σ", "difference [σ]", "unit"), rows, "lrrrrrl")
 
 
-def _figure(found: Identification, curves: ParameterCurves, number: int) -> Figure:
-    information = found.information
+def _figure(found: Identification, result: EkfResult, title: str, index: list[int], number: int) -> Figure:
+    information, curves = found.information, result.history
     t = curves.time_s
     frame = (float(t[0]), float(max(t[-1], curves.boundaries_s[-1])))
     panels = []
-    for k, name in enumerate(curves.names):
+    for k in index:
+        name = result.names[k]
         likely = float(information.values[information.names.index(name)])
         # The prior's band, at the first point, would hide what the data say.
         low = float(np.min(curves.lower[1:, k], initial=likely))
@@ -100,15 +102,15 @@ def _figure(found: Identification, curves: ParameterCurves, number: int) -> Figu
         edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
         x = np.array([v for b in edges for v in (b, b, np.nan)])
         y = np.array([v for _ in edges for v in (*ends, np.nan)])
-        drawn = [Curve(t, curves.estimate[:, k], "estimate", ESTIMATE),
+        drawn = [Curve(t, curves.theta[:, k], "estimate", ESTIMATE),
                  Curve(np.array(frame), np.array([likely, likely]), "maximum likelihood", LIKELY),
                  Curve(x, y, "a record begins", RECORDS)]
         band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
         known = "" if information.known[information.names.index(name)] else " *"
         panels.append(Panel(Axis("time in the records [s]", "linear", frame),
-                            Axis(f"[{words.unit(curves.units[k])}]", "linear", ends), tuple(drawn), (band,),
+                            Axis(f"[{words.unit(result.units[k])}]", "linear", ends), tuple(drawn), (band,),
                             f"{name}{known}"))
-    return Figure(f"kalman_{number}", f"{curves.title}: the extended Kalman filter's estimate against time, as in "
+    return Figure(f"kalman_{number}", f"{title}: the extended Kalman filter's estimate against time, as in "
                   "figs. 3.1 to 3.3 of Rademakers; the first second, with the far wider band of the prior, is not "
                   "shown. A parameter marked * is known only in combination; its own value depends on the prior.",
                   tuple(panels), min(3, len(panels)), 0.62)
@@ -137,17 +139,17 @@ def _consistency(found: Identification, result: EkfResult) -> Table:
 
 def _hidden(result: EkfResult) -> tuple[str, ...]:
     s = result.settings
-    said = ["Measurement noise: " + ("the sensor noise and converter of the rig file." if s.R is None else
-                                     f"set by hand, R = {s.R}; a value above the real sensor noise widens every band."),
-            "Process noise: " + ("the rig file's ambient floor motion, through the isolators. It does not hold for a "
-                                 "record with stronger floor motion." if s.Q is None else f"set by hand, Q = {s.Q}."),
+    said = ["Measurement noise: the sensor noise and converter of the rig file.",
+            "Process noise: the rig file's ambient floor motion, through the isolators. It does not hold for a record "
+            "with stronger floor motion.",
             f"Prior: standard deviation {100 * s.prior_share:g} % of each starting value. A parameter that the data do "
-            "not determine keeps this band; the band then depends on the prior only, not on the rig."]
-    said.append("Each record starts again from the prior covariance: the last record alone determines the bands."
-                if s.reset else "The covariance is kept from record to record"
-                + (f", after {s.warm_up} record{'s' * (s.warm_up > 1)} of warm-up for the linearisation."
-                   if s.warm_up else "."))
+            "not determine keeps this band; the band then depends on the prior only, not on the rig.",
+            f"The covariance is kept from record to record, after {s.warm_up} record of warm-up for the linearisation."]
     held = [name for name, count in zip(result.names, result.guarded, strict=True) if count]
     if held:
         said.append(f"The lower limit of the parameters was reached by {words.joined(held)}.")
-    return (*said, *(f"{line[:1].upper()}{line[1:]}." for line in result.directions.words()))
+    ratios, directions = result.undetermined
+    for ratio, direction in zip(ratios, directions.T, strict=True):
+        moved = [f"{name} {'up' if weight > 0 else 'down'}" for name, weight in main_members(result.names, direction)]
+        said.append(f"Not determined: {' with '.join(moved)} (variance {ratio:.2g} of the prior's).")
+    return tuple(said)
