@@ -21,8 +21,16 @@ def rounded(value: float, std: float) -> tuple[str, str]:
     return first, second
 
 
+def with_prefix(value: float, std: float, unit: str) -> tuple[float, float, str]:
+    """Value, standard deviation and unit: below a hundredth of a second, metre or volt in thousandths of it."""
+    if unit in ("s", "m", "V") and 0 < abs(value) < 0.01:
+        return 1e3 * value, 1e3 * std, f"m{unit}"
+    return value, std, unit
+
+
 def text(value: float, std: float, unit: str = "") -> str:
     """value +- std unit; the value alone where there is no standard deviation."""
+    value, std, unit = with_prefix(value, std, unit)
     first, second = rounded(value, std)
     known = f"{first} +- {second}" if math.isfinite(std) and std > 0 else first
     return known if unit in ("", "1", "mixed units") else f"{known} {unit}"

@@ -39,7 +39,9 @@ class FitSettings:
     least_elsewhere : fraction of the information on a combination of parameters that an octave or a level must leave
         to others to be compared with them [1]: of what one octave alone determines, the others say nothing, and
         round-off of the fit would count a hundredfold.
-    shortest_step : part of a Gauss-Newton step below which no shorter one is tried [1].
+    damping : factor between the dampings that are tried until a step descends [1].
+    shortest_step : part of a Gauss-Newton step, along what the data determine best, below which no shorter one is
+        tried [1].
     converged : change of the penalised sum of squares, relative to the number of data, below which a fit has converged.
     """
 
@@ -61,6 +63,7 @@ class FitSettings:
     least_distortion: float = 0.02
     least_eigenvalue: float = 1e-8
     least_elsewhere: float = 0.05
+    damping: float = 10.0
     shortest_step: float = 1e-3
     converged: float = 1e-5
 

@@ -190,23 +190,31 @@ class _Expansion:
 
 def _descent(expand: Callable[[np.ndarray], _Expansion], at: _Expansion, iterations: int, settings: FitSettings
              ) -> tuple[_Expansion, int]:
-    """Gauss-Newton steps, each shortened until it descends; the last expansion, and how many steps there were."""
+    """Gauss-Newton steps, each damped until it descends (Levenberg 1944); the last expansion, and how many steps there
+    were.
+
+    Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
+    hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
+    hardly corrects these, and descends in ever shorter ones.
+    """
+    one = np.eye(len(at.z))
     for steps in range(iterations):
-        step = np.linalg.solve(at.H + np.eye(len(at.z)), at.g - at.z)
-        if step @ (at.g - at.z) < settings.converged * len(at.now.e):
+        slope, damping = at.g - at.z, 0.0
+        step = np.linalg.solve(at.H + one, slope)
+        if step @ slope < settings.converged * len(at.now.e):
             return at, steps
-        size, after = 1.0, None
-        while size > settings.shortest_step:
+        most = np.linalg.norm(at.H + one, 2) / settings.shortest_step
+        while damping < most:
             try:
-                after = expand(at.z + size * step)
+                after = expand(at.z + step)
                 if after.whole < at.whole:
                     break
             except InputError:
                 pass  # no rig has these values: a shorter step
-            size /= 3
+            damping = max(settings.damping * damping, 1.0)
+            step = np.linalg.solve(at.H + (1 + damping) * one, slope)
         else:
             return at, steps
-        assert after is not None
         at = after
     return at, iterations
 
@@ -238,7 +246,10 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     H = at.H + np.eye(len(at.z))
     log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
-    return Fitted(at.model, priors, at.z, np.linalg.inv(H), variances, float(log_evidence), by_group, steps,
+    # Symmetric and positive definite, which rounding makes of `inv` neither where parameters are hardly determined.
+    size, vectors = np.linalg.eigh(H)
+    root = vectors / np.sqrt(np.maximum(size, 1.0))  # the priors' 1 is the least there can be
+    return Fitted(at.model, priors, at.z, root @ root.T, variances, float(log_evidence), by_group, steps,
                   settings, weights, at.now)
 
 

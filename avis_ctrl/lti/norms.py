@@ -7,6 +7,7 @@ are left, so that the peak is found between any grid points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,13 @@ NEIGHBOURHOOD = np.geomspace(0.5, 2.0, 101)
 def decibels(gain: float) -> float:
     """20 log10 of a gain; minus infinity for none."""
     return float(20 * np.log10(gain)) if gain > 0 else -np.inf
+
+
+def in_dB(gain: np.ndarray | Sequence[float]) -> np.ndarray:
+    """20 log10 |gain| (n,) to be drawn; nan where it is zero or not finite."""
+    size = np.abs(np.asarray(gain))
+    known = np.isfinite(size) & (size > 0)
+    return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
 
 
 class PeakGain(NamedTuple):

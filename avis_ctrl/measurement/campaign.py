@@ -117,7 +117,7 @@ def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: i
     good = np.isfinite(array)
     if not good.all():
         row, column = np.argwhere(~good)[0]
-        raise InputError(f"expected finite numbers; {np.count_nonzero(~good)} are not, the first at sample "
+        raise InputError(f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at sample "
                          f"{start + row} of channel {names[column]}", field=field, value=float(array[row, column]))
 
 

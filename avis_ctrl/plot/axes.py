@@ -41,13 +41,6 @@ def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> An
     return ax
 
 
-def decibels(size: np.ndarray) -> np.ndarray:
-    """20 log10 |size|; nan where it is zero or not finite."""
-    size = np.abs(np.asarray(size))
-    known = np.isfinite(size) & (size > 0)
-    return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
-
-
 def log_if_wide(ax: Any, values: np.ndarray) -> None:
     """A logarithmic y axis, with plain numbers at 1, 2 and 5 of each decade, where values span more than a decade."""
     if values.max() <= 10 * values.min():

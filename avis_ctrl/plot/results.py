@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish, log_if_wide, whole_numbers
+from avis_ctrl.lti.norms import in_dB
+from avis_ctrl.plot.axes import HERTZ, axes_of, finish, log_if_wide, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
 # Colours of Okabe and Ito; controllers look as in the report.
@@ -65,12 +66,12 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
     for name in names:
         one, t = known[name], known[name].transmissibility
         colour = COLOURS.get(name, "#222222")
-        ax.plot(t.omega / HERTZ, decibels(t.sigma), color=colour, label=one.title, linewidth=2 if name == "mu" else 1.3)
+        ax.plot(t.omega / HERTZ, in_dB(t.sigma), color=colour, label=one.title, linewidth=2 if name == "mu" else 1.3)
         if name == names[-1]:
-            ax.fill_between(t.omega / HERTZ, decibels(t.low), decibels(t.high), color=colour, alpha=0.25, linewidth=0,
+            ax.fill_between(t.omega / HERTZ, in_dB(t.low), in_dB(t.high), color=colour, alpha=0.25, linewidth=0,
                             label=f"{one.title}, sampled plants")
             if np.isfinite(one.worst_peak.upper):
-                level = float(decibels(np.array(one.worst_peak.upper)))
+                level = float(in_dB(np.array(one.worst_peak.upper)))
                 ax.axhline(level, color=LIMIT, linewidth=0.9, linestyle="--",
                            label=f"{one.title}, worst case {level:.1f} dB")
     return finish(ax, "frequency [Hz]", "transmissibility [dB]")

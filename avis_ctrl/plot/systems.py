@@ -8,8 +8,9 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.interchange import is_response, plot_frequencies, response_of
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.plot.axes import HERTZ, axes_of, decibels, finish
+from avis_ctrl.plot.axes import HERTZ, axes_of, finish
 from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 # Random systems drawn of an uncertain one, and how.
@@ -44,7 +45,7 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, freque
         for k in range(H.shape[2]):
             names = f"{_name(system, 'outputs', i)} / {_name(system, 'inputs', k)}" if H[0].size > 1 else None
             words = " ".join(part for part in (label, names) if part) or None
-            top.plot(omega / HERTZ, decibels(H[:, i, k]), label=words, **line)
+            top.plot(omega / HERTZ, in_dB(H[:, i, k]), label=words, **line)
             bottom.plot(omega / HERTZ, np.degrees(np.unwrap(np.angle(H[:, i, k]))), **line)
     finish(top, "", "magnitude [dB]")
     finish(bottom, "frequency [Hz]", "phase [degrees]")
@@ -61,7 +62,7 @@ def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequ
     if isinstance(system, UncertainSystem):
         return _family(sigma, system, _rad_s(omega, frequency_Hz), ax, label, line)
     omega = _rad_s(omega, frequency_Hz, system)
-    values = decibels(np.linalg.svd(response_of(system, omega), compute_uv=False))
+    values = in_dB(np.linalg.svd(response_of(system, omega), compute_uv=False))
     for k in range(values.shape[1]):
         if k:
             line["color"] = ax.lines[-1].get_color()

@@ -7,7 +7,7 @@ from avis_ctrl.report.sections.bounds import bounds
 from avis_ctrl.report.sections.controllers import controllers
 from avis_ctrl.report.sections.method import method
 from avis_ctrl.report.sections.plant import generalized_plant
-from avis_ctrl.report.sections.provenance import provenance, stamp
+from avis_ctrl.report.sections.provenance import document_of, provenance
 from avis_ctrl.report.sections.rig import rig
 from avis_ctrl.report.sections.simulation import simulation
 from avis_ctrl.report.sections.site import site
@@ -24,6 +24,5 @@ SECTIONS = (verdict, comparison, transmissibility, rig, generalized_plant, bound
 def document(result: DesignResult) -> Document:
     """The report of a study."""
     kept = joined([axis(name) for name in result.plant.axes])
-    made = str(result.provenance.get("date", ""))[:10]
-    return Document(result.design.title, f"Design report: {kept} of the rig {result.rig.name}"
-                    + (f", {made}" if made else ""), stamp(result), tuple(make(result) for make in SECTIONS))
+    return document_of(result.design.title, f"Design report: {kept} of the rig {result.rig.name}", result.provenance,
+                       (make(result) for make in SECTIONS))

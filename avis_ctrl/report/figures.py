@@ -184,16 +184,20 @@ def hertz(low: float = 0.1, high: float = 100.0) -> Axis:
     return Axis(HERTZ.label, "log", (low, high))
 
 
+def places(names: Sequence[str], label: str = "") -> tuple[np.ndarray, Axis]:
+    """A place for each name, (n,), and the axis that names them."""
+    x = np.arange(len(names), dtype=float)
+    return x, Axis(label, "linear", (-0.6, len(names) - 0.4), tuple(zip(x.tolist(), names, strict=True)))
+
+
+def steps(edges: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A value (n,) for each band between edges (n + 1,) as a staircase."""
+    return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(values, float), 2)
+
+
 def level(low: float, high: float, value: float, label: str, style: Style = STYLES["limit"]) -> Curve:
     """A horizontal line."""
     return Curve(np.array([low, high]), np.array([value, value]), label, style)
-
-
-def decibels(magnitude: np.ndarray | Sequence[float]) -> np.ndarray:
-    """20 log10 |magnitude|; nan where it is zero or not finite."""
-    size = np.abs(np.asarray(magnitude))
-    known = np.isfinite(size) & (size > 0)
-    return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
 
 
 def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:

@@ -26,6 +26,7 @@ from avis_ctrl.report.pieces import (
     Piece,
     Table,
 )
+from avis_ctrl.report.words import typeset
 
 # Of the text: a drawing leaves room for what it explains on the same page.
 DRAWING_WIDTH = 0.72
@@ -57,27 +58,30 @@ def render(document: Document) -> bytes:
 def _piece(piece: Piece) -> dict[str, Any]:
     match piece:
         case Heading(text):
-            return {"kind": "heading", "text": text}
+            return {"kind": "heading", "text": typeset(text)}
         case Paragraph(text, kind, good, half):
-            return {"kind": kind, "text": text, "good": good, "half": half}
+            return {"kind": kind, "text": typeset(text), "good": good, "half": half}
         case Bullets(items):
-            return {"kind": "bullets", "items": list(items)}
+            return {"kind": "bullets", "items": [typeset(item) for item in items]}
         case Formula(source, _):
             return {"kind": "formula", "typst": source}
         case Table():
-            return {"kind": "table", "caption": piece.caption, "header": list(piece.header),
+            return {"kind": "table", "caption": typeset(piece.caption), "header": [typeset(h) for h in piece.header],
                     "align": [piece.alignment(k) for k in range(len(piece.header))],
                     "rows": [[_cell(c) for c in row] for row in piece.rows]}
         case Drawing(_, caption, image, alternative):
-            return {"kind": "figure", "width": DRAWING_WIDTH, "caption": caption, "svg": image,
-                    "alternative": alternative}
+            return _image(DRAWING_WIDTH, caption, image, alternative)
         case Figure():
-            return {"kind": "figure", "width": 1.0, "caption": piece.caption, "svg": matplotlib_backend.svg(piece),
-                    "alternative": piece.caption}
+            return _image(1.0, piece.caption, matplotlib_backend.svg(piece), piece.caption)
         case Fold(title, pieces):
-            return {"kind": "fold", "title": title, "pieces": [_piece(p) for p in pieces]}
+            return {"kind": "fold", "title": typeset(title), "pieces": [_piece(p) for p in pieces]}
     raise TypeError(f"no piece of a report: {type(piece).__name__}")
 
 
+def _image(width: float, caption: str, svg: str, alternative: str) -> dict[str, Any]:
+    return {"kind": "figure", "width": width, "caption": typeset(caption), "svg": svg, "alternative": alternative}
+
+
 def _cell(cell: Cell) -> dict[str, Any]:
-    return {"text": cell.text, "good": cell.good} if isinstance(cell, Mark) else {"text": cell, "good": None}
+    text, good = (cell.text, cell.good) if isinstance(cell, Mark) else (cell, None)
+    return {"text": typeset(text), "good": good}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,6 +10,20 @@ import numpy as np
 from avis_ctrl.uncertain_value import rounded
 
 AXIS_WORDS = {"phi_x_edge": "phi_x (edge)", "phi_y_edge": "phi_y (edge)", "phi_z_edge": "phi_z (edge)"}
+
+# A typed power of ten, not inside a word.
+_POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)(?!\w)")
+_MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
+
+
+def typeset(text: str) -> str:
+    """Text as printed: signs in place of their typed forms, and no power of ten for a number below 100 000."""
+    return _MINUS.sub("−", _POWER.sub(_power, text.replace(" +- ", " ± ")))
+
+
+def _power(typed: re.Match[str]) -> str:
+    exponent = int(typed[2])
+    return f"{float(typed[0]):.0f}" if 0 <= exponent < 5 else f"{typed[1]}e{exponent}".replace("-", "−")
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -36,6 +51,13 @@ def with_std(value: float, std: float) -> tuple[str, str]:
 def bound(value: float, digits: int = 3) -> str:
     """A bound of mu or of a gain; infinite where the set holds an unstable plant."""
     return "unstable" if np.isinf(value) else number(value, digits)
+
+
+def percent(share: float, digits: int = 3) -> str:
+    """A fraction in per cent; below a hundred-thousandth it is stated as that."""
+    if not np.isfinite(share):
+        return "not computed"
+    return "< 0.001 %" if 0 < share < 1e-5 else f"{number(100 * share, digits)} %"
 
 
 def decibel(gain: float) -> str:
@@ -86,6 +108,11 @@ def unit(text: str) -> str:
 def yes(value: bool) -> str:
     """yes or no."""
     return "yes" if value else "no"
+
+
+def sentence(text: str) -> str:
+    """Text that begins with a capital letter and ends with a stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def joined(names: list[str] | tuple[str, ...]) -> str:

@@ -19,6 +19,17 @@ _UNITS = {"kg", "g", "t", "lb", "m", "mm", "cm", "um", "in", "N", "kN", "mN", "N
           "deg", "V", "mV", "kV", "Hz", "kHz", "rtHz", "s", "ms", "us", "s2", "Vs", "Vs2", "kgm2", "gmm2", "kgmm2",
           "gcm2"}
 
+# What pydantic says, such as "Input should be greater than or equal to 1", in the words of these messages.
+_PLAIN = (("^Input should be ", "expected "), ("expected a valid number", "expected a number"),
+          ("expected a valid integer", "expected a whole number"),
+          ("expected a valid string", "expected text in quotes"),
+          ("expected a valid list", "expected a list in square brackets"),
+          ("expected a valid boolean", "expected true or false"),
+          (r"expected greater than or equal to (\S+)", r"expected a number, \1 or more"),
+          (r"expected less than or equal to (\S+)", r"expected a number, \1 or less"),
+          ("expected (greater|less) than", r"expected a number \1 than"),
+          (r"^List should have (.* items?) after validation, not (\d+)", r"expected \1; the list has \2"))
+
 
 class Section(BaseModel):
     """A section of a file: its keys and no others, each of the type that it says."""
@@ -54,9 +65,11 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
     value = problem["input"]
     if problem["type"] in ("model_type", "dict_type", "model_attributes_type"):
         return InputError("expected a section of keys", field=field, value=value)
-    # pydantic says "Input should be a valid number", "List should have at least 2 items after validation, not 1".
-    words = problem["msg"].removeprefix("Value error, ").replace(" after validation", "")
-    words = re.sub(r"^(Input|List) should (be )?", lambda said: "expected " if said[2] else "expected to ", words)
+    words = problem["msg"].removeprefix("Value error, ")
+    for said, plain in _PLAIN:
+        words = re.sub(said, plain, words)
+    if problem["type"] == "float_type" and isinstance(value, str):
+        words += " without quotes and without unit"
     return InputError(words, field=field, value=value)
 
 

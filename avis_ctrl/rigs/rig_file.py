@@ -250,7 +250,8 @@ def _same_length(section: str, content: dict[str, Any], keys: tuple[str, ...]) -
         raise InputError("expected different names", field=f"{section}.{keys[0]}", value=names)
     for key in keys[1:]:
         if len(content[key]) != len(names):
-            raise InputError(f"expected {len(names)} entries, one for each of {section}.{keys[0]}",
+            raise InputError(f"expected as many entries as {section}.{keys[0]} has, which is {len(names)}; there are "
+                             f"{len(content[key])}",
                              field=f"{section}.{key}", value=content[key])
 
 

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
 from scipy.optimize import minimize
 
 from avis_ctrl.gap.effects.library import library
@@ -20,8 +21,11 @@ from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
 from avis_ctrl.gap.validation import halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
+from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.likelihood import Data, first_variances, fit
-from avis_ctrl.identification.priors import Priors, re_identified, with_tolerances
+from avis_ctrl.identification.maximum_likelihood import transient_unknowns
+from avis_ctrl.identification.parameter_sets import default_parameters
+from avis_ctrl.identification.priors import Priors, beside, identified, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import Variances, estimated, path_contributions, weigh
@@ -142,6 +146,37 @@ def found_at(seed: int = 7, bend: float = 0.0):
     little = Variances({group: 1e-4 * v for group, v in first.path.items()},
                        {group: 1e-9 * s for group, s in first.distortion.items()})
     return fit(model, priors, np.zeros(1), data, little, settings), data, settings
+
+
+def fit_with_places(noise: float, moved: float):
+    """A fit of two records that a table with other values gave, by parameters and places of the mounts, which the data
+    hardly tell apart; moved : standard deviation of the mounts' places over their tolerance."""
+    settings, rng = replace(SETTINGS, rounds=0), np.random.default_rng(2)
+    free = default_parameters(RIG)
+    priors = identified(bare(free), {}).followed_by(beside(bare(), free, TOLERANCES))
+    priors = priors.of([name for name in priors.names if name in free or ".p_" in name or name.startswith("com_")])
+    model = bare(priors.names)
+    z = moved * np.where([name in free for name in priors.names], 0.3, 1.0) * rng.standard_normal(len(priors.names))
+    blocks = tuple(block(model.at(priors.values(z)), seed, noise=noise) for seed in (5, 6))
+    data = Data(blocks, (0.5, 0.5))
+    first = first_variances(data, settings)
+    none = Variances({group: 1e-20 * v for group, v in first.path.items()},
+                     {group: 1e-20 * s for group, s in first.distortion.items()})
+    return fit(model, priors, np.zeros(len(z)), data, none, settings), blocks
+
+
+def test_a_fit_reaches_the_noise_though_parameters_are_hardly_told_apart():
+    """The table is drawn from the priors, or nearer: the penalised sum of squares is then chi-square or less."""
+    found, blocks = fit_with_places(1e-4, 1.0)
+    dof = len(found.e) - sum(transient_unknowns(one, found.model) for one in blocks)
+    assert stats.chi2.sf(found.e @ found.e + found.z @ found.z, dof) > 1e-3
+
+
+def test_the_covariance_is_one_though_parameters_are_hardly_told_apart():
+    found, _ = fit_with_places(1e-9, 0.0)
+    assert_array_equal(found.covariance, found.covariance.T)
+    root = np.linalg.cholesky(found.covariance)
+    assert_allclose(np.linalg.norm(found.J.T @ root, 2), 1, atol=1e-3)
 
 
 def test_normal_equations_are_those_of_the_flattened_rows():

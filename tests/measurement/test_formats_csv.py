@@ -66,9 +66,9 @@ def shifted(at, by):
 
 STAMPS = {
     "backwards": (np.concatenate([np.arange(100), np.arange(90, 190)]) / 100,
-                  r"1 stand still or go backwards, the first at data row 101: 0.9 s after 0.99 s"),
-    "still": (np.repeat(np.arange(100), 2) / 100, r"100 stand still or go backwards, the first at data row 2: "),
-    "gap": (np.delete(np.arange(200), [50, 51, 120]) / 100, r"2 gaps, the first before data row 51: 0.03 s instead"),
+                  r"not later than the one before: 1, the first at data row 101: 0.9 s after 0.99 s"),
+    "still": (np.repeat(np.arange(100), 2) / 100, r"not later than the one before: 100, the first at data row 2: "),
+    "gap": (np.delete(np.arange(200), [50, 51, 120]) / 100, r"gaps: 2, the first before data row 51: 0.03 s instead"),
     "uneven": (shifted(30, 0.003), r"1 are more than 0.1 of a sample off, the worst at data row 31 by 0.3 samples"),
 }
 
@@ -147,7 +147,7 @@ WRONG = {
     "short line": (edited(3, "0.5,1"), r"line 4 = '0.5,1': expected 3 columns, as in the header; there are 2"),
     "long line": (edited(3, "0,5,1,3"), r"expected 3 columns, as in the header; there are 4"),
     "second header": (edited(5, GOOD[0]), r"line 6, column t = 't': expected a number"),
-    "nan": (edited(4, "0.75,1,nan"), r"record a: y = nan: .* 1 are not, the first at sample 3 of channel S1"),
+    "nan": (edited(4, "0.75,1,nan"), r"record a: y = nan: .* infinite: 1, the first at sample 3 of channel S1"),
     "no header": ("\n".join(GOOD[1:]), r"line 1 = '0.0,0,0': expected a header line .* found numbers"),
     "only a header": (GOOD[0], r"expected at least two lines of numbers; there are 0"),
     "only comments": ("# a = 1\n# b = 2", r"expected a header line"),

@@ -203,10 +203,10 @@ def data(role, value, names=None, unit="V"):
 REFUSED = {
     "no format": (without("/", "format"), "format: missing; expected 'avis-campaign'"),
     "other format": (at("/", "format", "other"), "format = 'other': expected 'avis-campaign'"),
-    "later version": (at("/", "version", 2), "version = 2.0: this release reads version 1"),
+    "later version": (at("/", "version", 2), "version = 2.0: expected 1, the version that this release reads"),
     "version as text": (at("/", "version", "one"), "version = 'one': expected one number"),
-    "no records": (without("records"), "/records: missing; the file holds nothing"),
-    "no u": (without("records/00/u"), "record 00: u: missing; the record holds floor, y"),
+    "no records": (without("records"), "/records: missing; expected a group .*; the file holds nothing"),
+    "no u": (without("records/00/u"), "record 00: u: missing; expected a data set .*; the record holds floor, y"),
     "no rate": (without("records/00", "sample_rate_Hz"), "record 00: sample_rate_Hz: missing; expected the samp"),
     "rate as text": (at("records/00", "sample_rate_Hz", "fast"), "record 00: sample_rate_Hz = 'fast': expected one"),
     "rate zero": (at("records/00", "sample_rate_Hz", 0.0), "expected a positive sample rate in Hz"),
@@ -218,7 +218,7 @@ REFUSED = {
     "odd period": (at("records/00", "period_s", 0.123), "expected a whole number of samples; at 100 Hz it is 12.3"),
     "array of numbers": (at("records/00", "start_s", [1.0, 2.0]), "record 00: start_s = .*: expected one number"),
     "no names": (without("records/00/y", "names"), "record 00: y: names: missing"),
-    "few names": (at("records/00/y", "names", ["a", "b"]), "y names = .*: expected 3 names, .*; there are 2"),
+    "few names": (at("records/00/y", "names", ["a", "b"]), "y names = .*; there are 3 channels and 2 names"),
     "twice a name": (at("records/00/y", "names", ["a", "a", "b"]), "expected different names"),
     "number as name": (at("records/00/y", "names", [1.0, 2.0, 3.0]), "y names = 1.0: expected a text"),
     "unit": (at("records/00/y", "unit", "furlong"), "record 00: y unit = 'furlong': expected a unit of V, m/s, m/s"),
@@ -250,7 +250,7 @@ def test_samples_that_are_no_numbers_are_named_by_place(path, value):
         file["records/01/y"][33, 2] = value
     record = read_measurements(plain_file(path, edit=edit)).records[1]
     record.load(0, 33)
-    with pytest.raises(InputError, match=rf"a.h5: record 01: y = {value}: .* 1 are not, .* sample 33 of .* S3"):
+    with pytest.raises(InputError, match=rf"a.h5: record 01: y = {value}: .* infinite: 1, .* sample 33 of .* S3"):
         record.load(20, 40)
 
 
@@ -404,7 +404,7 @@ RESPONSES_REFUSED = {
     "coherence": (put("coherence", np.full((5, 2, 1), 1.5)), "coherence = 1.5: expected values from 0 to 1"),
     "coherence 0": (put("coherence", np.zeros((5, 2, 1))), "0 for some entry at every line"),
     "shape": (put("value", np.zeros((5, 1, 2), complex)), r"value = \(5, 1, 2\): expected shape \(5, 2, 1\)"),
-    "nan": (put("value", np.full((5, 2, 1), np.nan)), "expected finite numbers; 10 are not, the first at line 0"),
+    "nan": (put("value", np.full((5, 2, 1), np.nan)), "NaN or infinite: 10, the first at line 0"),
     "text": (put("value", "abc"), "/frf: value: expected numbers, found objects"),
     "order": (put("frequency_Hz", [1.0, 2.0, 2.0, 3.0, 4.0]), "expected increasing frequencies"),
     "no inputs": (group_edit(lambda g: g.attrs.pop("inputs")), "/frf: inputs: missing"),

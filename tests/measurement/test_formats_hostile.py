@@ -211,7 +211,7 @@ def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
     path.write_bytes(content.replace(f"{2:10d}{12:10d}".encode(), f"{2:10d}{999999999:10d}".encode()))
     assert "expected 3999999996 bytes for 999999999 values" in refusal(path)
     path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
-    assert "expected finite numbers; 1 are not, the first at sample 0 of channel A1" in refusal(path, excitation="rest",
+    assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refusal(path, excitation="rest",
                                                                                               columns={"y": "A1"})
 
 

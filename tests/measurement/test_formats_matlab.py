@@ -231,7 +231,7 @@ def test_samples_that_are_no_numbers_are_named_by_place(path, rng, version):
     record = fields(rng)
     record["y"][41, 1] = np.inf
     save(path, version, {"records": record, "rig": "avis"})
-    with pytest.raises(InputError, match=r"record 00: y = inf: .* 1 are not, the first at sample 41 of channel S2"):
+    with pytest.raises(InputError, match=r"record 00: y = inf: .* infinite: 1, the first at sample 41 of channel S2"):
         read_measurements(path).records[0].load()
 
 

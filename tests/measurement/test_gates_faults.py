@@ -12,7 +12,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.gates import examine
 from avis_ctrl.measurement.gates.clipping import repeated_extreme
 from avis_ctrl.measurement.gates.spikes import spikes
-from avis_ctrl.report.identification.gate_figures import figure_of
+from avis_ctrl.report.identification.gates import figure_of
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.identification import IdentifyOptions, start_model
 from avis_ctrl.study.record_checks import check_campaign

@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.block_diagram import BlockDiagram
 from avis_ctrl.report.canvas import Canvas
 from avis_ctrl.report.families import Families
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, decibels, ticks_log
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, ticks_log
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.report.rig_drawing import rig_drawing
@@ -44,7 +45,16 @@ def test_what_is_not_finite_is_said_in_words() -> None:
     assert words.decibel(np.inf) == words.bound(np.inf) == words.quantity(np.inf, "dB") == "unstable"
     assert words.number(np.nan) == "not computed"
     assert words.decibel(0.5) == "−6.0 dB" and words.decibel(2.0) == "+6.0 dB"
-    assert np.isnan(decibels([0.0, np.inf, np.nan])).all()
+    assert np.isnan(in_dB([0.0, np.inf, np.nan])).all()
+
+
+@pytest.mark.parametrize(("typed", "printed"), [
+    ("-17.2 % at -3 deg", "−17.2 % at −3 deg"), ("log evidence 4.14e+03 behind", "log evidence 4140 behind"),
+    ("1.853e+04 N s/m", "18530 N s/m"), ("5.814e+05 rad/s", "5.814e5 rad/s"), ("below 3.1e-05 s", "below 3.1e−5 s"),
+    ("41860 +- 160 N/m", "41860 ± 160 N/m"), ("2026-11-25, pages 71-109", "2026-11-25, pages 71-109"),
+    ("run1e-3.h5", "run1e-3.h5"), ("avis gap --design", "avis gap --design")])
+def test_signs_and_powers_are_typeset_and_names_are_not(typed, printed):
+    assert words.typeset(typed) == printed
 
 
 @pytest.mark.parametrize("name", ["avis", "halcyonics"])

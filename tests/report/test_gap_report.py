@@ -81,6 +81,14 @@ def test_same_sections_figures_and_tables_in_both(found, html, tmp_path):
         assert re.search(rf"^ *{number} +{re.escape(one.title)}", text, re.M), one.title
 
 
+def test_the_first_page_is_read_alone(found, tmp_path):
+    pages = [" ".join(page.split()) for page in pdf_text(gap_pdf(found), tmp_path).split("\f")]
+    for shown in ("1 Summary", found.gap.sentences[0][:30], "Table 1", "Figure 1", "What to measure next"):
+        assert shown in pages[0], shown
+    second = f"2 {document(found).sections[1].title}"
+    assert second not in pages[0] and second in pages[1]
+
+
 def test_opens_with_the_sentence_of_the_finder_and_the_numbers(found):
     first = section(found, "result").pieces[0]
     assert isinstance(first, Paragraph) and first.text == found.gap.sentences[0] and first.good is True
@@ -113,7 +121,7 @@ def test_each_verdict_has_its_words_and_colour(found, verdict):
 
 def test_none_says_what_would_not_have_been_seen(found):
     one = replace(found, gap=stand_in.with_verdict(found.gap, "none"))
-    assert "An actuator lag below 3.1e-05 s would not have been seen." in Reader(gap_html(one).encode()).text
+    assert "An actuator lag below 3.1e−5 s would not have been seen." in Reader(gap_html(one).encode()).text
 
 
 def test_a_band_that_stands_out_of_a_closed_gap_is_not_denied(found):
@@ -136,7 +144,7 @@ def test_a_group_is_said_to_be_one(found):
 
 
 def test_ladder_and_noise_line(found):
-    drawn = figures(section(found, "before_after"))["ladder"].panels[0]
+    drawn = figures(section(found, "result"))["ladder"].panels[0]
     bars = next(c for c in drawn.curves if c.bars)
     np.testing.assert_allclose(bars.y, [31.0, 12.0, 1.04])
     line = next(c for c in drawn.curves if c.label == "noise alone")
@@ -157,7 +165,9 @@ def test_sizes_are_rounded_to_their_deviation(found):
 
 @pytest.mark.parametrize(("one", "text"), [
     (Reported(92.0, 1.0, "Hz"), "(92.0 ± 1.0) Hz"), (Reported(0.93, 0.004, "1"), "0.9300 ± 0.0040"),
-    (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)")])
+    (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)"),
+    (Reported(0.00132638, 4.6e-7, "s"), "(1.32638 ± 0.00046) ms"), (Reported(0.0121, 0.0002, "m"),
+                                                                    "(0.01210 ± 0.00020) m")])
 def test_a_quantity_in_words(one, text):
     assert wording.quantity(one) == text
 
@@ -392,6 +402,6 @@ def test_same_input_same_page(found, html):
 
 def test_long_names_of_stages_stand_in_rows(found):
     stages = (*found.gap.stages, Stage("mount_relaxation", 0.0102, 1.01))
-    drawn = figures(section(replace(found, gap=replace(found.gap, stages=stages)), "before_after"))["ladder"]
+    drawn = figures(section(replace(found, gap=replace(found.gap, stages=stages)), "result"))["ladder"]
     assert drawn.panels[0].x.ticks[-1][1] == "+ mount\nrelaxation"
     assert graph(drawn)["layout"]["xaxis"]["ticktext"][-1] == "+ mount<br>relaxation"

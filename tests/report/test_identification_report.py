@@ -21,7 +21,7 @@ from avis_ctrl.report import pdf as paper_of
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.identification.content import document
-from avis_ctrl.report.identification.gate_figures import figure_of
+from avis_ctrl.report.identification.gates import figure_of
 from avis_ctrl.report.identification.responses import strongest
 from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section, Table
@@ -69,7 +69,7 @@ def figures(part: Section) -> dict[str, Figure]:
 
 def test_same_sections_figures_and_tables_in_both(found, html, pdf, tmp_path):
     content, page, text = document(found), Reader(html), pdf_text(pdf, tmp_path)
-    assert len(content.sections) == 10
+    assert len(content.sections) == 11
     drawn = [a["data-name"] for tag, a in page.elements if "data-name" in a]
     assert drawn == [p.name for p in content.figures()] == list(page.graphs())
     count = sum(len(tables(s)) for s in content.sections)
@@ -91,9 +91,19 @@ def test_verdict_has_the_numbers_of_the_validation(found):
                           and found.campaign_fit.fit.converged)
 
 
+def test_the_first_page_is_read_alone(found, pdf, tmp_path):
+    """Verdict, measurement, modes, errors; the parameters begin on the second page."""
+    pages = [" ".join(page.split()) for page in pdf_text(pdf, tmp_path).split("\f")]
+    for shown in ("1 Summary", "Measured: 4 records, 32.0 s in total", "Table 1", "Figure 1"):
+        assert shown in pages[0], shown
+    assert "2 Parameters" not in pages[0] and "2 Parameters" in pages[1]
+    modes = tables(section(found, "result"))[0].rows
+    assert [float(row[2]) for row in modes] == pytest.approx([m.frequency_Hz for m in found.validation.modes], rel=1e-3)
+
+
 def test_every_parameter_is_shown_as_well_as_it_is_known(found):
     """Horizontal springs in one line are known only as sums; the table says so, and gives numbers for the others."""
-    rows = {row[0]: row for row in tables(section(found, "result"))[0].rows}
+    rows = {row[0]: row for row in tables(section(found, "parameters"))[0].rows}
     information = found.campaign_fit.information
     assert tuple(rows) == information.names
     for name, value, sigma in zip(information.names, information.values, information.standard_deviation, strict=True):

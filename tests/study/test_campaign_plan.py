@@ -66,7 +66,7 @@ WRONG = [
     ("[1.0, 80.0]", "[80.0, 1.0]", "band_Hz", "lower limit first"),
     ("[1.0, 80.0]", "[80.0]", "band_Hz", "at least 2"),
     ("ligo_livingston", "ligo", "ambient.spectrum = 'ligo'", "expected one of"),
-    ("records = 2", "records = 0", "record[1].records = 0", "greater than or equal to 1"),
+    ("records = 2", "records = 0", "record[1].records = 0", "a number, 1 or more"),
     ("records = 2", "record = 2", "record[1].record", "did you mean records"),
     ("perturb_percent = 5.0", "perturb_percent = 100.0", "truth.perturb_percent = 100.0", "less than 100"),
     ("orthogonal", "both", "multisine.scheme = 'both'", "zippered"),

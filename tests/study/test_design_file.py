@@ -125,7 +125,7 @@ def test_bands_rise(place, value, field):
     ("requirement", {"quantity": "mu_upper", "at_most": 1.0}, ["requirement", "list"]),
     ("control_effort/bandwidth_Hz", "100", ["control_effort.bandwidth_Hz = '100'", "number"]),
     ("control_effort/bandwidth_Hz", True, ["control_effort.bandwidth_Hz = True", "number"]),
-    ("title", 3, ["title = 3", "string"]), ("transmissibility", "low", ["transmissibility = 'low'", "section"]),
+    ("title", 3, ["title = 3", "text in quotes"]), ("transmissibility", "low", ["transmissibility = 'low'", "section"]),
     ("uncertainty/parameters_percent", [10.0], ["uncertainty.parameters_percent", "section"]),
     ("title", ABSENT, ["title", "missing"]), ("transmissibility", ABSENT, ["transmissibility", "section is missing"]),
     ("control_effort/bandwidth_Hz", ABSENT, ["control_effort.bandwidth_Hz", "key is missing"]),

@@ -126,7 +126,7 @@ def test_the_identity_is_that_of_the_resolved_input(tmp_path):
     ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = [1]\n[[vary]]\nkey = "rig.mass"\nvalues = [2]',
      "key = 'rig.mass': expected each key once"),
     ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = ["much", true, inf]', "expected a number"),
-    ('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\nvalues = ["deep"]', "valid number"),
+    ('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\nvalues = ["deep"]', "expected a number"),
     ('base = "small.toml"\n[[vary]]\nkey = "base"\nvalues = [3]', "expected the name of a design file"),
     ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 3.0, high = 2.0}',
      "expected low below high"),

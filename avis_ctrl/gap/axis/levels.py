@@ -252,8 +252,8 @@ def read_levels(folder: str | Path, sample_rate_Hz: float | None, y_unit: str = 
     if not files:
         raise InputError("expected a folder with u_*.npy and y_*.npy", file=folder)
     if sample_rate_Hz is None or not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
-        raise InputError("expected the sample rate: .npy files hold none", file=folder, field="sample_rate_Hz",
-                         value=sample_rate_Hz)
+        raise InputError("missing; expected the sample rate in Hz (--sample-rate), because .npy files hold none",
+                         file=folder, field="sample_rate_Hz", value=sample_rate_Hz)
     records: list[Record] = []
     for file in files:
         level = re.search(r"(\d+(?:\.\d+)?)\s*mV", file.name)

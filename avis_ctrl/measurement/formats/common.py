@@ -166,8 +166,8 @@ def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...
     if not all(name and name.isprintable() for name in names):
         raise InputError("expected names that are not empty and can be printed", field=field, value=brief(names))
     if count is not None and len(names) != count:
-        raise InputError(f"expected {count} names, one per channel; there are {len(names)}", field=field,
-                         value=brief(names))
+        raise InputError(f"expected one name for each channel; there are {count} channels and {len(names)} "
+                         "names", field=field, value=brief(names))
     if len(set(names)) != len(names):
         raise InputError("expected different names", field=field, value=brief(names))
     return names

@@ -235,7 +235,8 @@ def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> np.ndarray:
             count = line.count(layout.separator)
             if count != separators and line.strip() and (count, line.rstrip()[-1:]) != (separators + 1,
                                                                                       layout.separator.strip()):
-                raise InputError(f"expected {separators + 1} columns, as in the header; there are {count + 1}",
+                raise InputError(f"expected {separators + 1} columns, as in the header; there are {count + 1}"
+                                 + ("; with decimal commas, separate columns by ;" * (layout.separator == ",")),
                                  field=f"line {number}", value=line[:60])
         filled = [line for line in chunk if line.strip()]
         try:

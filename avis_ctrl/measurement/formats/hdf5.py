@@ -84,7 +84,8 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         stated = _check_root(file)
         group = member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
-            words = "missing" if group is None else "expected a group, found a data set"
+            words = ("missing; expected a group with one group per record" if group is None else
+                     "expected a group, found a data set")
             raise InputError(f"{words}; the file holds {_listed(file)}", field="/frf" if response else "/records")
         if response:
             with within("/frf"):
@@ -118,7 +119,7 @@ def check_version(stated: Any, version: Any) -> None:
     if (name := as_text(stated, "format")) != FORMAT:
         raise InputError(f"expected {FORMAT!r}", field="format", value=name)
     if (number := as_number(version, "version")) != VERSION:
-        raise InputError(f"this release reads version {VERSION}", field="version", value=number)
+        raise InputError(f"expected {VERSION}, the version that this release reads", field="version", value=number)
 
 
 def _in_order(group: h5py.Group) -> list[str]:
@@ -141,7 +142,8 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
         if dataset is not None:
             parts[role] = _part(dataset, role)
         elif role != "floor":
-            raise InputError(f"missing; the record holds {_listed(record)}", field=role)
+            raise InputError(f"missing; expected a data set (samples, channels); the record holds {_listed(record)}",
+                             field=role)
     if "floor" in parts and tuple(parts["floor"].names) != FLOOR_NAMES:
         raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names",
                          value=parts["floor"].names)
@@ -164,8 +166,8 @@ def _part(dataset: Any, role: str) -> Part:
         raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
-        raise InputError(f"expected shape (samples, channels); {samples} samples of {count} channels look transposed",
-                         field=role, value=shape)
+        raise InputError(f"expected (samples, channels) with more samples than channels; {samples} samples of "
+                         f"{count} channels look transposed", field=role, value=shape)
     stated = attributes(dataset, "names", "unit")
     with within(role):
         names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")

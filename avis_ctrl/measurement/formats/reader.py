@@ -37,7 +37,8 @@ def parse_columns(text: str) -> dict[str, list[str]]:
     for part in text.split(","):
         role, equals, names = (word.strip() for word in part.partition("="))
         if not equals or role not in ROLES or role in columns or not all(name.strip() for name in names.split("+")):
-            raise InputError(f"expected role=name, each role once, of {', '.join(ROLES)}; such as u=A1+A2,y=S1,t=time",
+            raise InputError("expected role=name, each role once, such as u=A1+A2,y=S1,t=time; the roles are "
+                             f"{', '.join(ROLES)}",
                              field="columns", value=part.strip())
         columns[role] = [name.strip() for name in names.split("+")]
     return columns

@@ -141,8 +141,8 @@ def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float
         text = ", ".join(f"{role} has {count}" for role, count in lengths.items())
         raise InputError(f"expected equally many samples; {text}")
     if not channels["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError("expected at least one input; only a record of excitation 'rest' or 'floor' does without",
-                         field="u")
+        raise InputError("expected at least one input, a column u or u_...; where it has another name, columns says so "
+                         "(u=NAME); only a record with excitation 'rest' or 'floor' has none", field="u")
     notes: list[str] = []
     units: dict[str, str] = {}
     samples: dict[str, Any] = {}

@@ -130,8 +130,8 @@ def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
     if array.dtype.kind not in kinds:
         raise InputError("expected numbers", field=field, value=f"array of {kind_of(array.dtype)}")
     if not np.all(np.isfinite(array)):
-        raise InputError(f"expected finite numbers; {np.count_nonzero(~np.isfinite(array))} are not, the first at line "
-                         f"{np.argwhere(~np.isfinite(array))[0][0]}", field=field)
+        raise InputError(f"expected finite numbers; NaN or infinite: {np.count_nonzero(~np.isfinite(array))}, the "
+                         f"first at line {np.argwhere(~np.isfinite(array))[0][0]}", field=field)
     return array
 
 

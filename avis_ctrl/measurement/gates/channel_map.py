@@ -210,7 +210,7 @@ def _signs_agree(faults: Faults, campaign: Campaign, comparison: Comparison) -> 
 
 
 def _sign_picture(faults: Faults, campaign: Campaign, comparison: Comparison) -> Picture:
-    return Picture("Correlation of each sensor with the model, sign as recorded", "sensor", "correlation [-]",
+    return Picture("Signed correlation with the model", "sensor", "correlation [-]",
                    (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
                    (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)
 

@@ -113,7 +113,7 @@ class Hum(Gate):
                        "lines out of the fit.", (name,), records, float(line.ratio), SETTINGS.least_ratio, picture)
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
-        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/sqrt(Hz)]",
+        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/√Hz]",
                        (Series(name, kept.f[1:], kept.asd[1:, j]),),
                        tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
 

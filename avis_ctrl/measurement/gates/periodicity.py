@@ -101,9 +101,9 @@ class Periodicity(Gate):
                 Finding(self.name, "note",
                         f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first "
                         f"differs from the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that "
-                        "includes the transient, as in avis identify, needs no change; otherwise drop the first "
-                        f"{periods} of each record.", (), tuple(d[1].record for d in drops if d[0]), float(most), 0.0,
-                        picture))
+                        "includes the transient, as in avis identify, needs no change; otherwise leave out the "
+                        f"beginning of each record, {periods}.", (), tuple(d[1].record for d in drops if d[0]),
+                        float(most), 0.0, picture))
         return found or [
             Finding(self.name, "ok", f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for "
                     f"noise alone {limit:.2f}).", value=float(k.T.max()), limit=limit, picture=picture)]

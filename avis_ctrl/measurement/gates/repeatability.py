@@ -123,8 +123,8 @@ class Comparison(Gate):
         apart = [(a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]]
         level = FALSE_ALARM / max(1, len(apart) * n_y)
         levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
-        many = "s" if len(repeats) > 1 else ""
-        return [*_judged(self.name, repeats, campaign, _drifted, f"{len(repeats)} pair{many} of records agree",
+        agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
+        return [*_judged(self.name, repeats, campaign, _drifted, agreed,
                          "Repeatability was not tested: no two driven records of one level and enough length."),
                 *_judged("level dependence", levels, campaign, _nonlinear, "The responses at all levels agree",
                          "Dependence on the level was not tested: no driven records of one kind and enough length at "

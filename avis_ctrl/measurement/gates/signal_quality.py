@@ -83,8 +83,9 @@ class SignalToNoise(Gate):
 
     def _weak(self, names: tuple[str, ...], middle: np.ndarray, dB: np.ndarray, segment_s: float,
               picture: Picture) -> Iterator[Finding]:
-        advice = (f": noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. A periodic "
-                  "excitation would distinguish them; a higher level helps only against noise." if segment_s else
+        advice = (f". Causes are noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. "
+                  "A periodic excitation would distinguish them; a higher level helps only against noise."
+                  if segment_s else
                   ". Such bands have little weight in a fit; excite them more if they are important.")
         for name, levels in zip(names, dB.T, strict=True):
             weak = np.flatnonzero(levels < SETTINGS.low_dB)
@@ -94,8 +95,8 @@ class SignalToNoise(Gate):
                               f"dB at {middle[np.argmax(levels)]:.3g} Hz). Raise the level, or average longer.",
                               (name,), value=float(levels.max()), limit=SETTINGS.poor_dB, picture=picture)
             elif weak.size:
-                low = ", ".join(f"{middle[b]:.3g} Hz {round(float(levels[b]))} dB" for b in weak)
-                yield Finding(self.name, "note", f"Channel {name!r} has little signal around {low}{advice}", (name,),
+                low = ", ".join(f"{round(float(levels[b]))} dB at {middle[b]:.3g} Hz" for b in weak)
+                yield Finding(self.name, "note", f"Channel {name!r} has little signal: {low}{advice}", (name,),
                               value=float(levels.min()), limit=SETTINGS.low_dB, picture=picture)
 
     def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> Iterator[Finding]:
@@ -161,7 +162,7 @@ class Coherence(Gate):
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
-        picture = Picture(f"Multiple coherence at {top:.3g} V, thirds of octaves", "frequency [Hz]", "coherence [-]",
+        picture = Picture(f"Multiple coherence at {top:.3g} V, third octaves", "frequency [Hz]", "coherence [-]",
                           tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
                           (Limit("low", SETTINGS.low_coherence),), "log")
         below, excited = "", _lowest_driven(chosen)
@@ -177,7 +178,7 @@ class Coherence(Gate):
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         return [
             Finding(self.name, "ok",
-                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third of an octave from {best.f[0]:.3g} "
+                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third-octave band from {best.f[0]:.3g} "
                     f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
                     f"Hz).{below}", value=float(mean[b, j]), limit=SETTINGS.low_coherence, picture=picture)]
 
@@ -189,12 +190,13 @@ class Coherence(Gate):
         for j in ordered[:4]:
             b = int(np.argmin(mean[:, j]))
             count = int(np.count_nonzero(mean[:, j] < SETTINGS.low_coherence))
-            said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in {count} bands)")
-        more = f" and {len(group) - 4} more channels" if len(group) > 4 else ""
+            said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in "
+                        f"{count} band{'s' * (count > 1)})")
+        more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
         return Finding(self.name, "warning" if surely else "note",
                        f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
-                       f"the {len(middle)} thirds of octaves: {'; '.join(said)}{more}. Causes are noise, an input that "
-                       "is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
+                       f"the {len(middle)} third-octave bands: {'; '.join(said)}{more}. Causes are noise, an input "
+                       "that is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
                        f"decays more slowly than the segments of {seconds:.3g} s. Longer records distinguish "
                        f"leakage from the other causes; a higher level reduces the influence of noise.{below}",
                        tuple(names[j] for j in ordered), value=float(mean[:, group].min()),

@@ -87,7 +87,7 @@ class Spikes(Gate):
         return [Finding(self.name, "ok",
                         f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
                         f"{campaign.y_unit} would be found in every record.", value=float(least.max()),
-                        picture=Picture("Least spike that is found", "record", f"spike [{campaign.y_unit}]",
+                        picture=Picture("Smallest spike that would be found", "record", f"spike [{campaign.y_unit}]",
                                         (Series("least spike", np.arange(len(least)), least, "bars"),),
                                         x_names=tuple(r.header.name for r in campaign.records)))]
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level, places, steps
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.response_panels import difference, drives, magnitude
+from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
@@ -21,14 +21,14 @@ PAIRS = 3
 LETTERS = 13
 
 
-def before_after(found: Found) -> Section:
+def before_after(found: GapFinding) -> Section:
     """Number and picture, on held-out data, and measured responses with both models over them."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.heat is not None and gap.heat.before.size:
         pieces.append(spectrum(gap.heat, bool(gap.effects)))
     if gap.stages:
-        pieces += [ladder(gap), _stages(gap)]
+        pieces.append(_stages(gap))
     seen = gap_overlay(found.measured, gap.baseline, gap.updated)
     pieces += [Paragraph(seen, "note")] if isinstance(seen, str) else responses(seen, bool(gap.effects))
     return Section("The gap before and after" if gap.effects else "The gap", "before_after", tuple(pieces))
@@ -40,7 +40,7 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
     sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
     panels = []
     for title, reduce in (("Mean of all channels", _mean), ("Worst channel of each band", _worst)):
-        curves = [Curve(*_steps(edges, reduce(values)), label, style) for label, values, style in sides]
+        curves = [Curve(*steps(edges, reduce(values)), label, style) for label, values, style in sides]
         curves.append(level(edges[0], edges[-1], 1.0, "noise alone", NOISE))
         panels.append(Panel(hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log"),
                             tuple(curves), (), title))
@@ -66,15 +66,10 @@ def _worst(values: np.ndarray) -> np.ndarray:
     return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)
 
 
-def _steps(edges: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A value for each band as a staircase."""
-    return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(values, float), 2)
-
-
 def ladder(gap: Gap) -> Figure:
     """Error of each stage as a bar, with the line of what noise alone would leave."""
     values = np.array([100 * one.nrmse for one in gap.stages])
-    place = np.arange(len(values), dtype=float)
+    place, axis = places([textwrap.fill(rung(one.name, k), LETTERS) for k, one in enumerate(gap.stages)])
     noise = 100 * gap.noise_nrmse
     shown = np.append(values, noise)
     shown = shown[np.isfinite(shown) & (shown > 0)]
@@ -82,12 +77,10 @@ def ladder(gap: Gap) -> Figure:
     bars = Curve(place, np.where(np.isfinite(values) & (values > 0), values, np.nan), "error of the model",
                  Style("#8fbbdc"), line=False, bars=0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
-    ticks = tuple((float(k), textwrap.fill(rung(one.name, k), LETTERS)) for k, one in enumerate(gap.stages))
     return Figure("ladder", "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. "
                   "Logarithmic scale.",
-                  (Panel(Axis("", "linear", (-0.6, len(values) - 0.4), ticks),
-                         Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))), (bars, *lines)),),
-                  height=0.7)
+                  (Panel(axis, Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))),
+                         (bars, *lines)),), height=0.7)
 
 
 def rung(name: str, k: int) -> str:
@@ -99,10 +92,10 @@ def _stages(gap: Gap) -> Table:
     rows = []
     for k, one in enumerate(gap.stages):
         over = one.nrmse / gap.noise_nrmse if gap.noise_nrmse > 0 else np.nan
-        rows.append((rung(one.name, k), wording.percent(one.nrmse), words.number(over), words.number(
+        rows.append((rung(one.name, k), words.percent(one.nrmse), words.number(over), words.number(
             one.chi2_per_dof, 4)))
     if np.isfinite(gap.noise_nrmse):
-        rows.append(("noise alone", wording.percent(gap.noise_nrmse), "1", "1"))
+        rows.append(("noise alone", words.percent(gap.noise_nrmse), "1", "1"))
     return table("Each model is fitted to the same records; the figures are those of records or periods that no fit "
                  f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
                  "relative to that of the measured outputs.",

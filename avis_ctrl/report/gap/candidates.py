@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, table
+from avis_ctrl.study.gap import GapFinding
 
 FIRST = 12
 # Parameters of a candidate that a row has room for.
 MOST = 4
 
 
-def candidates(found: Found) -> Section:
+def candidates(found: GapFinding) -> Section:
     """Candidates that were refitted, the most probable first."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
@@ -31,7 +31,7 @@ def candidates(found: Found) -> Section:
     return Section("Rejected candidates", "considered", tuple(pieces))
 
 
-def _none(found: Found) -> str:
+def _none(found: GapFinding) -> str:
     if found.gap.verdict == "none":
         return "No candidate was fitted: the score test was significant for no effect at any place."
     return "No other candidate was fitted."

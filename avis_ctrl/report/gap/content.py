@@ -7,27 +7,32 @@ from avis_ctrl.report.gap.candidates import candidates
 from avis_ctrl.report.gap.controller import controller
 from avis_ctrl.report.gap.dependence import dependence
 from avis_ctrl.report.gap.effects import parameters
-from avis_ctrl.report.gap.finding import Found
-from avis_ctrl.report.gap.measurement import measurement
 from avis_ctrl.report.gap.method import method
 from avis_ctrl.report.gap.opening import opening
 from avis_ctrl.report.gap.places import places
 from avis_ctrl.report.gap.remaining import remaining
-from avis_ctrl.report.identification.gates import gates_of
-from avis_ctrl.report.pieces import Document
-from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
+from avis_ctrl.report.identification.gates import gates
+from avis_ctrl.report.pieces import Document, Section
+from avis_ctrl.report.records import records, remarks
+from avis_ctrl.report.sections.provenance import document_of, provenance_table
+from avis_ctrl.study.gap import GapFinding
 
 
-def document(found: Found) -> Document:
+def measurement(found: GapFinding) -> Section:
+    """The records, and how they were divided."""
+    use = {one.name: "held out" if one.held_out else "fitted" for one in found.gap.records}
+    how = found.gap.held_out.rstrip(".")
+    return Section("Measurement", "measurement", (records(found.measured, use, f"Held out: {how}" if how else ""),
+                                                  *remarks(found.measured)))
+
+
+def document(found: GapFinding) -> Document:
     """The report of a gap."""
-    made = str(found.provenance.get("date", ""))[:10]
     sections = [make(found) for make in (opening, before_after, places, dependence, parameters, candidates, remaining)]
     sections += [part for part in (controller(found),) if part is not None]
-    sections += [measurement(found), gates_of(found.findings), method(found.gap)]
+    sections += [measurement(found), gates(found.findings), method(found.gap)]
     told = {"seed": found.gap.seed, "seconds": found.gap.seconds, **found.provenance}
     sections.append(provenance_table(told, "The same measurement, rig, options, seed, library versions and "
                                      "processor give the same figures."))
-    name = found.gap.baseline.rig.name
-    return Document(f"Gap between simulation and measurement of the rig {name}",
-                    "Where they disagree, and which effects the model misses" + (f", {made}" if made else ""),
-                    stamp_of(found.provenance), tuple(sections))
+    return document_of(f"Gap between simulation and measurement of the rig {found.gap.baseline.rig.name}",
+                       "Where they disagree, and which effects the model misses", found.provenance, sections)

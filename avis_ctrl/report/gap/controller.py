@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, level
-from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level, places
 from avis_ctrl.report.pieces import Bullets, Cell, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.study.gap import GapFinding
 
 if TYPE_CHECKING:
     from avis_ctrl.study.gap_design import DesignEffect, LoopFigures
 
 
-def controller(found: Found) -> Section | None:
+def controller(found: GapFinding) -> Section | None:
     """The previous controller on both models beside a new one; None where no design was asked for."""
     effect = found.design
     if effect is None:
@@ -55,14 +55,12 @@ def _bounds(effect: DesignEffect) -> Figure:
     """mu of each loop as a bar; none where the loop is not stable."""
     drawn = loops(effect)
     mu = np.array([one.mu_upper for _, _, one in drawn])
-    place = np.arange(len(mu), dtype=float)
-    ticks = tuple((float(k), f"{who} on\n{model}") for k, (who, model, _) in enumerate(drawn))
+    place, axis = places([f"{who} on\n{model}" for who, model, _ in drawn])
     lost = " A loop without a bar is not stable." if not np.isfinite(mu).all() else ""
     top = 1.15 * max(1.0, float(np.max(mu[np.isfinite(mu)], initial=0.0)))
     bars = Curve(place, np.where(np.isfinite(mu), mu, np.nan), "upper bound of mu", Style("#8fbbdc"), line=False,
                  bars=0.5)
     return Figure("gap_mu", "Upper bound of mu (robust performance) of each controller with each model; below 1 the "
                   f"specified performance is guaranteed for every table of the set.{lost}",
-                  (Panel(Axis("", "linear", (-0.6, len(mu) - 0.4), ticks),
-                         Axis("mu, upper bound [-]", "linear", (0.0, top)),
-                         (bars, level(-0.5, len(mu) - 0.5, 1.0, "limit", STYLES["limit"]))),), height=0.7)
+                  (Panel(axis, Axis("mu, upper bound [-]", "linear", (0.0, top)),
+                         (bars, level(-0.5, len(mu) - 0.5, 1.0, "limit"))),), height=0.7)

@@ -6,15 +6,34 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from avis_ctrl.gap.result import Gap, RecordGap
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level
+from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
+from avis_ctrl.report import words
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, steps
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
-from avis_ctrl.report.gap.coherence import coherence
-from avis_ctrl.report.gap.finding import Found
-from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section
+from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
+
+LOOKS = {"model": ("model, linear in measured inputs", Style("#222222", "solid", 1.4)),
+         "missing": ("linear, missing from the model", Style("#d55e00", "dash", 1.8)),
+         "nonlinear": ("not linear (amplitude, time)", Style("#009e73", "solid", 1.8)),
+         "unmeasured": ("unmeasured inputs", Style("#0072b2", "dashdot", 1.6)),
+         "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6))}
+COLUMNS = {"model": "model", "missing": "linear, not in the model", "nonlinear": "not linear",
+           "unmeasured": "unmeasured inputs", "sensors": "sensors' noise"}
+# Fractions below this are not drawn.
+LEAST = 1e-9
+HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; the part of the "
+                 "excited lines that exceeds this and any linear response is not linear.",
+       "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
+                 "terms, is therefore attributed to noise and unmeasured inputs, which do not grow with the drives; "
+                 "any additional residual at a higher level is not linear. Nonlinearity at the lowest level that is "
+                 "not in the model counts as unmeasured inputs.",
+       "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
+                    "from nonlinearity that is not in the model: \"not linear\" contains only the model's own "
+                    "nonlinear terms, and \"unmeasured inputs\" all else that does not follow the drives linearly."}
 
 
-def dependence(found: Found) -> Section:
+def dependence(found: GapFinding) -> Section:
     """The residual of each record by level and by time, and fractions of power."""
     gap = found.gap
     pieces: list[Piece] = []
@@ -64,3 +83,52 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - room, high + room
 
+
+def coherence(shares: tuple[PowerShares, ...]) -> list[Piece]:
+    """The highest level as figure and table; the lowest one folded."""
+    lowest, top = shares[0], shares[-1]
+    pieces: list[Piece] = [Paragraph(_explained(top)), figure(top, "gap_coherence"), _whole(top)]
+    if len(shares) > 1:
+        pieces.append(Fold("The same at the lowest level", (figure(lowest, "gap_coherence_lowest"), _whole(lowest))))
+    return pieces
+
+
+def _explained(one: PowerShares) -> str:
+    unknown = "" if "sensors" in one.shares else (" The sensors' own noise is not known by itself and counts as "
+                                                  "unmeasured inputs.")
+    narrow = float(np.min(np.diff(one.bands_Hz)))
+    return (f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear means any "
+            "response to the measured inputs that is smooth over a band beside the model's own, with up to two poles "
+            f"moved; an error of the model narrower than that (bands are {words.number(narrow, 2)} Hz wide and more) "
+            "counts in part as not linear.")
+
+
+def figure(one: PowerShares, name: str) -> Figure:
+    """A panel for each output, fractions on a logarithmic axis."""
+    edges = np.asarray(one.bands_Hz, float)
+    positive = np.concatenate([np.ravel(v) for v in one.shares.values()])
+    positive = positive[np.isfinite(positive) & (positive > LEAST)]
+    low = float(10 ** np.floor(np.log10(positive.min(initial=0.1))))
+    panels = []
+    for k, output in enumerate(one.outputs):
+        curves = tuple(Curve(*steps(edges, _drawn(one.shares[key][:, k])), label, style)
+                       for key, (label, style) in LOOKS.items() if key in one.shares)
+        panels.append(Panel(hertz(float(edges[0]), float(edges[-1])),
+                            Axis("fraction of the power [-]", "log", (low, 2.0)), curves, (), output))
+    records = ", ".join(one.records)
+    return Figure(name, f"What accounts for the power of each output at {words.number(one.level_V)} V r.m.s. "
+                  f"({one.excitation}, records {records}), by frequency; the fractions of a band add up to 1. A line "
+                  "that ends is below what can be determined.", tuple(panels), 2, 0.72)
+
+
+def _drawn(share: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(share) & (share > LEAST), share, np.nan)
+
+
+def _whole(one: PowerShares) -> Table:
+    """Fractions of the power of all bands together."""
+    keys = [key for key in LOOKS if key in one.whole]
+    rows = [(output, *(words.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
+            for k, output in enumerate(one.outputs)]
+    return table(f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
+                 "lies at the resonances.", ("output", *(COLUMNS[key] for key in keys)), rows, "l" + "r" * len(keys))

@@ -11,12 +11,12 @@ from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.gap.table_model import inseparable_parameters
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
-from avis_ctrl.report.pieces import Bullets, Fold, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.tolerances import tolerances
+from avis_ctrl.study.gap import GapFinding
 
 
-def parameters(found: Found) -> Section:
+def parameters(found: GapFinding) -> Section:
     """Sizes with standard deviations, how each effect was confirmed, and the rig's parameters with and without."""
     gap = found.gap
     pieces: list[Piece] = []
@@ -29,9 +29,7 @@ def parameters(found: Found) -> Section:
         groups = inseparable_parameters(gap.baseline)
         pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
                            (_rig(gap, groups), *_together(groups), *_always(gap))))
-    if gap.tolerances:
-        pieces += [Heading("Tolerances"), *tolerances(gap.tolerances)]
-    return Section("Parameters", "parameters", tuple(pieces))
+    return Section("Parameters", "parameters", (*pieces, *tolerances(gap.tolerances)))
 
 
 def _sizes(gap: Gap) -> Table:
@@ -75,7 +73,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
         shown, spread = words.number(new, 5), "not by itself" if name in shared else "not stated"
         if name in sigma and name not in shared:
             shown, spread = words.with_std(new, sigma[name])
-        change = f"{100 * (new / value - 1):+.2f} %".replace("-", "−") if value and np.isfinite(new) else "none"
+        change = f"{100 * (new / value - 1):+.2f} %" if value and np.isfinite(new) else "none"
         middle = (words.number(value, 5), shown, spread, change) if gap.effects else (shown, spread)
         rows.append((name, *middle, words.unit(units[name])))
     if not gap.effects:

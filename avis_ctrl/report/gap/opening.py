@@ -1,20 +1,26 @@
-"""The result: one sentence, what it rests on, and the named effects in one table."""
+"""The page that is read alone: one sentence, what it rests on, and the named effects in one table."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
+from avis_ctrl.report.gap.before_after import ladder
+from avis_ctrl.report.gap.remaining import next_step
 from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
 
 # Parameters of an effect that a row has room for; all of them stand in the section on parameters.
 MOST = 5
+CHANCES = (" The probability takes into account the other candidates, the tolerances, and causes outside the library; "
+           "for hum, a converter and floor motion it is one minus the p-value of the signal. No probability above 99 % "
+           "is stated.")
 
 
-def opening(found: Found) -> Section:
+def opening(found: GapFinding) -> Section:
     """Verdict, the gap in numbers, named effects."""
     gap = found.gap
     good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)
@@ -22,19 +28,21 @@ def opening(found: Found) -> Section:
     pieces.append(Paragraph(wording.claim(gap)))
     if numbers := in_numbers(gap):
         pieces.append(Paragraph(numbers))
+    if gap.stages:
+        pieces.append(ladder(gap))
     if gap.effects or gap.traces:
-        pieces.append(_named(gap))
+        pieces.append(named(gap, CHANCES))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
         pieces.append(Paragraph("The section on the residual lists the detection limits of the effects."))
-    open_still = gap.verdict in ("unexplained", "partly explained")
-    if told := (*gap.sentences[1:], *([gap.next_experiment] if open_still and gap.next_experiment else [])):
+    if told := gap.sentences[1:]:
         pieces.append(Bullets(tuple(map(wording.said, told))))
+    pieces.append(Paragraph(f"What to measure next: {next_step(found)}"))
     warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
     if warned:
         pieces.append(Paragraph(f"Gates that warned of the records: {words.joined(warned)}; see the section on gates.",
                                 "note"))
-    return Section("Result", "result", tuple(pieces))
+    return Section("Summary", "result", tuple(pieces), alone=True)
 
 
 def sentence(gap: Gap) -> str:
@@ -52,10 +60,10 @@ def in_numbers(gap: Gap) -> str:
     """The gap before and after on held-out data, beside that of noise alone."""
     if not gap.stages:
         return ""
-    told = [f"{wording.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
+    told = [f"{words.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
     text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
     if np.isfinite(gap.noise_nrmse):
-        text += f"; that of the noise alone is estimated at {wording.percent(gap.noise_nrmse)}"
+        text += f"; that of the noise alone is estimated at {words.percent(gap.noise_nrmse)}"
     first, last = _reference(gap), gap.stages[-1].nrmse
     if gap.effects and first > 0 and last > 0:
         text += f". With the effect{'s' * (len(gap.effects) > 1)} the error is "
@@ -82,16 +90,15 @@ def _stage(name: str) -> str:
             "tolerances": "with all tolerances"}.get(name, f"with {wording.titled(name)}")
 
 
-def _named(gap: Gap) -> Table:
+def named(gap: Gap | AxisGap, remark: str) -> Table:
+    """The named effects with their sizes; traces last. remark : on their probabilities."""
     rows = [(f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}", one.location,
-             wording.quantities(one.parameters, MOST), wording.percent(np.nan if one.share is None else one.share),
+             wording.quantities(one.parameters, MOST), words.percent(np.nan if one.share is None else one.share),
              wording.probability(one.probability),
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in (*gap.effects, *gap.traces)]
     return table("Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
-                 "held-out records if this effect alone is removed, relative to the power of the re-identified model's "
-                 "residual beyond noise; below 1 % an effect is a trace. The probability takes into account the other "
-                 "candidates, the tolerances, and causes outside the library; for hum, a converter and floor motion it "
-                 "is one minus the p-value of the signal. No probability above 99 % is stated.",
+                 "held-out data if this effect alone is removed, relative to the power that the residual has beyond "
+                 f"noise without any effect; below 1 % an effect is a trace.{remark}",
                  ("effect", "place", "size", "fraction of the gap", "probability", "indistinguishable from"), rows,
                  "lllrrl")

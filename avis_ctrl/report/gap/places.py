@@ -11,15 +11,15 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
 
 # Colours begin at half of the noise's power and end at ten times it or more.
 LOWEST, LEAST_TOP = 0.5, 10.0
 LETTERS = 20
 
 
-def places(found: Found) -> Section:
+def places(found: GapFinding) -> Section:
     """Heat map before and after, and the table of places before naming."""
     gap = found.gap
     pieces: list[Piece] = []
@@ -64,7 +64,7 @@ def _short(name: str) -> str:
 
 def table_of(listed: Sequence[Where], caption: str) -> Table:
     """Bands and paths with their fraction of the excess over noise."""
-    rows = [(wording.place(one), wording.percent(one.share), _stated(one.excess), _chance(one.p_value))
+    rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value))
             for one in listed]
     return table(f"{caption}Fraction: of the power beyond noise. Over noise: power of the residual relative to "
                  "that of the noise. p-value: of noise alone, over all places (family-wise).",

@@ -7,12 +7,12 @@ import numpy as np
 from avis_ctrl.gap.result import Detectable, Gap, spoken
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.finding import Found
 from avis_ctrl.report.gap.places import table_of
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.study.gap import GapFinding
 
 
-def remaining(found: Found) -> Section:
+def remaining(found: GapFinding) -> Section:
     """Where the residual of the updated model lies, and the next experiment."""
     gap = found.gap
     pieces: list[Piece] = [Paragraph(_left(gap))]
@@ -20,7 +20,7 @@ def remaining(found: Found) -> Section:
         pieces.append(table_of(gap.remaining, "Where the residual of the updated model lies, on held-out data. "))
     if gap.detectable:
         pieces += [Heading("Detection limits"), detectable(gap)]
-    pieces += [Heading("What to measure next"), Paragraph(gap.next_experiment or _nothing(found))]
+    pieces += [Heading("What to measure next"), Paragraph(next_step(found))]
     return Section("Residual, and what to measure next", "remaining", tuple(pieces))
 
 
@@ -62,13 +62,16 @@ def _left(gap: Gap) -> str:
              None: "From these records it is not known whether it grows faster than the drives."}[left.grows_with_level]
     places = ("The table below lists where it lies." if gap.remaining else
               f"No band of any channel exceeds the estimated noise significantly{after}.")
-    return (f"On held-out records the residual of the updated model is {wording.percent(left.nrmse)} of the response, "
+    return (f"On held-out records the residual of the updated model is {words.percent(left.nrmse)} of the response, "
             f"r.m.s., which is {words.number(left.over_noise)} times the estimated noise. Its power beyond noise is "
-            f"{wording.percent(left.share)} of that of the re-identified model. {level} {places}")
+            f"{words.percent(left.share)} of that of the re-identified model. {level} {places}")
 
 
-def _nothing(found: Found) -> str:
+def next_step(found: GapFinding) -> str:
+    """The experiment that would tell more, or that none is needed."""
     gap = found.gap
+    if gap.next_experiment:
+        return wording.said(gap.next_experiment)
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
         return "No further measurement was found that would distinguish the effects that these data confuse."
     if gap.verdict in ("partly explained", "unexplained"):

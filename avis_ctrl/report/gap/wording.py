@@ -10,6 +10,7 @@ from avis_ctrl.gap.effects.base import Effect, Reported
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
 from avis_ctrl.report import words
+from avis_ctrl.uncertain_value import with_prefix
 
 # What each verdict claims, and what it does not.
 CLAIMS = {
@@ -31,9 +32,6 @@ CLAIMS = {
 RAISED = ("Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "
           "name for that. As a whole, the residual of the model{with_effects} on the held-out data is the measured "
           "noise.")
-PERCENT = 100.0
-# Fractions below this are stated as that.
-LEAST = 1e-5
 
 
 def claim(gap: Gap) -> str:
@@ -65,20 +63,14 @@ def probability(value: float) -> str:
         return "not computed"
     if value > 0.999:
         return "> 99.9 %"
-    return "< 0.1 %" if value < 0.001 else f"{words.number(PERCENT * value, 3)} %"
-
-
-def percent(share: float, digits: int = 3) -> str:
-    """A fraction in per cent."""
-    if not np.isfinite(share):
-        return "not computed"
-    return "< 0.001 %" if 0 < share < LEAST else f"{words.number(PERCENT * share, digits)} %"
+    return "< 0.1 %" if value < 0.001 else f"{words.number(100 * value)} %"
 
 
 def quantity(one: Reported) -> str:
     """value ± standard deviation unit."""
-    value, sigma = words.with_std(one.value, one.std)
-    unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
+    size, std, unit = with_prefix(one.value, one.std, one.unit)
+    value, sigma = words.with_std(size, std)
+    unit = "" if unit in ("", "1") else f" {words.unit(unit)}"
     if not (np.isfinite(one.std) and one.std > 0):
         return f"{value}{unit} (no standard deviation)"
     return f"({value} ± {sigma}){unit}" if unit else f"{value} ± {sigma}"

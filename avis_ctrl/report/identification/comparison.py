@@ -79,7 +79,7 @@ def _table(found: Identification, result: EkfResult) -> Table:
                                                          _differences(found, result), strict=True):
         first, second = words.with_std(value, sigma), words.with_std(other, spread)
         rows.append((one.words, *(first if one.determined else (first[0], "not determined")), *second,
-                     f"{apart:+.1f}".replace("-", "−") if np.isfinite(apart) else "",
+                     f"{apart:+.1f}" if np.isfinite(apart) else "",
                      words.unit(one.unit) if one.unit != "1" else ""))
     return table("Estimates of each combination by both methods. The difference is divided by the root of the sum of "
                  "both variances. Because both use the same data, it should be smaller than for independent data.",

@@ -7,23 +7,22 @@ from avis_ctrl.report.identification.gates import gates
 from avis_ctrl.report.identification.identifiability import identifiability
 from avis_ctrl.report.identification.measurements import measurements
 from avis_ctrl.report.identification.method import method
-from avis_ctrl.report.identification.opening import opening
+from avis_ctrl.report.identification.opening import opening, parameters
 from avis_ctrl.report.identification.responses import responses
 from avis_ctrl.report.identification.uncertainty import uncertainty
 from avis_ctrl.report.identification.validation import validation
 from avis_ctrl.report.pieces import Document
-from avis_ctrl.report.sections.provenance import provenance_table, stamp_of
+from avis_ctrl.report.sections.provenance import document_of, provenance_table
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identified_uncertainty import InDesign
 
 
 def document(found: Identification, in_design: InDesign | None = None) -> Document:
     """The report of an identification; in_design : what a design makes of it, where that was computed."""
-    made = str(found.provenance.get("date", ""))[:10]
-    sections = [make(found) for make in (opening, measurements, gates, responses, identifiability, ways, validation)]
-    sections += [uncertainty(found, in_design), method(found),
-                 provenance_table(found.provenance, "The same measurement, rig, options, seed, library versions and "
-                                  "processor give the same figures.")]
-    return Document(f"Identification of the rig {found.rig.name}",
-                    "From measurements to a rig with known uncertainty" + (f", {made}" if made else ""),
-                    stamp_of(found.provenance), tuple(sections))
+    return document_of(
+        f"Identification of the rig {found.rig.name}", "From measurements to a rig with known uncertainty",
+        found.provenance, (opening(found), parameters(found), measurements(found), gates(found.findings),
+                           responses(found), identifiability(found), ways(found), validation(found),
+                           uncertainty(found, in_design), method(found),
+                           provenance_table(found.provenance, "The same measurement, rig, options, seed, library "
+                                            "versions and processor give the same figures.")))

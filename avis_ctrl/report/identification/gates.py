@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Picture
-from avis_ctrl.report.identification.gate_figures import figure_of
+import numpy as np
+
+from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Limit, Picture, Series
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, log_range, numbered
 from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, table
-from avis_ctrl.study.identification import Identification
 
 MARKS: dict[str, Cell] = {"ok": Mark("ok", True), "note": "note", "warning": Mark("WARNING", False),
                           "stop": Mark("STOP", False)}
 TOGETHER = 6
+# Letters that fit beside each other under a panel of half the width.
+LETTERS = 36
+LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
 
 
-def gates(found: Identification) -> Section:
+def gates(findings: Sequence[Finding]) -> Section:
     """Table of all findings, and their pictures."""
-    return gates_of(found.findings)
-
-
-def gates_of(findings: Sequence[Finding]) -> Section:
-    """The same of findings by themselves."""
     if not findings:
         return Section("Gates", "gates", (Paragraph("The gates (automatic checks of the data) need records in the time "
                                                     "domain; there were none."),))
@@ -28,7 +28,7 @@ def gates_of(findings: Sequence[Finding]) -> Section:
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
     listed = [severity for _, severity, _ in together]
-    counts = ", ".join(f"{listed.count(s)} {s}" for s in reversed(SEVERITIES) if s in listed)
+    counts = ", ".join(f"{n} {s}{'s' * (n > 1 and s != 'ok')}" for s in reversed(SEVERITIES) if (n := listed.count(s)))
     pieces: list[Piece] = [
         table(f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
               "note is for information, a warning means less accurate results, a stop means wrong results.",
@@ -74,3 +74,80 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
     groups = [of[k:k + TOGETHER] for of in (many, few) for k in range(0, len(of), TOGETHER)]
     return [figure_of(f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group,
                       2, 0.75) for k, group in enumerate(groups)]
+
+
+
+def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:
+    """Pictures as panels of one figure: a name has the same look in all of them."""
+    names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
+    limits = list(dict.fromkeys(one.name for p in pictures for one in p.limits))
+    columns = min(columns, len(pictures))
+    return Figure(name, caption, tuple(panel_of(p, names, limits, LETTERS * 2 // columns) for p in pictures), columns,
+                  height)
+
+
+def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int = LETTERS) -> Panel:
+    """A picture; names, limits : in the order of their styles; letters : that fit beside each other under it."""
+    curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
+    if len(picture.series) == 1:  # title and axis say what it is
+        curves = tuple(replace(curve, label="") for curve in curves)
+    x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names, letters))
+    panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)),
+                  curves, (), picture.title)
+    lines = tuple(_line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3))
+                  for one in picture.limits)
+    return _framed(replace(panel, curves=(*curves, *lines)))
+
+
+def _named(names: Sequence[str], letters: int) -> tuple[tuple[float, str], ...]:
+    """Names as ticks, in as many rows as keep them from each other."""
+    rows = 1 + sum(len(name) + 1 for name in names) // letters
+    return tuple((float(k), "\n" * (k % rows) + name) for k, name in enumerate(names))
+
+
+def _scale(text: str) -> Scale:
+    return "log" if text == "log" else "linear"
+
+
+def _curve(series: Series, style: Style) -> Curve:
+    x, y = np.asarray(series.x, float), np.asarray(series.y, float)
+    if series.style == "bars":
+        width = 0.8 * float(np.min(np.diff(np.sort(x)))) if len(x) > 1 else 0.8
+        return Curve(x, y, series.name, style, line=False, bars=width)
+    points = series.style == "points"
+    return Curve(x, y, series.name, style, points=points, line=not points)
+
+
+def _line(limit: Limit, panel: Panel, style: Style) -> Curve:
+    """A straight line across the data."""
+    if limit.axis == "x":
+        low, high = _span(panel, "y")
+        return Curve(np.array([limit.value, limit.value]), np.array([low, high]), limit.name, style)
+    low, high = _span(panel, "x")
+    return Curve(np.array([low, high]), np.array([limit.value, limit.value]), limit.name, style)
+
+
+def _span(panel: Panel, which: str) -> tuple[float, float]:
+    values = np.concatenate([getattr(c, which) for c in panel.curves] or [np.array([0.0, 1.0])])
+    values = values[np.isfinite(values)]
+    if getattr(panel, which).scale == "log":
+        values = values[values > 0]
+    return (float(values.min()), float(values.max())) if values.size else (0.1, 1.0)
+
+
+def _framed(panel: Panel) -> Panel:
+    """A logarithmic axis of frequencies runs from its first to its last point; few whole numbers are ticks."""
+    if panel.x.scale == "log":
+        low, high = _span(panel, "x")
+        return replace(panel, x=replace(panel.x, range=(low / 1.1, high * 1.1)), y=_with_range(panel))
+    if panel.x.ticks:
+        return replace(panel, y=_with_range(panel))
+    numbers = np.unique(np.concatenate([c.x for c in panel.curves] or [np.zeros(0)]))
+    if 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
+        return replace(panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)),
+                       y=_with_range(panel))
+    return replace(panel, y=_with_range(panel))
+
+
+def _with_range(panel: Panel) -> Axis:
+    return replace(panel.y, range=log_range(panel)) if panel.y.scale == "log" else panel.y

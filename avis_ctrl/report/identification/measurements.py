@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import Campaign, in_short
+from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.distortion_lines import Kind, distortion_levels
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.records import records, remarks
 from avis_ctrl.study.identification import Identification
 
 DISTORTIONS: tuple[Kind, ...] = ("even", "odd")
@@ -20,32 +21,18 @@ def measurements(found: Identification) -> Section:
     measured = found.measured
     if isinstance(measured, FrequencyResponse):
         return Section("Measurements", "measurements", _response(measured))
-    pieces: list[Piece] = [_records(found, measured), _channels(found, measured)]
-    if (levels := distortion(measured)) is not None:
-        pieces.append(levels)
-    if in_short(measured.notes):
-        pieces += [Heading("Notes on the measurement file"), Bullets(tuple(in_short(measured.notes)))]
-    return Section("Measurements", "measurements", tuple(pieces))
+    levels = distortion(measured)
+    return Section("Measurements", "measurements", (_records(found, measured), _channels(found, measured),
+                                                    *([levels] if levels else []), *remarks(measured)))
 
 
 def _records(found: Identification, campaign: Campaign) -> Table:
-    fitted = {r.header.name for r in found.split.fitted.records} if found.split else set()
-    held = {r.header.name for r in found.split.held_out.records} if found.split else set()
-    rows = []
-    for record in campaign.records:
-        h = record.header
-        periods = f"{h.periods} of {words.number(h.period_s)} s" if h.period_s else "none"
-        use = ("part fitted, part held out" if h.name in fitted & held else "held out" if h.name in held
-               else "fitted" if h.name in fitted else "not used")
-        quiet = h.excitation in ("rest", "floor")
-        rows.append((h.name, h.excitation, "silent" if quiet else f"{words.number(h.level_V)} {h.u_unit}",
-                     f"{words.number(h.duration_s)} s", periods, words.yes(bool(h.floor_names)), use))
-    how = f" {found.split.how[:1].upper()}{found.split.how[1:]}." if found.split else ""
-    return table(f"The records{f' ({campaign.source})' if campaign.source else ''}, sampled at "
-                 f"{words.number(campaign.sample_rate_Hz)} Hz. Levels are r.m.s. values of the drive voltages; in "
-                 f"records at rest or with a shaken floor the drives are silent.{how}",
-                 ("record", "excitation", "level", "duration", "periods", "floor measured", "used as"), rows,
-                 "llrrrcl")
+    if found.split is None:
+        return records(campaign, {}, "")
+    fitted, held = ({r.header.name for r in part.records} for part in found.split[:2])
+    use = {name: "part fitted, part held out" if name in fitted & held else "held out" if name in held else "fitted"
+           for name in fitted | held}
+    return records(campaign, use, found.split.how)
 
 
 def distortion(campaign: Campaign) -> Table | None:

@@ -1,11 +1,13 @@
-"""What came out, in one sentence, one table and one figure."""
+"""What came out, on one page; and every parameter."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style
+from avis_ctrl.report.identification.validation import errors, modes
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.identification import Identification
@@ -14,16 +16,37 @@ TOGETHER = "only in combination"
 
 
 def opening(found: Identification) -> Section:
-    """The verdict, and every parameter."""
-    pieces: list[Piece] = [_sentence(found), _parameters(found), _changes(found)]
-    if found.campaign_fit.tolerances:
-        pieces += [*tolerances(found.campaign_fit.tolerances), Paragraph(_upper(found.caution), "note")]
-    pieces += [Paragraph(_upper(note), "note") for note in found.campaign_fit.notes]
-    return Section("Result", "result", tuple(pieces))
+    """The page that is read alone: verdict, what was measured, modes, errors, the next measurement."""
+    v = found.validation
+    pieces: list[Piece] = [_sentence(found), _measured(found)]
+    if v.modes:
+        pieces.append(modes(found))
+    if v.held_out:
+        pieces.append(errors(v.held_out[0], v.outputs))
+    if found.advice:
+        pieces.append(Paragraph(f"The next measurement: {found.advice[0]}"))
+    return Section("Summary", "result", tuple(pieces), alone=True)
 
 
-def _upper(text: str) -> str:
-    return text[:1].upper() + text[1:].rstrip(".") + "."
+def parameters(found: Identification) -> Section:
+    """Every parameter, how far the tolerances moved, and what the deviations include."""
+    fit = found.campaign_fit
+    notes = [*([found.caution] if fit.tolerances else []), *fit.notes]
+    return Section("Parameters", "parameters", (_parameters(found), _changes(found), *tolerances(fit.tolerances),
+                                                *(Paragraph(words.sentence(note), "note") for note in notes)))
+
+
+def _measured(found: Identification) -> Paragraph:
+    low, high = found.campaign_fit.band_Hz
+    band = f"{words.number(low)} to {words.number(high)} Hz"
+    if not isinstance(found.measured, Campaign):
+        return Paragraph(f"Measured: frequency responses; the fit uses them from {band}. The error below is that of "
+                         "lines that no fit has used.")
+    total = sum(r.header.duration_s for r in found.measured.records)
+    how = f" {words.sentence(found.split.how)}" if found.split else ""
+    return Paragraph(f"Measured: {len(found.measured.records)} records, {words.number(total)} s in total; the fit uses "
+                     f"the spectral lines from {band}.{how} The error is measured on what is held out, which no fit "
+                     "has used.")
 
 
 def _sentence(found: Identification) -> Paragraph:
@@ -33,7 +56,7 @@ def _sentence(found: Identification) -> Paragraph:
     stops = any(f.severity == "stop" for f in found.findings)
     consistent = all(one.consistent for one in found.validation.held_out)
     count = len(information.names)
-    said = [_upper(found.validation.verdict),
+    said = [words.sentence(found.validation.verdict),
             f"The data determine {information.rank} combinations of the {count} parameters, and {alone} parameters "
             "individually."]
     if not found.campaign_fit.fit.converged:
@@ -51,7 +74,7 @@ def _parameters(found: Identification) -> Table:
     rows = []
     for name, unit, before, value, sigma in zip(information.names, information.units, start, information.values,
                                                 information.standard_deviation, strict=True):
-        change = f"{100 * (value / before - 1):+.2f} %".replace("-", "−") if before else "from zero"
+        change = f"{100 * (value / before - 1):+.2f} %" if before else "from zero"
         if np.isfinite(sigma):
             shown, spread = words.with_std(value, sigma)
             share = f"{words.number(100 * sigma / abs(value), 2)} %" if value else ""
@@ -61,7 +84,8 @@ def _parameters(found: Identification) -> Table:
     prior = " The standard deviations include the priors." if found.campaign_fit.fit.priors else ""
     return table("Every fitted parameter: starting value and maximum likelihood estimate with one standard deviation "
                  "(Cramér-Rao bound). If a parameter is known only in combination with others, its own value is the "
-                 "one nearest to the start and has no meaning by itself; section 5 lists the combinations."
+                 "one nearest to the start and has no meaning by itself; the section on identifiability lists the "
+                 "combinations."
                  f"{prior}", ("parameter", "start", "identified", "± 1 σ", "relative", "change", "unit"), rows,
                  "lrrrrrl")
 
@@ -86,4 +110,4 @@ def _changes(found: Identification) -> Figure:
                if known.any() else "Change of each parameter from its starting value; none is determined individually.")
     return Figure("changes", caption, (Panel(Axis("change from the start [%]"),
                                              Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
-                  height=max(0.5, 0.085 * n))
+                  height=max(0.5, 0.07 * n))

@@ -34,7 +34,7 @@ def responses(found: Identification) -> Section:
     seen = found.validation.overlay
     if seen is None:
         return Section("Frequency responses", "responses", (Paragraph(
-            "No measured frequency response can be shown; the notes of section 7 state the reason."),))
+            "No measured frequency response can be shown; the notes of the section on validation state the reason."),))
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
     pieces: list[Piece] = [Paragraph(
@@ -45,7 +45,8 @@ def responses(found: Identification) -> Section:
         pieces.append(Paragraph("From these records, no response can be estimated without a model that is not smoothed "
                                 "at the resonances. The points are therefore the identified model's response plus the "
                                 "residual of the records, regressed on the inputs. A model error that is narrower than "
-                                "a window of lines is not visible here, but in the tests of section 7.", "note"))
+                                "a window of lines is not visible here, but in the tests of the section on "
+                                "validation.", "note"))
     groups = [pairs[k:k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
     pieces += [_bode(seen, group, k) for k, group in enumerate(groups)]
     pieces += [_residual(seen, pairs), _overview(seen)]

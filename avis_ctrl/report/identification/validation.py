@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.identification.validation import HeldOut
 from avis_ctrl.identification.whiteness import Correlation, Whiteness
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, numbered
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, numbered, places
 from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.identification import Identification
 
@@ -19,19 +19,20 @@ MOST_DRAWN = 3
 def validation(found: Identification) -> Section:
     """Chi-square, errors, whiteness and modes."""
     v = found.validation
-    pieces: list[Piece] = [Paragraph(f"{v.verdict[:1].upper()}{v.verdict[1:]}.", "verdict", v.passed), _records(found)]
+    pieces: list[Piece] = [Paragraph(words.sentence(v.verdict), "verdict", v.passed), _records(found)]
     drawn = v.held_out[:MOST_DRAWN]
     for one in drawn:
-        pieces += [_chi_square(one, v.outputs), _errors(one, v.outputs), _nrms(one, v.outputs)]
+        # The errors of the first one are in the summary.
+        pieces += [_chi_square(one, v.outputs), *([errors(one, v.outputs)] if one is not drawn[0] else []),
+                   _nrms(one, v.outputs)]
         if one.whiteness is not None:
             pieces += [_whiteness(one.name, one.whiteness)]
     if len(v.held_out) > len(drawn):
         pieces.append(Paragraph(f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records "
                                 "and pieces; the table lists all.", "note"))
     if v.modes:
-        pieces.append(_modes(found))
-    said = [f"{s[:1].upper()}{s[1:].rstrip('.')}." for s in (*v.sentences[1:], *v.notes)]
-    pieces.append(Bullets(tuple(dict.fromkeys(said))))
+        pieces += _measured_modes(found)
+    pieces.append(Bullets(tuple(dict.fromkeys(map(words.sentence, (*v.sentences[1:], *v.notes))))))
     return Section("Validation", "validation", tuple(pieces))
 
 
@@ -53,14 +54,8 @@ def _records(found: Identification) -> Table:
                  rows, "lrrrrrcc")
 
 
-def _places(outputs: tuple[str, ...]) -> tuple[np.ndarray, Axis]:
-    x = np.arange(1, len(outputs) + 1, dtype=float)
-    return x, Axis("output", "linear", (0.4, len(outputs) + 0.6),
-                   tuple((float(p), name) for p, name in zip(x, outputs, strict=True)))
-
-
 def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
-    x, axis = _places(outputs)
+    x, axis = places(outputs, "output")
     low, high = one.output_chi2_interval.T
     curves = (Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=True, line=False, error=(high - low) / 2),
               Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False))
@@ -68,8 +63,9 @@ def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
                   "its interval.", (Panel(axis, Axis("chi-square / dof [-]"), curves),), height=0.8)
 
 
-def _errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
-    x, axis = _places(outputs)
+def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
+    """Normalised r.m.s. error of each output as bars."""
+    x, axis = places(outputs, "output")
     values = [100 * v for v in (one.nrms_start, one.nrms, one.nrms_floor)]
     labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
     curves = tuple(Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)
@@ -98,7 +94,7 @@ def _whiteness(name: str, white: Whiteness) -> Figure:
     panels = tuple(_correlation(one) for one in white.correlations)
     return Figure(f"whiteness_{name}", f"Correlations of the residual, record {name}, of each output: the largest over "
                   "the inputs if there are several. Noise alone exceeds any limit (dashed) in 1 % of all "
-                  "validations.", panels, height=0.85)
+                  "validations.", panels, height=0.55)
 
 
 def _correlation(one: Correlation) -> Panel:
@@ -111,22 +107,27 @@ def _correlation(one: Correlation) -> Panel:
         max(one.value.max(), one.limit.max())))), tuple(curves), (), f"{one.what[:1].upper()}{one.what[1:]}")
 
 
-def _modes(found: Identification) -> Table:
-    rows = []
-    for row in found.validation.modes:
-        f, z = (_pair(*two) for two in ((row.frequency_Hz, row.frequency_std_Hz),
-                                        (100 * row.damping, 100 * row.damping_std)))
-        measured_f, measured_z = (_pair(*two) for two in (
-            (row.measured_frequency_Hz, row.measured_frequency_std_Hz),
-            (100 * row.measured_damping, 100 * row.measured_damping_std)))
-        rows.append((row.shape, words.number(row.start_frequency_Hz, 4), f, measured_f, _sigma(row.frequency_sigma),
-                     words.number(100 * row.start_damping, 3), z, measured_z, _sigma(row.damping_sigma)))
-    return table("Modes of the start and of the identified model beside those measured in the held-out data without "
-                 "the rig's equations, each with one standard deviation. Shapes "
-                 "are given by the distribution of the kinetic energy; the difference is model minus "
-                 "measured, divided by its standard deviation.",
-                 ("shape", "start [Hz]", "identified [Hz]", "measured [Hz]", "diff. [σ]", "damping, start [%]",
-                  "identified [%]", "measured [%]", "diff. [σ]"), rows)
+def modes(found: Identification) -> Table:
+    """Natural frequencies and damping of the start and of the identified model."""
+    rows = [(row.shape, words.number(row.start_frequency_Hz, 4), words.number(row.frequency_Hz, 4),
+             words.number(100 * row.start_damping), words.number(100 * row.damping)) for row in found.validation.modes]
+    return table("Modes of the start and of the identified model. Shapes are given by the distribution of the kinetic "
+                 "energy.", ("shape", "frequency, start [Hz]", "identified [Hz]", "damping ratio, start [%]",
+                             "identified [%]"), rows)
+
+
+def _measured_modes(found: Identification) -> list[Piece]:
+    """The identified modes beside measured ones, with standard deviations."""
+    rows = found.validation.modes
+    frequency = [(r.shape, _pair(r.frequency_Hz, r.frequency_std_Hz),
+                  _pair(r.measured_frequency_Hz, r.measured_frequency_std_Hz), _sigma(r.frequency_sigma)) for r in rows]
+    damping = [(r.shape, _pair(100 * r.damping, 100 * r.damping_std),
+                _pair(100 * r.measured_damping, 100 * r.measured_damping_std), _sigma(r.damping_sigma)) for r in rows]
+    return [table(caption, ("shape", f"identified [{unit}]", f"measured [{unit}]", "difference [σ]"), several)
+            for caption, unit, several in (
+                ("Natural frequencies of the identified model beside those measured in the held-out data without the "
+                 "rig's equations, with one standard deviation. The difference is model minus measured, divided by "
+                 "its standard deviation.", "Hz", frequency), ("Damping ratios in the same way.", "%", damping))]
 
 
 def _pair(value: float, sigma: float) -> str:
@@ -138,4 +139,4 @@ def _pair(value: float, sigma: float) -> str:
 
 
 def _sigma(value: float) -> str:
-    return f"{value:+.1f}".replace("-", "−") if np.isfinite(value) else "none"
+    return f"{value:+.1f}" if np.isfinite(value) else "none"

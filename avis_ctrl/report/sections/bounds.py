@@ -55,7 +55,7 @@ def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, 
     order = np.argsort(passive.frequencies)
     curves.append(Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive",
                         STYLES["passive"]))
-    curves.append(level(0.01, 1000.0, 1.0, "1", STYLES["limit"]))
+    curves.append(level(0.01, 1000.0, 1.0, "mu = 1"))
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
     top = min(max(finite) * 1.3, 30.0)
     panel = Panel(hertz(0.01, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))
@@ -66,13 +66,19 @@ def _stability(result: DesignResult) -> Table:
     rows = []
     for c in result.controllers:
         b = c.stability
-        shown = not c.stable or b.lower >= 1
-        verdict = Mark("no", False) if shown else Mark("yes", True) if b.upper < 1 else Mark("not shown", False)
         margin = words.number(1 / b.upper) if c.stable and np.isfinite(b.upper) and b.upper > 0 else "none"
-        rows.append((c.title, words.bound(b.upper, 4), words.bound(b.lower, 4), words.hertz(b.omega), margin, verdict))
+        rows.append((c.title, words.bound(b.upper, 4), words.bound(b.lower, 4), words.hertz(b.omega), margin,
+                     stable_for_the_set(c)))
     return table("Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
                  "upper bound of mu reaches 1.",
                  ("controller", "mu upper", "mu lower", "peak at", "margin", "stable for the set"), rows, "lrrrrc")
+
+
+def stable_for_the_set(c: ControllerResult) -> Mark:
+    """Whether the loop is stable for every plant of the uncertainty set, as far as that is proved."""
+    if not c.stable or c.stability.lower >= 1:
+        return Mark("no", False)
+    return Mark("yes", True) if c.stability.upper < 1 else Mark("not shown", False)
 
 
 def _worst(result: DesignResult) -> Table:

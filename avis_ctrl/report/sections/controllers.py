@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import (
@@ -13,7 +14,6 @@ from avis_ctrl.report.figures import (
     Panel,
     Style,
     controller_style,
-    decibels,
     hertz,
     numbered,
 )
@@ -42,13 +42,18 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
     rows = [(c.title, f"controllers/{c.name}.json", str(c.order), f"{words.number(c.fastest_pole_Hz)} Hz",
              words.number(2 * c.fastest_pole_Hz / rate), words.yes(_system(c).is_stable()),
              f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
-             f"{words.number(c.rest.percent)} %" if c.rest else "") for c in made]
+             _offset(c.rest.percent) if c.rest else "") for c in made]
     return table(f"The controllers and their state-space files. The fastest pole is compared with half the sample "
                  f"rate of {words.number(rate, 4)} Hz. The gain at rest turns the offset of the sensors' electronics "
                  "into drive voltage: the last column is the part of a drive's range that the largest offsets of the "
                  "rig file need, each with its worst sign.",
                  ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself",
                   "gain at rest", "offset needs"), rows, "llrrrcrr")
+
+
+def _offset(percent: float) -> str:
+    """Part of a drive's range; below a millionth it is rounding."""
+    return f"{words.number(percent if percent > 1e-4 else 0.0)} %"
 
 
 def _gains(made: list[ControllerResult]) -> Figure:
@@ -94,8 +99,8 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         S = np.linalg.inv(np.eye(L.shape[1]) - L)
         size = np.linalg.norm(S, ord=2, axis=(1, 2))
         peaks.append(f"{c.title} {words.decibel(float(size.max()))}")
-        loops.append(Curve(HZ, decibels(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
-        sensitivities.append(Curve(HZ, decibels(size), c.title, controller_style(c.name)))
+        loops.append(Curve(HZ, in_dB(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
+        sensitivities.append(Curve(HZ, in_dB(size), c.title, controller_style(c.name)))
     x = hertz(0.01, 500.0)
     return Figure("loops", "Largest singular value of the open loop G K at the measurement (left) and of the "
                   f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, numbered
-from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Table, table
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz
+from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 from avis_ctrl.study.design_result import DesignResult
-from avis_ctrl.study.identified_uncertainty import InDesign
+from avis_ctrl.study.identified_uncertainty import JUDGED_HZ, InDesign
 
 # Parameters shown for each direction.
 SHOWN = 5
@@ -20,9 +22,8 @@ def identified(result: DesignResult) -> list[Piece]:
     if found is None or content is None:
         return []
     pieces: list[Piece] = [Heading("Uncertainty from the identification"), _origin(result, found)]
-    if found.directions:
-        pieces.append(_directions(result, found))
-    return [*pieces, _spread(found)]
+    rig = result.plant.rig
+    return [*pieces, *directions(found, rig.nominal, rig.units), spread(found)]
 
 
 def _origin(result: DesignResult, found: InDesign) -> Paragraph:
@@ -54,39 +55,36 @@ def _percent(share: np.ndarray) -> str:
     return f"{words.number(100 * float(np.max(share, initial=0.0)), 2)} %"
 
 
-def _directions(result: DesignResult, found: InDesign) -> Table:
-    nominal, units = result.plant.rig.nominal, result.plant.rig.units
+def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str, str]) -> list[Piece]:
+    """The bounded directions with the parameters that they change most; nothing where none is bounded."""
     rows = []
     for direction, effect in zip(found.directions, found.found.effect, strict=True):
-        sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal[one[0]] or 1.0)))
-        shown = [f"{name} {100 * change / abs(nominal[name]):+.2g} %" if nominal[name] else
-                 f"{name} {change:+.2g} {words.unit(units[name])}" for name, change in sizes[:SHOWN]]
+        sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal.get(one[0]) or 1.0)))
+        shown = [f"{name} {100 * change / abs(nominal[name]):+.2g} %" if nominal.get(name) else
+                 f"{name} {change:+.2g} {words.unit(units.get(name, ''))}" for name, change in sizes[:SHOWN]]
         more = f" and {len(sizes) - SHOWN} parameters by less" if len(sizes) > SHOWN else ""
-        rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %",
-                     (", ".join(shown) + more).replace("-", "−")))
-    return table("Directions of the identified parameters: each is one real number between −1 and 1 that changes all "
-                 "of them together. The effect is the largest relative change of the response at 1.",
-                 ("direction", "effect", "change at +1"), rows, "lrl")
+        rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %", ", ".join(shown) + more))
+    return [table("Directions of correlated parameters: each is one real number between −1 and 1 that changes all of "
+                  f"them together; 1 corresponds to {words.number(found.found.box)} standard deviations. The effect is "
+                  "the largest relative change of the response at 1.",
+                  ("direction", "effect", "change at +1"), rows, "lrl")] if rows else []
 
 
-def _spread(found: InDesign) -> Figure:
-    weight, spread = found.weight, found.spread
-    f = np.geomspace(weight.grid[0], weight.grid[-1], 400) / (2 * np.pi)
+def spread(found: InDesign) -> Figure:
+    """The measured spread of the response, its bound, and the filter above it."""
+    s, weight = found.spread, found.weight
+    f = np.geomspace(min(JUDGED_HZ[0], s.frequency_Hz[0]), max(JUDGED_HZ[-1], s.frequency_Hz[-1]), 400)
     omega = 2 * np.pi * f
-    confidence = words.number(100 * found.confidence)
-    curves = [Curve(spread.frequency_Hz, 100 * spread.measured, "as measured", Style("#999999", "dot", 1.0)),
-              Curve(spread.frequency_Hz, 100 * spread.bound(found.confidence), f"bound at {confidence} %",
-                    numbered(0)),
-              Curve(f, 100 * weight.envelope(omega), "envelope", STYLES["limit"]),
-              Curve(f, 100 * weight.magnitude(omega), f"|W|, order {weight.shape.order}", STYLES["filter"])]
-    low = 10 ** np.floor(np.log10(100 * np.min(weight.data) / 3))
-    high = 10 ** np.ceil(np.log10(100 * np.max(weight.magnitude(omega))))
-    declared = (" Where the design file states a larger uncertainty of the drives, the envelope follows it."
-                if weight.declared else " Outside the measured band it keeps the value at the end of the band.")
-    assumed = f" {found.assumption}" if found.assumption else ""
-    return Figure("identified_spread", "Relative difference between the measured response and the identified model in "
-                  "the kept coordinates (largest singular value), its bound with the measurement's noise, the envelope "
-                  f"and the filter of lowest order within 1 dB above it: order {weight.shape.order}, at most "
-                  f"{weight.slack_dB:.2f} dB above.{declared}{assumed}",
-                  (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log",
-                                                                (float(low), float(high))), tuple(curves)),))
+    curves = (Curve(s.frequency_Hz, 100 * s.measured, "measured minus model, with noise", Style("#0072b2"),
+                    points=True, line=False),
+              Curve(s.frequency_Hz, 100 * (s.bound(found.confidence) - s.measured), "noise of the measurement",
+                    Style("#7a7a7a", "dot", 1.4)),
+              Curve(weight.omega / (2 * np.pi), 100 * weight.data, "bound to be covered",
+                    Style("#d55e00", "dash", 1.5)),
+              Curve(f, 100 * weight.envelope(omega), "envelope", Style("#e69f00", "dashdot", 1.3)),
+              Curve(f, 100 * weight.shape.magnitude(omega), f"filter of order {weight.shape.order}",
+                    Style("#222222", "solid", 2.0)))
+    return Figure("spread", "Relative difference between the measured response and the identified model in the kept "
+                  f"coordinates, largest singular value: {weight.meaning}. {found.assumption}".rstrip(),
+                  (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log"), curves),),
+                  height=1.1)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.block_diagram import block_diagram
 from avis_ctrl.report.families import EXTERNAL, Families
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, decibels, hertz, level, numbered
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, hertz, level, numbered
 from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.identified import identified
 from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
@@ -77,7 +78,7 @@ def _blocks(result: DesignResult) -> Table:
         elif one is not None:
             half = one.half_range(plant.rig.nominal[block.name])
             nominal, unit = plant.rig.nominal[block.name], words.unit(plant.rig.units[block.name])
-            spread = f"{nominal:.6g} ± {half:.4g} {unit}".replace("-", "−")
+            spread = f"{nominal:.6g} ± {half:.4g} {unit}"
             meaning = described.get(block.name, "parameter of the rig")
         else:
             spread = "see the weight" if chain is None else "|W| of the weight"
@@ -97,13 +98,13 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
     omega = mu.transmissibility.omega
     f = omega / (2 * np.pi)
     limit = result.plant.weights["transmissibility"].bound(omega)
-    curves = (Curve(f, asked_dB(result, omega), "required", STYLES["limit"]),
-              Curve(f, decibels(limit), "1/|W_T|, the filter", STYLES["filter"]),
-              Curve(f, decibels(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
+    curves = (Curve(f, asked_dB(result, omega), "target of the synthesis", STYLES["limit"]),
+              Curve(f, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
+              Curve(f, in_dB(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
               upper_bound(mu, "mu synthesis, upper bound over the set"))
-    return Figure("weight_transmissibility", "The required transmissibility bound, its realisation by a rational "
-                  "filter, and the transmissibility achieved. The loop meets the bound where its curves lie below that "
-                  "of the filter; the upper bound over the set was computed at the marked frequencies.",
+    return Figure("weight_transmissibility", "The target of the synthesis, its realisation by a rational "
+                  "filter, and the transmissibility achieved. The loop meets the target where its curves lie below "
+                  "that of the filter; the upper bound over the set was computed at the marked frequencies.",
                   (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),))
 
 
@@ -120,9 +121,9 @@ def _effort(result: DesignResult) -> Figure:
         closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
         curves.append(Curve(HZ, gain, f"mu synthesis, {words.axis(axis)}", numbered(k)))
-    return Figure("weight_effort", "Control effort: volts per m/s of floor velocity on the drive that saturates first "
-                  "when a force acts along the axis, compared with the limit of the weight; nominal plant.",
-                  (Panel(hertz(0.1, 500.0), Axis("V per m/s", "log"), tuple(curves)),))
+    return Figure("weight_effort", "Control effort: voltage of the drive that saturates first when a force acts along "
+                  "the axis, relative to floor velocity, compared with the limit of the weight; nominal plant.",
+                  (Panel(hertz(0.1, 500.0), Axis("drive voltage / floor velocity [V s/m]", "log"), tuple(curves)),))
 
 
 def _chains(plant: DesignPlant) -> list[Piece]:

@@ -6,8 +6,9 @@ import re
 
 import numpy as np
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, decibels, hertz, numbered
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, numbered
 from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.instruments import Sensor
@@ -39,7 +40,7 @@ def _parameters(one: Rig) -> list[Piece]:
         if match := _NUMBERED.fullmatch(name):
             rows = grouped.setdefault(match["group"], {})
             rows.setdefault(match["rest"], {})[int(match["number"])] = p
-        else:
+        elif not name.startswith("actuator."):  # the table of drives has the force constants
             plain.append((name, _value(p.value), words.unit(p.unit), p.description))
     found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
     for group, rows in grouped.items():
@@ -167,14 +168,14 @@ def _compared(result: DesignResult, n: int) -> Figure:
     curves = []
     for k, name in enumerate(error.keep):
         colour = numbered(k).colour
-        curves += [Curve(f, decibels(error.full[:, k, k]), f"{name}, six degrees of freedom",
+        curves += [Curve(f, in_dB(error.full[:, k, k]), f"{name}, six degrees of freedom",
                          Style(colour, "solid", 2.2)),
-                   Curve(f, decibels(error.reduced[:, k, k]), f"{name}, small model", Style("#111111", "dot", 1.6))]
+                   Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, small model", Style("#111111", "dot", 1.6))]
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
-    curves.append(Curve(f, decibels(largest), "from the floor's other axes", numbered(3)))
+    curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
     panel = Panel(hertz(), Axis("gain [dB]", "linear", (-80.0, 40.0)), tuple(curves),
                   title="transmissibility along each kept axis")
-    apart = [Curve(f, decibels(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
+    apart = [Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
              for k, name in enumerate(error.keep)]
     lower = Panel(hertz(), Axis("difference [dB]", "linear", (-140.0, 20.0)), tuple(apart),
                   title="difference, relative to the largest gain")

@@ -30,7 +30,7 @@ def synthesis(result: DesignResult) -> Section:
     values = Panel(marked, shown, (
         Curve(steps, gamma, "gamma of the scaled loop", numbered(1), points=True),
         Curve(steps, mu, "peak of the upper bound of mu", STYLES["mu"], points=True),
-        level(steps[0] - 0.5, steps[-1] + 0.5, 1.0, "1")))
+        level(steps[0] - 0.5, steps[-1] + 0.5, 1.0, "limit 1")))
     order = np.array([h.order for h in history], float)
     orders = Panel(marked, Axis("states", "linear", (0.0, 1.15 * float(order.max()))), (
         Curve(steps, order, "states of the controller", STYLES["plain"], points=True),
@@ -40,8 +40,9 @@ def synthesis(result: DesignResult) -> Section:
     caption = (f"Course of the mu synthesis: {len(history)} iterations in {words.number(total)} s. gamma is the norm "
                "of the scaled loop, an upper bound of mu with every block taken as complex.")
     return Section("D-K iteration", "synthesis", (
-        table("The iterations. \"fit\" is the increase of the bound caused by realising the scalings as rational "
-              "functions, compared with the best scalings at each frequency. The best controller of all iterations is "
-              "used.",
+        table("The iterations. Kind: \"H-infinity\", \"nominal\" (plant without uncertainty) and \"given\" are initial "
+              "controllers; \"D-K\" alternates synthesis and scalings; the others improve the best controller. Fit: "
+              "increase of the bound caused by realising the scalings as rational functions, compared with the best "
+              "scalings at each frequency. The best controller of all iterations is used.",
               ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"), rows, "rlrrrrrr"),
         Figure("dk_history", caption, (values, orders), 2)))

@@ -9,35 +9,29 @@ import numpy as np
 
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Fold, Paragraph, Piece, table
-
-_HEADER = ("parameter", "value", "± 1 σ", "unit", "moved by")
+from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 
 
 @dataclass(frozen=True)
 class Shown:
-    """How many rows are shown at once, and from how many tolerances on a value counts as far from the rig file."""
+    """How many rows are shown, and from how many tolerances on a value counts as far from the rig file."""
 
     rows: int = 10
     far: float = 3.0
 
 
 def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece]:
-    """Table of all values, the largest movement first; those after the first rows are folded."""
+    """How far the values moved: all together in a sentence, the largest movements in a table."""
+    if not found:
+        return []
     moved = np.array([one.moved for one in found])
     far = int(np.sum(np.abs(moved) > shown.far))
     rms = words.number(float(np.sqrt(np.mean(moved ** 2))), 2)
-    rows = [_row(one) for one in found]
-    first, rest = rows[:shown.rows], rows[shown.rows:]
-    pieces: list[Piece] = [
-        Paragraph(f"{len(rows)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
+    rows = [(one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2f}")
+            for one in found[:shown.rows]]
+    return [
+        Heading("Tolerances"),
+        Paragraph(f"{len(found)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
                   f"(r.m.s.), {far or 'none'} of them by more than {shown.far:g} tolerances."),
-        table("The values of the rig file that moved most, in units of their tolerance.", _HEADER, first, "lrrlr")]
-    if rest:
-        pieces.append(Fold(f"{len(rest)} more tolerances", (table("The other values.", _HEADER, rest, "lrrlr"),)))
-    return pieces
-
-
-def _row(one: Tolerance) -> tuple[str, ...]:
-    value, sigma = words.with_std(one.value, one.std)
-    return one.parameter, value, f"± {sigma}", words.unit(one.unit), f"{one.moved:+.1f}".replace("-", "−")
+        table(f"The {len(rows)} values of the rig file that moved most, in units of their tolerance. The JSON file of "
+              "results lists all.", ("parameter", "value", "± 1 σ", "unit", "moved by"), rows, "lrrlr")]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, decibels, hertz
+from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, hertz
 from avis_ctrl.report.pieces import Section, Table, table
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
@@ -30,7 +31,7 @@ def _against_skyhook(result: DesignResult) -> Table:
 
 
 def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
-    """The limit of the design, with its steps [dB]."""
+    """The target of the synthesis, with its steps [dB]."""
     limits = result.design.transmissibility
     f = omega / (2 * np.pi)
     inside = (f >= limits.band_Hz[0]) & (f <= limits.band_Hz[1])
@@ -45,18 +46,18 @@ def left_out(result: DesignResult) -> str:
 
 def _limit(result: DesignResult) -> Curve:
     omega = 2 * np.pi * np.geomspace(0.1, 200.0, 2000)
-    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "required bound", STYLES["limit"])
+    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "target of the synthesis", STYLES["limit"])
 
 
 def _sigma(c: ControllerResult) -> Curve:
-    return Curve(_hz(c), decibels(c.transmissibility.sigma), c.title, controller_style(c.name))
+    return Curve(_hz(c), in_dB(c.transmissibility.sigma), c.title, controller_style(c.name))
 
 
 def upper_bound(c: ControllerResult, label: str) -> Curve:
     """Worst-case transmissibility where its bound was computed, marked: between the points it may lie higher."""
     b = c.worst_peak
     order = np.argsort(b.frequencies)
-    return Curve(b.frequencies[order] / (2 * np.pi), decibels(b.upper_curve[order]), label, STYLES["plain"],
+    return Curve(b.frequencies[order] / (2 * np.pi), in_dB(b.upper_curve[order]), label, STYLES["plain"],
                  points=True)
 
 
@@ -98,7 +99,7 @@ def _uncertain(result: DesignResult) -> Figure:
         T = c.transmissibility
         style = controller_style(c.name)
         worst = upper_bound(c, "upper bound over the whole set")
-        band = Band(_hz(c), decibels(T.low), decibels(T.high), f"{c.title}: range over sampled plants", style)
+        band = Band(_hz(c), in_dB(T.low), in_dB(T.high), f"{c.title}: range over sampled plants", style)
         panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
     return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels), len(panels))
 
@@ -116,7 +117,7 @@ def _spread_words(result: DesignResult) -> str:
 def _by_axis(result: DesignResult) -> Figure:
     panels = []
     for k, axis in enumerate(result.plant.axes):
-        curves = [Curve(_hz(c), decibels(c.transmissibility.nominal[:, k, k]), c.title, controller_style(c.name))
+        curves = [Curve(_hz(c), in_dB(c.transmissibility.nominal[:, k, k]), c.title, controller_style(c.name))
                   for c in result.controllers if c.stable]
         panels.append(Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (),
                             words.axis(axis)))
@@ -128,8 +129,8 @@ def _by_axis(result: DesignResult) -> Figure:
 def _six_dof(result: DesignResult) -> Figure:
     check, mu = result.six_dof, result.controller("mu")
     f = check.omega / (2 * np.pi)
-    curves = [_sigma(mu), Curve(f, decibels(check.kept), "six degrees of freedom, sampled", STYLES["plain"]),
-              Curve(f, decibels(check.others), "from the floor's other coordinates", STYLES["limit"])]
+    curves = [_sigma(mu), Curve(f, in_dB(check.kept), "six degrees of freedom, sampled", STYLES["plain"]),
+              Curve(f, in_dB(check.others), "from the floor's other coordinates", STYLES["limit"])]
     caption = (f"Check of the design model: the sampled mu controller on all six degrees of freedom, with the skyhook "
                f"loops of the other axes. In the band the largest gain differs by at most {check.deviation_dB:.2g} dB "
                "from that of the design model. The third line shows how floor motion along the other coordinates "

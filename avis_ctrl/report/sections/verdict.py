@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 
 import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table
-from avis_ctrl.report.sections.bounds import certificate
+from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
-from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
+from avis_ctrl.study.design_result import ControllerResult, DesignResult
 from avis_ctrl.study.verdict import all_axes, first_sentence
 
 
@@ -22,7 +21,7 @@ def verdict(result: DesignResult) -> Section:
     met = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
                  "singular value from floor to payload, rotations as displacement of the edge.",
                  ("requirement", "verdict", "result", "limit"), rows, "lcrr")] if rows else []
-    return Section("Summary", "verdict", (_sentence(result), _asked(result), *met, certificate(result),
+    return Section("Summary", "verdict", (_sentence(result), _asked(result, bool(met)), *met, certificate(result),
                                           summary_figure(result)), alone=True)
 
 
@@ -31,20 +30,21 @@ def _sentence(result: DesignResult) -> Paragraph:
     if not result.stable:
         return Paragraph(first_sentence(result), "verdict", False)
     said = f"{first_sentence(result)} {_achieved(result)}"
-    return Paragraph(re.sub(r"(?<= )-(?=\d)", "−", said), "verdict", good)
+    return Paragraph(said, "verdict", good)
 
 
-def _asked(result: DesignResult) -> Paragraph:
-    """The task in two sentences."""
+def _asked(result: DesignResult, judged: bool) -> Paragraph:
+    """The task; judged : a table of requirements follows."""
     design, uncertain = result.design, result.design.uncertainty.parameters_percent
     low, high = design.transmissibility.band_Hz
     spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
     members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
     return Paragraph(
         f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
-        f"{result.rig.name}, stable and within the bounds for {members}: "
-        f"transmissibility at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and at most "
-        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies.".replace(" -", " −"))
+        f"{result.rig.name}, stable for {members}. Its target, the weight of the synthesis, is a transmissibility of "
+        f"at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and of at most "
+        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
+        + (" The result is judged by the requirements of the design file:" if judged else ""))
 
 
 def _achieved(result: DesignResult) -> str:
@@ -72,7 +72,7 @@ def comparison(result: DesignResult) -> Section:
         ("mu, lower bound", lambda c: words.bound(c.mu.lower, 4)),
         ("mu peaks at", lambda c: words.hertz(c.mu.omega)),
         ("stable, nominal", lambda c: Mark("yes", True) if c.stable else Mark("no", False)),
-        ("stable for the whole set", _robustly_stable),
+        ("stable for the whole set", stable_for_the_set),
         ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
         ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
         (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
@@ -102,13 +102,6 @@ def _remarks(result: DesignResult) -> list[Piece]:
     rows = [(r.name, r.note) for r in result.requirements if r.note]
     told: list[Piece] = [table("Notes to the requirements of the summary.", ("requirement", "note"), rows, "ll")]
     return [*(told if rows else []), *(Paragraph(note, "note") for note in result.notes)]
-
-
-def _robustly_stable(c: ControllerResult) -> Cell:
-    bound: Bound = c.stability
-    if not c.stable or bound.lower >= 1:
-        return Mark("no", False)
-    return Mark("yes", True) if bound.upper < 1 else Mark("not shown", False)
 
 
 def _settled(c: ControllerResult, text: str) -> str:
