@@ -278,6 +278,20 @@ def test_a_parameter_that_hardly_acts_in_a_half_may_move_there():
     assert [one.change for one in plain] == [one.change for one in same]
 
 
+def test_a_gain_moves_relative_to_its_departure():
+    """A gain of 1.00 in one half of the data and 1.07 in the other is no gain of 1.035."""
+    rng, std = np.random.default_rng(4), 1e-3
+    x = rng.standard_normal(400)
+    y = np.where(np.arange(400) < 200, 1.0, 1.07) * x + std * rng.standard_normal(400)
+    J = x[None] * 1e3 / std
+    P = np.linalg.inv(J @ J.T + np.eye(1))
+    z = P @ J @ (y - x) / std
+    wide = Priors(("gain",), np.ones(1), np.full(1, 1e3), np.zeros(1, bool))
+    found = SimpleNamespace(priors=wide, z=z, covariance=P, J=J, e=(y - x) / std - J.T @ z, rows={})
+    half, = halves(found, ("gain",), GapSettings(), [("first", np.arange(200))], {"gain": 1.0})
+    assert half.change == pytest.approx(1.0, abs=0.15)
+
+
 def test_standard_deviations_cover_what_octaves_differ_by():
     """One gain above 8 Hz, another below: known no better than these agree, and no worse."""
     good, bent = found_at()[0], found_at(bend=0.3)[0]
