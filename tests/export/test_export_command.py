@@ -24,7 +24,8 @@ from avis_ctrl.simulation.discrete import digital_controller
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
 CERTIFICATE_KEYS = {"format", "version", "controller_sha256", "mu_upper", "mu_lower", "guaranteed", "stable",
                     "worst_case_peak_transmissibility_dB", "worst_case_band_transmissibility_dB",
-                    "rounding_noise_m_per_s", "step_time_us", "between_samples", "at_rest", "files", "test_vectors"}
+                    "rounding_noise_m_per_s", "step_time_us", "between_samples", "at_rest", "anti_windup", "files",
+                    "test_vectors"}
 CONTROLLER_KEYS = {"format", "version", "name", "sample_rate_Hz", "arithmetic", "A", "B", "C", "D", "inputs", "outputs",
                    "input_units", "output_units", "limits_V", "delay_samples"}
 
