@@ -101,7 +101,7 @@ def _anti_windup(choice) -> str:
     with_it, without = (1e3 * one[-1, 0] for one in (choice.chosen, choice.without))
     after = f"after floor motion that demands {choice.levels[-1]:g} times the drives' range"
     if choice.corner_Hz is None:
-        return ("Anti-windup: none: each one tried slows the recovery at some level of the floor, or is no better; "
+        return ("No anti-windup: each law tried slows the recovery at some level of the floor, or is no better; "
                 f"{after} the payload moves with {without:.3g} mm/s r.m.s.")
     return (f"Anti-windup: lag of {choice.corner_Hz:g} Hz, gain {choice.gain:g}; {after} the payload moves with "
             f"{with_it:.3g} mm/s r.m.s., {without:.3g} mm/s without it.")

@@ -4,10 +4,10 @@ No anti-windup is best for every controller: what the limits cut off may be what
 law that reacts to it then prolongs the recovery. The circle criterion, by which these laws could guarantee an L2 gain,
 is not met even without anti-windup: at the upper crossover an eigenvalue of I - L has a phase beyond 90 degrees.
 So the choice is made by comparison: the floor moves as at the site, but so far that the linear loop would demand
-several times the drives' range, then it rests. A law is kept only if at no level of the floor the table recovers more
-slowly than without it; of those kept, the one with the smallest geometric mean of all figures is exported, and none if
-none is better. Random motion averages over the
-instants at which it may end; after a single sine the recovery depends on that instant more than on the law.
+several times the drives' range, then it rests. A law is kept only if the table recovers no more slowly than without it,
+at every level of the floor. Of those kept, the one with the smallest geometric mean of all figures is exported; if none
+is better than no anti-windup, there is none. Random motion averages over the instants at which it may end; after a
+single sine the recovery depends on that instant more than on the law.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import gmean
 
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.loop import floor_velocity, simulate
@@ -71,7 +72,8 @@ def choose_anti_windup(loop: SampledLoop, axes: tuple[str, ...],
                        settings: AntiWindupSettings = AntiWindupSettings()) -> Choice:
     """The anti-windup for the loop of the exported controller, judged by the velocity of `axes`.
 
-    Converter and noise are left out: beyond its range the code lets go of the table, and limits are not reached.
+    Converter and noise are left out: beyond the converter's range the code lets go of the table, and the drives do not
+    reach their limits.
     """
     sensors = replace(loop.sensors, converter=None, noise_rms_V=np.zeros(1), flicker_rms_V=np.zeros(1),
                       offset_V=np.zeros(1))
@@ -91,14 +93,9 @@ def choose_anti_windup(loop: SampledLoop, axes: tuple[str, ...],
                 if np.any(found[-1] > (1 + settings.alike) * without[k]):
                     break
             else:
-                if _mean(found) < min(_mean(best.chosen), (1 - settings.alike) * _mean(without)):
+                if gmean(found, None) < min(gmean(best.chosen, None), (1 - settings.alike) * gmean(without, None)):
                     best = Choice(law, corner, gain, settings.levels, without, np.array(found))
     return best
-
-
-def _mean(figures: Any) -> float:
-    """Geometric mean."""
-    return float(np.exp(np.mean(np.log(figures))))
 
 
 def _floors(loop: SampledLoop, settings: AntiWindupSettings) -> np.ndarray:

@@ -36,7 +36,7 @@ from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, outliers
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
-from avis_ctrl.gap.tolerances import moved, of_effect
+from avis_ctrl.gap.tolerances import moved, of_effect, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
@@ -297,10 +297,7 @@ def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remai
 
 def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
     """Every value of the rig file with a tolerance, the most moved first."""
-    rig = fitted.model.rig
-    known = re_identified(rig).names
-    names = [name for name in fitted.priors.names if "@" not in name and name not in known]
-    return moved(fitted, names, tolerances_of(rig), settings)
+    return moved(fitted, with_tolerance(fitted), tolerances_of(fitted.model.rig), settings)
 
 
 def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:

@@ -161,7 +161,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
         while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
-            progress(f"search for effect {len(steps) + 1}")
+            progress(f"search for effect {len(base.labels) + len(steps) + 1}")
             step = _step(now, data, effects, settings, each)
             if step is None:
                 return
@@ -194,16 +194,15 @@ def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSe
         return [], now
     progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
-    narrow: Fitted | None = _with_spread(now, rows, size, data, settings)
-    while narrow is not None and len(now.labels) + len(steps) < settings.longest:
-        step = _step(narrow, data, [one for one in effects if one.name in BEYOND], settings, each)
-        steps += [] if step is None else [step]
-        narrow = None if step is None else step.fitted
-    return steps, _with_spread(steps[-1].fitted, rows, 1 / size, data, settings) if steps else now
+    narrow, beyond = _with_spread(now, rows, size, data, settings), [one for one in effects if one.name in BEYOND]
+    while len(narrow.labels) < settings.longest and (step := _step(narrow, data, beyond, settings, each)) is not None:
+        steps.append(step)
+        narrow = step.fitted
+    return steps, _with_spread(narrow, rows, 1 / size, data, settings) if steps else now
 
 
 def _with_spread(fitted: Fitted, rows: Sequence[int], size: float, data: Data, settings: GapSettings) -> Fitted:
-    """The fit with some priors narrower by a factor."""
+    """The fit with the standard deviations of some priors times a factor."""
     priors = fitted.priors.scaled(rows, size)
     return fit(fitted.model, priors, priors.z(fitted.priors.values(fitted.z)), data, fitted.variances, settings)
 
@@ -268,8 +267,7 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     last = tried
     while last:
         last = _tried(begun, richer_laws(list(last.values()), data, settings), data, settings, each)
-        tried |= {label: one for label, one in last.items()
-                  if label not in tried or one.log_evidence > tried[label].log_evidence}
+        tried = _likelier([*tried.values(), *last.values()])
     best = max(tried, key=lambda label: tried[label].log_evidence)
     tried |= _tried(begun, other_laws(found, best, tried), data, settings, each)
     best = max(tried, key=lambda label: tried[label].log_evidence)
@@ -329,12 +327,17 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
              and (end is None or end.fall < settings.least_promised * one.fall))]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
+    return _likelier([one for one in further if not implausible(one)
+                      and not within_tolerance(one.model.effects[-1], stated, settings)])
+
+
+def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:
+    """Of fits by the label of their last effect, the one of the largest evidence; of equal ones the first."""
     found: dict[str, Fitted] = {}
-    for one in further:
-        label = one.labels[-1]
-        if not implausible(one) and not within_tolerance(one.model.effects[-1], stated, settings) and (
-                label not in found or one.log_evidence > found[label].log_evidence):
-            found[label] = one
+    for one in fits:
+        known = found.get(one.labels[-1])
+        if known is None or one.log_evidence > known.log_evidence:
+            found[one.labels[-1]] = one
     return found
 
 

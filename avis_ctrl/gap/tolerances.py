@@ -51,6 +51,12 @@ def released(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Pri
     return priors.scaled(tolerances_behind(effect, priors.names), 1 / settings.held)
 
 
+def with_tolerance(fitted: Fitted) -> list[str]:
+    """Names of the free values of the rig file that have a tolerance."""
+    theta = set(re_identified(fitted.model.rig).names)
+    return [name for name in fitted.priors.names if "@" not in name and name not in theta]
+
+
 def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
     """Indices of the values of the rig file that the data determine, and how far these have moved, in tolerances: root
     of the sum of z^2 over the sum of what the data take from their prior variance (D. MacKay, Neural Computation 4
@@ -59,9 +65,8 @@ def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
     A table may be built better than its tolerances say. A value of three tolerances is an outlier there.
     """
     own = {k for one in fitted.model.effects for k in tolerances_behind(one, fitted.priors.names)}
-    theta = set(re_identified(fitted.model.rig, settings).names)
     determined = 1 - np.diag(fitted.covariance)
-    rows = [k for k, name in enumerate(fitted.priors.names) if "@" not in name and name not in theta and k not in own
+    rows = [k for k in map(fitted.priors.names.index, with_tolerance(fitted)) if k not in own
             and determined[k] > settings.determined]
     if not rows:
         return [], 1.0

@@ -7,9 +7,10 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -197,26 +198,33 @@ def _descent(expand: Callable[[np.ndarray], _Expansion], at: _Expansion, iterati
     hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
     hardly corrects these, and descends in ever shorter ones.
     """
-    one = np.eye(len(at.z))
     for steps in range(iterations):
-        slope, damping = at.g - at.z, 0.0
-        step = np.linalg.solve(at.H + one, slope)
-        if step @ slope < settings.converged * len(at.now.e):
+        slope = at.g - at.z
+        trials = _damped_steps(at.H, slope, settings)
+        first = next(trials)
+        if first @ slope < settings.converged * len(at.now.e):
             return at, steps
-        most = np.linalg.norm(at.H + one, 2) / settings.shortest_step
-        while damping < most:
+        for step in chain([first], trials):
             try:
                 after = expand(at.z + step)
                 if after.whole < at.whole:
                     break
             except InputError:
                 pass  # no rig has these values: a shorter step
-            damping = max(settings.damping * damping, 1.0)
-            step = np.linalg.solve(at.H + (1 + damping) * one, slope)
         else:
             return at, steps
         at = after
     return at, iterations
+
+
+def _damped_steps(H: np.ndarray, slope: np.ndarray, settings: FitSettings) -> Iterator[np.ndarray]:
+    """The Gauss-Newton step with the priors, then ever more damped ones."""
+    one = np.eye(len(H))
+    yield np.linalg.solve(H + one, slope)
+    damping, most = 1.0, np.linalg.norm(H + one, 2) / settings.shortest_step
+    while damping < most:
+        yield np.linalg.solve(H + (1 + damping) * one, slope)
+        damping *= settings.damping
 
 
 def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
@@ -246,7 +254,7 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     H = at.H + np.eye(len(at.z))
     log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
-    # Symmetric and positive definite, which rounding makes of `inv` neither where parameters are hardly determined.
+    # By eigenvalues, because rounding leaves `inv` neither symmetric nor positive definite where the data say little.
     size, vectors = np.linalg.eigh(H)
     root = vectors / np.sqrt(np.maximum(size, 1.0))  # the priors' 1 is the least there can be
     return Fitted(at.model, priors, at.z, root @ root.T, variances, float(log_evidence), by_group, steps,

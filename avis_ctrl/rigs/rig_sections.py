@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
@@ -17,10 +18,20 @@ LIMIT = 1e12
 Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
 Positive = Annotated[float, Field(gt=0, le=LIMIT)]
 NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
-# No table is larger: far points leave no digits for the inertia beside m r^2.
-FARTHEST_M = 100.0
-Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
-PositiveLength = Annotated[float, Field(gt=0, le=100.0)]
+
+
+@dataclass(frozen=True)
+class RigLimits:
+    """farthest_m : of a point from the origin, along each axis [m]: no table is larger, and far points leave no digits
+    for the inertia beside m r^2.
+    """
+
+    farthest_m: float = 100.0
+
+
+LIMITS = RigLimits()
+Length = Annotated[float, Field(ge=-LIMITS.farthest_m, le=LIMITS.farthest_m)]
+PositiveLength = Annotated[float, Field(gt=0, le=LIMITS.farthest_m)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
 PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]

@@ -15,7 +15,7 @@ from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
-from avis_ctrl.rigs.rig_sections import FARTHEST_M
+from avis_ctrl.rigs.rig_sections import LIMITS
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.identification_design import default_design, design_toml
 
@@ -61,8 +61,8 @@ def rig_text(new: NewRig) -> str:
     for field in ("mass_kg", "vertical_Hz", "horizontal_Hz", "damping", "constant_N_per_V", "limit_V",
                   "sample_rate_Hz"):
         require_positive(getattr(new, field), field)
-    if len(new.size_m) != 3 or not all(0 < side <= FARTHEST_M for side in new.size_m):
-        raise InputError(f"expected three positive lengths in metres, at most {FARTHEST_M:g}", field="size_m",
+    if len(new.size_m) != 3 or not all(0 < side <= LIMITS.farthest_m for side in new.size_m):
+        raise InputError(f"expected three positive lengths in metres, at most {LIMITS.farthest_m:g}", field="size_m",
                          value=new.size_m)
     if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):
         raise InputError("expected a name without quotes", field="name", value=new.name)

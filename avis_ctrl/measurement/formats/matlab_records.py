@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,17 @@ from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, 
 from avis_ctrl.measurement.formats.stored import Columns
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
-MUCH_LONGER = 10  # a record has at least that many times more samples than channels, where names do not say
+
+@dataclass(frozen=True)
+class MatlabSettings:
+    """much_longer : how many times more samples than channels a record has at least, where no names tell them apart
+    [1]: an array nearer to a square can be read either way.
+    """
+
+    much_longer: float = 10.0
+
+
+SETTINGS = MatlabSettings()
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output"), "t": ("t", "time"), "floor": ("floor",),
          "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"), "u_names": ("u_names",), "y_names": ("y_names",)}
 PERIODS = ("Ts", "dt")
@@ -246,7 +256,7 @@ def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[st
         raise InputError(f"expected equally many samples; {shown}{also}")
     samples = max(possible)
     square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
-    if square or (len(possible) > 1 and samples < MUCH_LONGER * min(possible)):
+    if square or (len(possible) > 1 and samples < SETTINGS.much_longer * min(possible)):
         raise InputError(f"rows and columns could both be the samples: {shown}; expected names of the channels or a "
                          "time vector that distinguishes them")
     return samples

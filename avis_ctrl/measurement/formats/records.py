@@ -15,10 +15,21 @@ from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
 ROLES = ("t", "u", "y", "floor", "sample_rate_Hz", "u_names", "y_names")
 UNNAMED = "unnamed"  # rig of a campaign whose file does not say
-SAME_RATE = 1e-6  # relative difference below which two records' time stamps mean one clock
 PIECE = 1 << 18  # samples of u on disk that are looked at together
 
 Mapped = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """same_rate : relative difference of two sample rates below which they are one clock's [1]: time stamps are rounded
+    by less, and the quartz clocks of two instruments differ by more.
+    """
+
+    same_rate: float = 1e-6
+
+
+SETTINGS = RecordSettings()
 
 
 @dataclass(frozen=True)
@@ -205,7 +216,7 @@ def one_clock(records: Sequence[RecordSource]) -> tuple[tuple[RecordSource, ...]
     first, notes, result = records[0].header.sample_rate_Hz, [], []
     for record in records:
         rate = record.header.sample_rate_Hz
-        if rate != first and abs(rate - first) <= SAME_RATE * first:
+        if rate != first and abs(rate - first) <= SETTINGS.same_rate * first:
             notes.append(f"record {record.header.name}: sample rate {rate:.9g} Hz taken as {first:.9g} Hz")
             record = with_header(record, sample_rate_Hz=first)
         result.append(record)

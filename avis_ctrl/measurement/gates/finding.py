@@ -15,14 +15,23 @@ SEVERITIES: tuple[str, ...] = ("ok", "note", "warning", "stop")
 Response = Callable[[np.ndarray, tuple[str, ...]], np.ndarray]
 # Chance that a gate raises an alarm on clean data of one campaign, over all its channels and records.
 FALSE_ALARM = 0.01
-MOST_POINTS = 2000  # of a line in a plot
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """most_points : of a line in a plot: a panel is no more than some hundred pixels wide, each with two points."""
+
+    most_points: int = 2000
+
+
+SETTINGS = PictureSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
     """A curve of a picture: x and y of equal length; style "line", "points" or "bars".
 
-    Of a longer line the smallest and the largest point of each of `MOST_POINTS` / 2 bins are kept.
+    Of a longer line the smallest and the largest point of each of `most_points` / 2 bins are kept.
     """
 
     name: str
@@ -31,9 +40,9 @@ class Series:
     style: str = "line"
 
     def __post_init__(self) -> None:
-        if self.style == "line" and len(self.x) > MOST_POINTS:
+        if self.style == "line" and len(self.x) > SETTINGS.most_points:
             x, y = np.asarray(self.x), np.asarray(self.y)
-            bins = np.array_split(np.arange(len(x)), MOST_POINTS // 2)
+            bins = np.array_split(np.arange(len(x)), SETTINGS.most_points // 2)
             keep = np.unique([k for part in bins for k in (part[np.argmin(y[part])], part[np.argmax(y[part])])])
             object.__setattr__(self, "x", x[keep])
             object.__setattr__(self, "y", y[keep])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,15 @@ from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
 from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
 
+
+@dataclass(frozen=True)
+class DependenceSettings:
+    """least_drawn : fraction of the power below which nothing is drawn [1]: -90 dB."""
+
+    least_drawn: float = 1e-9
+
+
+SETTINGS = DependenceSettings()
 LOOKS = {"model": ("model, linear in measured inputs", Style("#222222", "solid", 1.4)),
          "missing": ("linear, missing from the model", Style("#d55e00", "dash", 1.8)),
          "nonlinear": ("not linear (amplitude, time)", Style("#009e73", "solid", 1.8)),
@@ -20,8 +30,6 @@ LOOKS = {"model": ("model, linear in measured inputs", Style("#222222", "solid",
          "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6))}
 COLUMNS = {"model": "model", "missing": "linear, not in the model", "nonlinear": "not linear",
            "unmeasured": "unmeasured inputs", "sensors": "sensors' noise"}
-# Fractions below this are not drawn.
-LEAST = 1e-9
 HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; the part of the "
                  "excited lines that exceeds this and any linear response is not linear.",
        "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
@@ -107,7 +115,7 @@ def figure(one: PowerShares, name: str) -> Figure:
     """A panel for each output, fractions on a logarithmic axis."""
     edges = np.asarray(one.bands_Hz, float)
     positive = np.concatenate([np.ravel(v) for v in one.shares.values()])
-    positive = positive[np.isfinite(positive) & (positive > LEAST)]
+    positive = positive[np.isfinite(positive) & (positive > SETTINGS.least_drawn)]
     low = float(10 ** np.floor(np.log10(positive.min(initial=0.1))))
     panels = []
     for k, output in enumerate(one.outputs):
@@ -122,7 +130,7 @@ def figure(one: PowerShares, name: str) -> Figure:
 
 
 def _drawn(share: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(share) & (share > LEAST), share, np.nan)
+    return np.where(np.isfinite(share) & (share > SETTINGS.least_drawn), share, np.nan)
 
 
 def _whole(one: PowerShares) -> Table:

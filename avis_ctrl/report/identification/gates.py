@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,10 +13,20 @@ from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section,
 
 MARKS: dict[str, Cell] = {"ok": Mark("ok", True), "note": "note", "warning": Mark("WARNING", False),
                           "stop": Mark("STOP", False)}
-TOGETHER = 6
-# Letters that fit beside each other under a panel of half the width.
-LETTERS = 36
 LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
+
+
+@dataclass(frozen=True)
+class GateFigureSettings:
+    """together : panels of a figure: three rows of two fill a page. letters : that fit beside each other under a panel
+    of half the width, in the legend's size.
+    """
+
+    together: int = 6
+    letters: int = 36
+
+
+SETTINGS = GateFigureSettings()
 
 
 def gates(findings: Sequence[Finding]) -> Section:
@@ -71,7 +81,7 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
     # Those with a curve for each channel share a legend; among others it would name what they do not have.
     many = [p for p in pictures if len(p.series) > 2]
     few = [p for p in pictures if len(p.series) <= 2]
-    groups = [of[k:k + TOGETHER] for of in (many, few) for k in range(0, len(of), TOGETHER)]
+    groups = [of[k:k + SETTINGS.together] for of in (many, few) for k in range(0, len(of), SETTINGS.together)]
     return [figure_of(f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group,
                       2, 0.75) for k, group in enumerate(groups)]
 
@@ -82,11 +92,11 @@ def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int
     names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
     limits = list(dict.fromkeys(one.name for p in pictures for one in p.limits))
     columns = min(columns, len(pictures))
-    return Figure(name, caption, tuple(panel_of(p, names, limits, LETTERS * 2 // columns) for p in pictures), columns,
-                  height)
+    letters = SETTINGS.letters * 2 // columns
+    return Figure(name, caption, tuple(panel_of(p, names, limits, letters) for p in pictures), columns, height)
 
 
-def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int = LETTERS) -> Panel:
+def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int = SETTINGS.letters) -> Panel:
     """A picture; names, limits : in the order of their styles; letters : that fit beside each other under it."""
     curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
     if len(picture.series) == 1:  # title and axis say what it is

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from avis_ctrl.report import words
@@ -12,8 +13,15 @@ from avis_ctrl.study.design_result import DesignResult
 NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs_sha256": "SHA-256 of the inputs",
          "measurement_sha256": "SHA-256 of the measurement", "seconds": "seconds of computing", "python": "Python"}
 
-# Values that a row has room for.
-MOST = 12
+
+@dataclass(frozen=True)
+class ProvenanceSettings:
+    """most_values : that a row of the table has room for; longer ones are in the JSON file."""
+
+    most_values: int = 12
+
+
+SETTINGS = ProvenanceSettings()
 
 
 def provenance(result: DesignResult) -> Section:
@@ -30,7 +38,7 @@ def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
 
 
 def _said(value: Any) -> str:
-    if isinstance(value, Mapping) and len(value) > MOST:
+    if isinstance(value, Mapping) and len(value) > SETTINGS.most_values:
         return "listed in the JSON file of results"
     if isinstance(value, Mapping):
         return "; ".join(f"{key} ({_said(one)})" if isinstance(one, Mapping) else f"{key} {_said(one)}"
