@@ -11,7 +11,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.export.certificate import Progress
 from avis_ctrl.export.design_folder import Added, DesignFolder
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.robust.fixed_order import Task, fixed_order
+from avis_ctrl.robust.fixed_order import fixed_order
+from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.design_file import Design

@@ -10,31 +10,8 @@ the barrier sum_k c_k p_k - log det F - sum_k c_k log p_k and its derivatives ar
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
-
-
-class PathSettings(NamedTuple):
-    """central : Newton decrement below which a point counts as the analytic centre.
-    near : Newton decrement below which a full step is taken, for it converges quadratically there.
-    reach : fraction of the way to the boundary that lambda falls in one step: the nearer to 1, the fewer steps, but the
-        more Newton steps each.
-    first, shrink : first trial of that way, in units of the least that it can be, and the factor to the next trial.
-    newton, steps : most Newton steps to a centre, and most centres; both are never needed.
-    """
-
-    central: float = 0.3
-    near: float = 0.4
-    reach: float = 0.9
-    first: float = 3.0
-    shrink: float = 0.7
-    newton: int = 40
-    steps: int = 60
-
-
-SETTINGS = PathSettings()
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""The compiled inner loop of `mu_lmi`: damped Newton steps to the analytic centre, one problem after the other.
+"""The compiled path of `mu_lmi`: damped Newton steps to each analytic centre, one problem after the other.
 
 For V = [I  M^H], K(theta) = sum_k theta_k K_k given by its entries, F = V K V^H and T = V^H inv(F) V
 
@@ -15,7 +15,26 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-NEAR = 0.4
+
+class PathSettings(NamedTuple):
+    """central : Newton decrement below which a point counts as the analytic centre.
+    near : Newton decrement below which a full step is taken, for it converges quadratically there.
+    reach : fraction of the way to the boundary that lambda falls in one step: the nearer to 1, the fewer steps, but the
+        more Newton steps each.
+    first, shrink : first trial of that way, in units of the least that it can be, and the factor to the next trial.
+    newton, steps : most Newton steps to a centre, and most centres; both are never needed.
+    """
+
+    central: float = 0.3
+    near: float = 0.4
+    reach: float = 0.9
+    first: float = 3.0
+    shrink: float = 0.7
+    newton: int = 40
+    steps: int = 60
+
+
+SETTINGS = PathSettings()
 
 
 class Entries(NamedTuple):
@@ -77,23 +96,11 @@ def _inverse(A):
 @njit(cache=True)
 def _residual(M, K):
     """F = V K V^H for M (n_z, n_w), as (K_ww + K_wz M) + M^H (K_zw + K_zz M)."""
-    n_z, n_w = M.shape
-    KV = np.zeros((n_w + n_z, n_w), np.complex128)
-    for i in range(n_w + n_z):
-        for j in range(n_w):
-            KV[i, j] = K[i, j]
-        for k in range(n_z):
-            if K[i, n_w + k] != 0:
-                for j in range(n_w):
-                    KV[i, j] += K[i, n_w + k] * M[k, j]
-    F = np.zeros((n_w, n_w), np.complex128)
-    for i in range(n_w):
-        for j in range(n_w):
-            F[i, j] += KV[i, j]
-        for k in range(n_z):
-            m = np.conj(M[k, i])
-            for j in range(n_w):
-                F[i, j] += m * KV[n_w + k, j]
+    n_w = M.shape[1]
+    lower = np.dot(K[n_w:, n_w:].copy(), M) + K[n_w:, :n_w]
+    F = np.dot(np.conj(M.T).copy(), lower) + K[:n_w, :n_w]
+    if np.any(K[:n_w, n_w:]):
+        F += np.dot(K[:n_w, n_w:].copy(), M)
     return F
 
 
@@ -118,23 +125,10 @@ def _add_derivatives(T, entries, lam, gradient, hessian):
 def _gram(M, S):
     """T = V^H inv(F) V = [S, S M^H; M S, M S M^H] for S = inv(F)."""
     n_z, n_w = M.shape
-    T = np.zeros((n_w + n_z, n_w + n_z), np.complex128)
-    for i in range(n_w):
-        for j in range(n_w):
-            T[i, j] = S[i, j]
-    for i in range(n_z):
-        for k in range(n_w):
-            m = M[i, k]
-            for j in range(n_w):
-                T[n_w + i, j] += m * S[k, j]
-        for j in range(n_w):
-            T[j, n_w + i] = np.conj(T[n_w + i, j])
-        for l in range(i + 1):
-            total = 0j
-            for k in range(n_w):
-                total += T[n_w + i, k] * np.conj(M[l, k])
-            T[n_w + i, n_w + l] = total
-            T[n_w + l, n_w + i] = np.conj(total)
+    T = np.empty((n_w + n_z, n_w + n_z), np.complex128)
+    MS = np.dot(M, S)
+    T[:n_w, :n_w], T[n_w:, :n_w], T[:n_w, n_w:] = S, MS, np.conj(MS.T)
+    T[n_w:, n_w:] = np.dot(MS, np.conj(M.T).copy())
     return T
 
 
@@ -213,44 +207,116 @@ def _newton(hessian, right, is_g):
 
 
 @njit(cache=True)
-def centres(M, theta, lam, form, core, trace, is_g, accuracy, steps):
-    """Analytic centres theta (B, p) at fixed lam (B,) and the directions d theta / d lambda (B, p) of their path.
+def _to_centre(M, x, lam, form, core, trace, is_g, settings):
+    """Moves x (p,) to the analytic centre at lam and returns d x / d lambda, the direction of the path of centres.
 
-    Of trace theta - log det F - log det X, F of every matrix of M (B, n_shared, n_z, n_w) complex; theta (B, p) to
-    start from; form and core are Entries of F and X. NaN where it failed.
+    Of trace x - log det F - log det X, F of every matrix of M (n_shared, n_z, n_w). NaN where it failed.
     """
     n_p = trace.size
-    found, direction = np.empty((theta.shape[0], n_p)), np.empty((theta.shape[0], n_p))
-    gradient, slope, hessian, x = np.empty(n_p), np.empty(n_p), np.empty((n_p, n_p)), np.empty(n_p)
-    rate = np.empty(form.row.size, np.complex128)
+    gradient, slope, hessian = np.empty(n_p), np.zeros(n_p), np.empty((n_p, n_p))
+    T = np.empty((M.shape[0], form.size, form.size), np.complex128)
+    for count in range(settings.newton + 1):
+        hessian[:] = 0.0
+        gradient[:] = trace
+        K = _matrix(x, form, lam)
+        for s in range(M.shape[0]):
+            T[s] = _gram(M[s], _inverse(_residual(M[s], K)))
+            _add_derivatives(T[s], form, lam, gradient, hessian)
+        _add_derivatives(_inverse(_matrix(x, core, 1.0)), core, 1.0, gradient, hessian)
+        step = _newton(hessian, gradient, is_g)
+        decrement = np.sqrt(max(-np.dot(step, gradient), 0.0))
+        # Not a number is not far either: `_inside` sorts such problems out.
+        if not decrement >= settings.central or count == settings.newton:
+            break
+        x += step * (1.0 if decrement < settings.near else 1.0 / (1.0 + decrement))
+    rate = x[form.parameter] * form.value
+    for s in range(M.shape[0]):
+        _add_slope(T[s], rate, form, lam, slope)
+    return _newton(hessian, slope, is_g)
+
+
+@njit(cache=True)
+def _positive(A):
+    """Whether a Hermitian matrix is positive definite, with a margin of round-off; its lower triangle is lost."""
+    n = A.shape[0]
+    least = 0.0
+    for i in range(n):
+        least = max(least, 1e-14 * A[i, i].real)
+    for j in range(n):
+        total = A[j, j].real
+        for k in range(j):
+            total -= A[j, k].real ** 2 + A[j, k].imag ** 2
+        if not total > least:
+            return False
+        root = np.sqrt(total)
+        A[j, j] = root
+        for i in range(j + 1, n):
+            value = A[i, j]
+            for k in range(j):
+                value -= A[i, k] * np.conj(A[j, k])
+            A[i, j] = value / root
+    return True
+
+
+@njit(cache=True)
+def _inside(M, x, lam, form, core):
+    """Whether F > 0 and X > 0."""
+    if not np.all(np.isfinite(x)) or not np.isfinite(_inverse(_matrix(x, core, 1.0))[0, 0].real):
+        return False
+    K, sound = _matrix(x, form, lam), True
+    for s in range(M.shape[0]):
+        sound = sound and _positive(_residual(M[s], K))
+    return sound
+
+
+@njit(cache=True)
+def _speed(M, x, lam, direction, form, core):
+    """Frobenius norm of d (F, X) / d lambda along the path, in the metric of F and X: at least the largest eigenvalue,
+    whose inverse is the way to the boundary."""
+    K, moved = _matrix(x, form, lam), _matrix(direction, form, lam)
+    for e in range(form.row.size):
+        if form.on_level[e]:
+            moved[form.row[e], form.col[e]] += x[form.parameter[e]] * form.value[e]
+    Y = np.dot(_inverse(_matrix(x, core, 1.0)), _matrix(direction, core, 1.0))
+    total = np.sum((Y * Y.T).real)
+    for s in range(M.shape[0]):
+        Y = np.dot(_inverse(_residual(M[s], K)), _residual(M[s], moved))
+        total += np.sum((Y * Y.T).real)
+    return np.sqrt(max(total, 0.0))
+
+
+@njit(cache=True)
+def follow_path(M, theta, lam, floor, form, core, trace, is_g, tolerance, settings):
+    """Scalings theta (B, p) and levels lam (B,), moved in place along the path of centres down to the least level or to
+    `floor` (B,); feasible with each other.
+
+    M (B, n_shared, n_z, n_w) complex; form and core are Entries of F and X. Ends where the way to the boundary is below
+    `tolerance` lambda; where a positive floor is reached, at its centre.
+    """
     for b in range(M.shape[0]):
-        for k in range(n_p):
-            x[k] = theta[b, k]
-        for count in range(steps + 1):
-            for k in range(n_p):
-                gradient[k], slope[k] = trace[k], 0.0
-                for l in range(n_p):
-                    hessian[k, l] = 0.0
-            for e in range(form.row.size):
-                rate[e] = x[form.parameter[e]] * form.value[e]
-            K = _matrix(x, form, lam[b])
-            for s in range(M.shape[1]):
-                T = _gram(M[b, s], _inverse(_residual(M[b, s], K)))
-                _add_derivatives(T, form, lam[b], gradient, hessian)
-                _add_slope(T, rate, form, lam[b], slope)
-            _add_derivatives(_inverse(_matrix(x, core, 1.0)), core, 1.0, gradient, hessian)
-            step = _newton(hessian, gradient, is_g)
-            decrement = 0.0
-            for k in range(n_p):
-                decrement -= step[k] * gradient[k]
-            decrement = np.sqrt(max(decrement, 0.0))
-            # Not a number is not far either: the caller sorts such problems out.
-            if not decrement >= accuracy or count == steps:
+        x = theta[b].copy()
+        for _ in range(settings.steps):
+            at = lam[b]
+            direction = _to_centre(M[b], x, at, form, core, trace, is_g, settings)
+            if not np.all(np.isfinite(direction)) or not _inside(M[b], x, at, form, core):
+                # Round-off ended the path here; the last verified point stands.
                 break
-            length = 1.0 if decrement < NEAR else 1.0 / (1.0 + decrement)
-            for k in range(n_p):
-                x[k] += length * step[k]
-        towards = _newton(hessian, slope, is_g)
-        for k in range(n_p):
-            found[b, k], direction[b, k] = x[k], towards[k]
-    return found, direction
+            theta[b] = x
+            if floor[b] > 0 and at <= floor[b]:
+                break
+            whole = at - max(floor[b], 0.0)
+            fall = min(whole, settings.first / max(_speed(M[b], x, at, direction, form, core), 1e-300))
+            for _ in range(40):
+                if _inside(M[b], x - fall * direction, at - fall, form, core):
+                    break
+                fall *= settings.shrink
+            else:
+                break
+            last = fall <= tolerance * at
+            if fall < whole:
+                fall *= settings.reach
+            x -= fall * direction
+            lam[b] = at - fall
+            theta[b] = x
+            if last:
+                break

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.robust.mu_kernel import Entries, centres
+from avis_ctrl.robust.mu_kernel import SETTINGS, Entries, follow_path
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Array = np.ndarray
@@ -167,74 +167,15 @@ def least_level(M: Array, scalings: Scalings, level: Array) -> Array:
     return np.where(feasible, lam, np.inf) if r.size else lam
 
 
-def _inside(space: ScalingSpace, M: Array, theta: Array, lam: Array) -> Array:
-    """Whether F > 0 and X > 0, for each problem."""
-    F = np.linalg.eigvalsh(residual(M, space.scalings(theta), lam, space.level))
-    X = np.linalg.eigvalsh(space.core.matrix(theta))
-    return np.all(F[..., 0] > 1e-14 * np.abs(F[..., -1]), axis=1) & (X[:, 0] > 0)
-
-
-def _step_to_boundary(space: ScalingSpace, M: Array, theta: Array, lam: Array, direction: Array) -> Array:
-    """How far lambda may fall along d theta / d lambda until F or X turns singular (linearised)."""
-    scalings, moved = space.scalings(theta), space.scalings(direction)
-    F = residual(M, scalings, lam, space.level)
-    dF = residual(M, moved, lam, space.level) + (scalings.X_w * space.level)[:, None]
-    X, dX = space.core.matrix(theta), space.core.matrix(direction)
-
-    def fastest(P: Array, dP: Array) -> Array:
-        L = np.linalg.inv(np.linalg.cholesky(P))
-        Q = L @ dP @ dagger(L)
-        return np.linalg.eigvalsh((Q + dagger(Q)) / 2)[..., -1]
-    rate = np.maximum(np.max(fastest(F, dF), axis=1), fastest(X, dX))
-    return 1.0 / np.maximum(rate, 1e-300)
-
-
-def _centre(space: ScalingSpace, M: Array, theta: Array, lam: Array, accuracy: float = 0.3,
-            steps: int = 40) -> tuple[Array, Array]:
-    """Analytic centres at fixed lambda and the directions in which they move with lambda."""
-    return centres(np.ascontiguousarray(M, complex), theta, lam, space.form.entries(space.is_level),
-                   space.core.entries(np.zeros(space.core.row.size, bool)), space.trace, space.is_g, accuracy, steps)
-
-
-def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5,
-           iterations: int = 60) -> tuple[Array, Array]:
+def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5
+           ) -> tuple[Array, Array]:
     """Follow the analytic centres from a feasible (theta, lam) down to the least lambda, or to `goal`.
 
     M (B, n_shared, n_z, n_w). Returns theta (B, p) and lambda (B,), feasible with each other. Problems whose
     lambda reaches a positive `goal` stop there, at its centre.
     """
     theta, lam = theta.copy(), lam.copy()
-    floor = np.broadcast_to(goal, lam.shape)
-    active = np.arange(M.shape[0])
-    for _ in range(iterations):
-        Ma, la, end = M[active], lam[active], floor[active]
-        th, direction = _centre(space, Ma, theta[active], la)
-        sound = np.all(np.isfinite(th), axis=1) & np.all(np.isfinite(direction), axis=1)
-        sound[sound] &= _inside(space, Ma[sound], th[sound], la[sound])
-        if not np.all(sound):
-            # Round-off ended the path here; the last verified point stands.
-            active, Ma, la, end, th, direction = (active[sound], Ma[sound], la[sound], end[sound], th[sound],
-                                                  direction[sound])
-            if not active.size:
-                break
-        theta[active] = th
-        reach = _step_to_boundary(space, Ma, th, la, direction)
-        fall = np.minimum(0.9 * reach, la - end)
-        for _ in range(30):
-            ok = _inside(space, Ma, th - fall[:, None] * direction, la - fall)
-            if np.all(ok):
-                break
-            fall = np.where(ok, fall, 0.6 * fall)
-        fall = np.where(ok, fall, 0.0)
-        theta[active], lam[active] = th - fall[:, None] * direction, la - fall
-        done = (reach <= tolerance * np.maximum(la, end)) | (lam[active] <= end) | (fall == 0.0)
-        active = active[~done]
-        if not active.size:
-            break
-    held = np.flatnonzero((floor > 0) & (lam <= floor))
-    if held.size:
-        centred, _ = _centre(space, M[held], theta[held], lam[held])
-        good = np.all(np.isfinite(centred), axis=1)
-        good[good] &= _inside(space, M[held[good]], centred[good], lam[held[good]])
-        theta[held[good]] = centred[good]
+    floor = np.broadcast_to(np.asarray(goal, float), lam.shape).copy()
+    follow_path(np.ascontiguousarray(M, complex), theta, lam, floor, space.form.entries(space.is_level),
+                space.core.entries(np.zeros(space.core.row.size, bool)), space.trace, space.is_g, tolerance, SETTINGS)
     return theta, lam

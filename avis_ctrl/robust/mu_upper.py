@@ -11,14 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.robust.mu_diagonal_kernel import SETTINGS as PATH
 from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal
+from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
 from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follow, least_level, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 BATCH_BYTES = 64e6
 # Of many blocks, the matrices whose bound with one number a block is above this share of the largest get the full one.
 WORTH = 0.97
+# A start from scalings that prove a level begins at this multiple of the level's square, with room around them.
+ROOM = 1.1
 
 
 class UpperBound(NamedTuple):
@@ -66,19 +68,21 @@ def rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scaling
                     size[:, None, None] * d_w[:, :, None] * scalings.G * d_z[:, None, :])
 
 
-def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5,
-                goal: Array | float = 0.0) -> UpperBound:
+def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, goal: Array | float = 0.0,
+                start: UpperBound | None = None) -> UpperBound:
     """Least beta with scalings that prove mu <= beta, for M (B, n_shared, n_z, n_w).
 
     Matrices along axis 1 share scalings. With `goal` > 0 the search stops where beta <= goal, at the analytic
-    centre of the scalings that prove it: the ones with most room around them.
+    centre of the scalings that prove it: the ones with most room around them. start : a bound to begin from, whose
+    scalings fit `structure`, such as that of the simplified blocks.
     """
     goals = np.broadcast_to(goal, M.shape[:1])
     if _is_diagonal(structure):
         return _upper_chunk(M, structure, tolerance, goals)
     n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
-    return UpperBound.joined([_upper_chunk(M[k:k + n_chunk], structure, tolerance, goals[k:k + n_chunk])
-                              for k in range(0, M.shape[0], n_chunk)])
+    parts = [np.arange(k, min(k + n_chunk, M.shape[0])) for k in range(0, M.shape[0], n_chunk)]
+    return UpperBound.joined([_upper_chunk(M[part], structure, tolerance, goals[part],
+                                           None if start is None else start.at(part)) for part in parts])
 
 
 def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
@@ -87,7 +91,7 @@ def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -
         return upper_bound(M, structure, tolerance, goal)
     found = upper_bound(M, structure.simplified(), tolerance, goal)
     if (left := np.flatnonzero(found.beta >= goal)).size:
-        _replace(found, left, upper_bound(M[left], structure, tolerance, goal))
+        _replace(found, left, upper_bound(M[left], structure, tolerance, goal, found.at(left)))
     return found
 
 
@@ -98,7 +102,7 @@ def highest(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound
     found, full = upper_bound(M, structure.simplified(), tolerance), np.zeros(M.shape[0], bool)
     while not full[np.argmax(found.beta)]:
         left = np.flatnonzero(~full & (found.beta >= WORTH * np.max(found.beta)))
-        _replace(found, left, upper_bound(M[left], structure, tolerance))
+        _replace(found, left, upper_bound(M[left], structure, tolerance, start=found.at(left)))
         full[left] = True
     return found
 
@@ -108,7 +112,8 @@ def _replace(found: UpperBound, which: Array, better: UpperBound) -> None:
         whole[which] = part
 
 
-def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array) -> UpperBound:
+def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array, start: UpperBound | None = None
+                 ) -> UpperBound:
     d_z, d_w = expand(structure, block_balance(M, structure))
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
@@ -120,9 +125,13 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
         scalings = _diagonal(unit, structure, live, floor, tolerance)
     else:
         space = ScalingSpace.of(structure)
-        theta = space.identity(M.shape[0])
+        theta, lam = space.identity(M.shape[0]), np.full(M.shape[0], 2.0)
+        if start is not None:
+            theta = space.theta(rescaled(start.scalings, 1 / d_z, 1 / d_w, 1 / size))
+            theta = theta * (space.core.size / (theta @ space.trace))[:, None]
+            lam = ROOM * (start.beta / size) ** 2
         if np.any(live):
-            found, _ = follow(space, unit[live], theta[live], np.full(live.sum(), 2.0), floor[live], tolerance)
+            found, _ = follow(space, unit[live], theta[live], lam[live], floor[live], tolerance)
             theta[live] = found
         scalings = space.scalings(theta)
     lam = np.where(live, least_level(unit, scalings, np.ones(structure.n_w, bool)), 0.0)

@@ -23,9 +23,10 @@ from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import continuous_image, sampled_image
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.dstep import PointwiseScalings, tightened
-from avis_ctrl.robust.fixed_order import Task, fixed_order
+from avis_ctrl.robust.fixed_order import fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
+from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State

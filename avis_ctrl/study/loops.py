@@ -13,7 +13,8 @@ import numpy as np
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.robust.fixed_order import Task, fixed_order
+from avis_ctrl.robust.fixed_order import fixed_order
+from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.plant import DesignPlant

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.robust.fixed_order import GainLimit
+from avis_ctrl.robust.mu_descent import GainLimit
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
 from avis_ctrl.study.plant import DesignPlant
 

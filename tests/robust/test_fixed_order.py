@@ -7,8 +7,10 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, balanced_truncation, discretise, lft_lower
-from avis_ctrl.robust.fixed_order import SETTINGS, Entries, GainLimit, Objective, Task, fixed_order
+from avis_ctrl.robust.controller_entries import Entries
+from avis_ctrl.robust.fixed_order import fixed_order, with_mode
 from avis_ctrl.robust.frequency_grid import frequency_grid
+from avis_ctrl.robust.mu_descent import SETTINGS, GainLimit, Objective, Task
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import musyn
 from avis_ctrl.robust.reduction import split_stable
@@ -91,7 +93,7 @@ def test_no_frequency_is_bounded_twice_in_a_step(full, monkeypatch):
     def counted(M, *arguments):
         seen.append(M)
         return upper_bound(M, *arguments)
-    monkeypatch.setattr("avis_ctrl.robust.fixed_order.upper_bound", counted)
+    monkeypatch.setattr("avis_ctrl.robust.mu_descent.upper_bound", counted)
     value, _ = Objective(Task(P, ONE_DRIVE), form, frequency_grid(lft_lower(P, made.K)), 20.0).value(form.start)
     every = np.concatenate(seen)
     assert len(every) > SETTINGS.first and len(np.unique(every.reshape(len(every), -1), axis=0)) == len(every)
@@ -106,6 +108,41 @@ def test_starts_of_fewer_states_are_tried(full):
     *_, alone = fixed_order(hasty, made.K, 3)
     *_, found = fixed_order(hasty, made.K, 3, [best.K])
     assert found.peak <= best.peak * (1 + 1e-6) < alone.peak
+
+
+@pytest.mark.parametrize("most", [1, 2])
+def test_an_added_mode_lowers_the_smoothed_peak(full, most):
+    """By AB13MD, from the best controller of one state."""
+    P, _, made = full
+    task = Task(P, ONE_DRIVE)
+    *_, one = fixed_order(task, made.K, 1)
+    longer = with_mode(task, one.K, most)
+    assert one.K.nstates < longer.nstates <= one.K.nstates + most
+    omega = frequency_grid(lft_lower(P, one.K))
+
+    def smoothed(K):
+        return sum(mu_upper_slicot(M, ONE_DRIVE) ** SETTINGS.sharpness[0]
+                   for M in lft_lower(P, K).frequency_response(omega))
+    assert smoothed(longer) < smoothed(one.K)
+
+
+def test_a_start_of_fewer_states_gets_all_states_that_are_asked_for(full):
+    P, _, made = full
+    *_, one = fixed_order(Task(P, ONE_DRIVE), made.K, 1)
+    *_, three = fixed_order(Task(P, ONE_DRIVE), one.K, 3)
+    assert one.K.nstates < three.K.nstates <= 3
+    assert peak_by_slicot(lft_lower(P, three.K)) <= min(1.03 * made.mu_upper_complex, one.peak)
+
+
+def test_a_slightly_different_start_ends_at_the_same_peak(full):
+    """Rounding must not decide between local minima: entries of the start are changed by a thousandth."""
+    P, _, made = full
+    rng, form, peaks = np.random.default_rng(0), Entries.of(made.K), []
+    for _ in range(4):
+        K = form.controller(form.start * (1 + 1e-3 * rng.standard_normal(form.start.size)))
+        *_, step = fixed_order(Task(P, ONE_DRIVE), K, 2)
+        peaks.append(peak_by_slicot(lft_lower(P, step.K)))
+    assert max(peaks) <= 1.01 * min(peaks)
 
 
 def test_the_result_is_that_of_the_short_controller(full):

@@ -69,8 +69,9 @@ def test_each_axis_sees_its_own_signal_alone(loops):
     response = made.K.frequency_response(np.geomspace(0.01, 1e4, 100))
     assert np.max(np.abs(response[:, [0, 1], [1, 0]])) == 0.0
     assert np.min(np.max(np.abs(response[:, [0, 1], [0, 1]]), axis=0)) > 0
-    assert made.K.nstates <= 6 and made.K.is_stable()
-    assert made.notes == ("states of each axis's loop: z 2, phi_x_edge 2",)
+    assert made.K.nstates == 6 and made.K.is_stable()  # the skyhook that it starts from has four
+    of_z, of_phi_x = (np.count_nonzero(row) for row in made.K.C)
+    assert made.notes == (f"states of each axis's loop: z {of_z}, phi_x_edge {of_phi_x}",) and of_z + of_phi_x == 6
 
 
 def test_mu_is_below_that_of_the_skyhook_and_the_gain_below_its_limit(loops):
@@ -78,7 +79,7 @@ def test_mu_is_below_that_of_the_skyhook_and_the_gain_below_its_limit(loops):
     plant, rig, skyhook, made = loops
     P, blocks = plant.synthesis.P, plant.synthesis.all_blocks
     mu, before = (mu_peak(lft_lower(P, one.K), blocks) for one in (made, skyhook))
-    assert mu.guaranteed and mu.upper < 0.7 * before.lower
+    assert mu.guaranteed and mu.upper < 0.62 * before.lower
     limit = gain_limit(plant, rig.sample_rate_Hz)
     omega = np.geomspace(limit.omega[0], limit.omega[-1], 500)
     gain = np.linalg.norm(made.K.frequency_response(omega), 2, (1, 2))

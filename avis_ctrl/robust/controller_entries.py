@@ -1,0 +1,87 @@
+"""A controller as a vector of its free entries, each in units of its own size: what descent moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from avis_ctrl.lti import StateSpace
+from avis_ctrl.robust.mu_lmi import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """K with tridiagonal A (blocks of its modes), its free entries in units of their own size.
+
+    rows, cols : places of the free entries of [A B; C D]; size : their units; start : their values in these units.
+    """
+
+    K: StateSpace
+    rows: Array
+    cols: Array
+    size: Array
+    start: Array
+
+    @staticmethod
+    def of(K: StateSpace, decentralised: bool = False) -> Entries:
+        A, B, C, rate, channel = _modal(K)
+        n = rate.size
+        whole = np.block([[A, B], [C, K.D]])
+        free = np.ones(whole.shape, bool)
+        free[:n, :n] = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 1
+        if decentralised:
+            label = np.r_[channel, np.arange(K.ninputs)], np.r_[channel, np.arange(K.noutputs)]
+            free &= np.equal.outer(label[1], label[0])
+        unit = np.empty(whole.shape)
+        unit[:n, :n] = np.sqrt(np.outer(rate, rate))
+        unit[:n, n:] = np.linalg.norm(B, axis=1, keepdims=True)
+        unit[n:, :n] = np.linalg.norm(C, axis=0)
+        unit[n:, n:] = np.linalg.norm(K.D) + np.max(np.abs(C).sum(axis=0) * np.abs(B).sum(axis=1) / rate, initial=0.0)
+        unit[unit == 0] = 1.0
+        rows, cols = np.nonzero(free)
+        return Entries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
+
+    def matrix(self, x: Array) -> Array:
+        n = self.K.nstates
+        whole = np.zeros((n + self.K.noutputs, n + self.K.ninputs))
+        whole[self.rows, self.cols] = x * self.size
+        return whole
+
+    def controller(self, x: Array) -> StateSpace:
+        n, whole = self.K.nstates, self.matrix(x)
+        return StateSpace(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], 0.0, self.K.inputs,
+                          self.K.outputs)
+
+    def slope(self, whole: Array) -> Array:
+        return whole[self.rows, self.cols] * self.size
+
+
+def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
+    """A of 2 x 2 blocks, real poles in pairs of neighbours, with rows of B as long as columns of C; and |poles|.
+
+    Last the output (n,) that each state moves most; the states are in the order of these.
+    """
+    n, vectors, sizes, channels = K.nstates, [], [], []
+    values, V = la.eig(K.A)
+    output = np.argmax(np.abs(K.C @ V), axis=0)
+    for k in np.lexsort((np.abs(values), output)):
+        if values[k].imag > 0:
+            vectors += [V[:, k].real, V[:, k].imag]
+            sizes += [abs(values[k])] * 2
+            channels += [output[k]] * 2
+        elif values[k].imag == 0:
+            vectors.append(V[:, k].real)
+            sizes.append(abs(values[k]))
+            channels.append(output[k])
+    S = np.array(vectors).T.reshape(n, n)
+    A, B, C = np.linalg.solve(S, K.A @ S), np.linalg.solve(S, K.B), K.C @ S
+    rows, cols = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
+    # One scale for both states of a pair keeps its block normal.
+    scale = np.sqrt(np.where((rows > 0) & (cols > 0), rows, 1.0) / np.where((rows > 0) & (cols > 0), cols, 1.0))
+    for k in range(n - 1):
+        if A[k, k + 1] * A[k + 1, k] < 0 and sizes[k] == sizes[k + 1]:
+            scale[k:k + 2] = np.sqrt(scale[k] * scale[k + 1])
+    rate = np.maximum(np.array(sizes), 1e-6 * max(sizes, default=1.0))
+    return A / scale[:, None] * scale, B / scale[:, None], C * scale, rate, np.array(channels, int)
