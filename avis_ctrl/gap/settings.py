@@ -43,8 +43,8 @@ class GapSettings(FitSettings):
         on.
     least_promised : fraction of the fall of the sum of squares that the score test promises, below which a fit of a
         candidate's own parameters has failed [1]: the fit of all parameters then begins at the seed, too.
-    quick_rounds, quick_iterations : `rounds` and `iterations` of a fit that only compares candidates, or gives
-        the residual of a stage.
+    quick_rounds, quick_iterations, quick_converged : `rounds`, `iterations` and `converged` of a fit that only compares
+        candidates, or gives the residual of a stage.
     longest : most effects that are named together.
     revisions : how often an effect may be replaced by a rival that is better beside what was found after it; twice, for
         a pair that was named wrong both times.
@@ -93,6 +93,7 @@ class GapSettings(FitSettings):
     least_promised: float = 0.5
     quick_rounds: int = 4
     quick_iterations: int = 4
+    quick_converged: float = 1e-4
     longest: int = 5
     revisions: int = 2
     certain: float = 3.9
@@ -116,7 +117,8 @@ class GapSettings(FitSettings):
     @property
     def quick(self) -> GapSettings:
         """Of a fit that only compares candidates, or only gives a figure."""
-        return replace(self, rounds=self.quick_rounds, iterations=self.quick_iterations)
+        return replace(self, rounds=self.quick_rounds, iterations=self.quick_iterations,
+                       converged=self.quick_converged)
 
 
 SETTINGS = GapSettings()

@@ -7,11 +7,10 @@ z are standardised parameters; the whitened residual e is free of the transients
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -189,41 +188,50 @@ class _Expansion:
         return self.cost + float(self.z @ self.z)
 
 
-def _descent(expand: Callable[[np.ndarray], _Expansion], at: _Expansion, iterations: int, settings: FitSettings
-             ) -> tuple[_Expansion, int]:
+class _Expand(Protocol):
+    def __call__(self, z: np.ndarray, derivative: bool = True) -> _Expansion:
+        """About z; without derivative the sum of squares alone. InputError where no rig has these values."""
+
+
+def _descent(expand: _Expand, at: _Expansion, iterations: int, settings: FitSettings) -> tuple[_Expansion, int]:
     """Gauss-Newton steps, each damped until it descends (Levenberg 1944); the last expansion, and how many steps there
     were.
 
     Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
     hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
-    hardly corrects these, and descends in ever shorter ones.
+    hardly corrects these, and descends in ever shorter ones. Each step begins with somewhat less damping than the one
+    before it needed.
     """
+    needed, enough = 0.0, settings.converged * len(at.now.e)
     for steps in range(iterations):
         slope = at.g - at.z
-        trials = _damped_steps(at.H, slope, settings)
-        first = next(trials)
-        if first @ slope < settings.converged * len(at.now.e):
+        if np.linalg.solve(at.H + np.eye(len(at.z)), slope) @ slope < enough:
             return at, steps
-        for step in chain([first], trials):
+        before = at
+        for damping in _dampings(at.H, needed, settings):
+            z = at.z + np.linalg.solve(at.H + (1 + damping) * np.eye(len(at.z)), slope)
             try:
-                after = expand(at.z + step)
-                if after.whole < at.whole:
-                    break
+                # Of a step that may well be refused the derivative is not needed yet.
+                if not damping or expand(z, derivative=False).whole < at.whole:
+                    after = expand(z)
+                    if after.whole < at.whole:
+                        at, needed = after, damping
+                        break
             except InputError:
                 pass  # no rig has these values: a shorter step
-        else:
-            return at, steps
-        at = after
+        if before.whole - at.whole < enough:
+            return at, steps + (at is not before)
     return at, iterations
 
 
-def _damped_steps(H: np.ndarray, slope: np.ndarray, settings: FitSettings) -> Iterator[np.ndarray]:
-    """The Gauss-Newton step with the priors, then ever more damped ones."""
-    one = np.eye(len(H))
-    yield np.linalg.solve(H + one, slope)
-    damping, most = 1.0, np.linalg.norm(H + one, 2) / settings.shortest_step
+def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[float]:
+    """Dampings to be tried, from less than the last one on, to what leaves next to nothing of a Gauss-Newton step."""
+    damping = last / settings.damping ** 2
+    yield (damping := damping if damping > 1 else 0.0)
+    most = (1 + np.linalg.norm(H, 2)) / settings.shortest_step
+    damping = max(damping * settings.damping, 1.0)
     while damping < most:
-        yield np.linalg.solve(H + (1 + damping) * one, slope)
+        yield damping
         damping *= settings.damping
 
 
@@ -236,9 +244,10 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
 
-        def expand(z: np.ndarray, model: Any = model, weights: Weights = weights) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool = True, model: Any = model, weights: Weights = weights
+                   ) -> _Expansion:
             moved = model.at(priors.values(z))
-            now = _evaluate(moved, priors, z, data, weights)
+            now = _evaluate(moved, priors, z, data, weights, derivative)
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
         at, more = _descent(expand, expand(z), settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
@@ -317,9 +326,9 @@ class Profile:
         rest = -(self.fitted.z if at is None else at)
         weights = self.fitted.weights
 
-        def expand(z: np.ndarray) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool = True) -> _Expansion:
             moved = model.at(priors.values(z))
-            now = _evaluate(moved, priors, z, self.data, weights)
+            now = _evaluate(moved, priors, z, self.data, weights, derivative)
             # The products of the rows that `free` would give.
             H, g, cost = weights.normal_equations(now.J, now.e)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
