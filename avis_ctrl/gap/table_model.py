@@ -33,7 +33,7 @@ class ModelSettings:
     """
 
     step: float = 1e-4
-    one_sided: float = 1e-5
+    one_sided: float = 1e-6
     probed_Hz: tuple[float, float, int] = (0.5, 100.0, 5)
     unchanged: float = 1e-6
 
