@@ -24,8 +24,7 @@ from avis_ctrl.rigs.rig import Rig
 class ModelSettings:
     """Of a model's derivatives and of its sensors' transients.
 
-    step, one_sided : steps of differences by an effect's parameters, in units of their size [1]: central, of effects
-        that depend on the record; to one side, of those that change the table, whose error is of first order.
+    step : step of differences by an effect's parameters, in units of their size [1].
     probed_Hz : lowest and highest frequency [Hz], and number of those at which the chains of sensors are compared with
         the rig's.
     unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
@@ -33,7 +32,6 @@ class ModelSettings:
     """
 
     step: float = 1e-4
-    one_sided: float = 1e-6
     probed_Hz: tuple[float, float, int] = (0.5, 100.0, 5)
     unchanged: float = 1e-6
 
@@ -323,10 +321,10 @@ class TableModel:
         return Acting(U, force, reading, output, inner)
 
     def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
-        """Differences by the effects' parameters: of what an effect adds to a record, which the response is linear in;
-        of the whole response where it changes the table, from which the present one is one side."""
+        """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
+        linear in; of the whole response where it changes the table."""
         n = len(self.base.names)
-        for row, (effect, others, width, table) in enumerate(self._beside(omega), n):
+        for row, (effect, others, width, tables) in enumerate(self._beside(omega), n):
             if effect.nonlinear:
                 assert block is not None
                 record = self.motion[block.name]
@@ -339,32 +337,25 @@ class TableModel:
                 side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
-            assert table is not None
-            side = AtMotion(table, response.acting, response.x)
+            sides = [AtMotion(table, response.acting, response.x) for table in tables]
             # d x = inv(D) (d F - d D x): no second inverse.
-            dY[row] = ((side.Y - response.Y) + response.left @ side.push) / width
+            dY[row] = ((sides[0].Y - sides[1].Y) + response.left @ (sides[0].push - sides[1].push)) / width
 
     @partial(kept_lines, most=1)
-    def _beside(self, omega: np.ndarray) -> list[tuple[Effect, list[ActiveEffect], float, Assembled | None]]:
-        """For every free parameter of the effects: its effect; for one that depends on the record, the effect on either
-        side and the step between the two; for one that changes the table, the table on one side, not inverted, and the
-        step to it."""
-        n, theta, (low, high), scale = len(self.base.names), self.values, self.bounds(), self.scales()
-        found: list[tuple[Effect, list[ActiveEffect], float, Assembled | None]] = []
+    def _beside(self, omega: np.ndarray) -> list[tuple[Effect, list[ActiveEffect], float, list[Assembled]]]:
+        """For every free parameter of the effects: its effect, that effect on either side, the step between the two,
+        and the table there, not inverted, of one that changes the table."""
+        n, theta, (low, high), found = len(self.base.names), self.values, self.bounds(), []
+        scale = self.scales()
         for row in range(n, len(theta)):
-            k = self._free[row - n][0]
-            effect = self.effects[k].effect
-            step = (SETTINGS.step if effect.nonlinear else SETTINGS.one_sided) * scale[row]
+            step = SETTINGS.step * scale[row]
             # A bound that goes with the payload's mass may have moved past the value.
             lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
-            up, down = (min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1))
-            if effect.nonlinear:
-                others = [self._with_effect_parameter(row - n, end).effects[k] for end in (up, down)]
-                found.append((effect, others, up - down, None))
-            else:
-                end = up if up > theta[row] else down
-                table = Assembled(self._with_effect_parameter(row - n, end).operators(omega))
-                found.append((effect, [], end - theta[row], table))
+            ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
+            others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
+            effect = self.effects[k].effect
+            tables = [] if effect.nonlinear else [Assembled(one.operators(omega)) for one in others]
+            found.append((effect, [one.effects[k] for one in others], ends[0] - ends[1], tables))
         return found
 
 

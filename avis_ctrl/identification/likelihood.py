@@ -199,37 +199,34 @@ def _descent(expand: _Expand, at: _Expansion, iterations: int, settings: FitSett
 
     Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
     hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
-    hardly corrects these, and descends in ever shorter ones. Each step begins with somewhat less damping than the one
-    before it needed.
+    hardly corrects these, and descends in ever shorter ones.
     """
-    needed, enough = 0.0, settings.converged * len(at.now.e)
+    needed = 0.0
     for steps in range(iterations):
         slope = at.g - at.z
-        if np.linalg.solve(at.H + np.eye(len(at.z)), slope) @ slope < enough:
+        if np.linalg.solve(at.H + np.eye(len(at.z)), slope) @ slope < settings.converged * len(at.now.e):
             return at, steps
-        before = at
         for damping in _dampings(at.H, needed, settings):
             z = at.z + np.linalg.solve(at.H + (1 + damping) * np.eye(len(at.z)), slope)
             try:
                 # Of a step that may well be refused the derivative is not needed yet.
-                if not damping or expand(z, derivative=False).whole < at.whole:
+                if not (damping or needed) or expand(z, derivative=False).whole < at.whole:
                     after = expand(z)
                     if after.whole < at.whole:
                         at, needed = after, damping
                         break
             except InputError:
                 pass  # no rig has these values: a shorter step
-        if before.whole - at.whole < enough:
-            return at, steps + (at is not before)
+        else:
+            return at, steps
     return at, iterations
 
 
 def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[float]:
-    """Dampings to be tried, from less than the last one on, to what leaves next to nothing of a Gauss-Newton step."""
-    damping = last / settings.damping ** 2
-    yield (damping := damping if damping > 1 else 0.0)
-    most = (1 + np.linalg.norm(H, 2)) / settings.shortest_step
-    damping = max(damping * settings.damping, 1.0)
+    """Dampings to be tried: none; then from somewhat less than the last one needed on, to what leaves next to nothing
+    of a Gauss-Newton step."""
+    yield 0.0
+    damping, most = max(last / settings.damping ** 2, 1.0), (1 + np.linalg.norm(H, 2)) / settings.shortest_step
     while damping < most:
         yield damping
         damping *= settings.damping
