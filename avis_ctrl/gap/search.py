@@ -90,13 +90,14 @@ def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -
 
 
 def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
-    """Richer laws of the effects that were fitted last, each begun where a simpler one has ended."""
+    """Richer laws of the effects that were fitted last, each begun where a simpler one has ended; and the same law from
+    elsewhere, of an effect with many local minima."""
     found = []
     for one in fits:
-        last = one.model.effects[-1]
-        law = last.effect
+        law = one.model.effects[-1].effect
         if isinstance(law, HasRicherLaws):
             whole = without_path_errors(one, data, settings)
+            last = whole.model.effects[-1]
             found += [Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
                       for place, values in law.richer(EvidenceScore(whole, data, settings), last)]
     return found
@@ -264,13 +265,15 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     tried = _tried(begun, shortlist(found, settings), data, settings, each)
     if not tried:
         return None
-    last = tried
-    while last:
-        last = _tried(begun, richer_laws(list(last.values()), data, settings), data, settings, each)
-        tried = _likelier([*tried.values(), *last.values()])
-    best = max(tried, key=lambda label: tried[label].log_evidence)
-    tried |= _tried(begun, other_laws(found, best, tried), data, settings, each)
-    best = max(tried, key=lambda label: tried[label].log_evidence)
+    better, best = tried, max(tried, key=lambda label: tried[label].log_evidence)
+    while better:
+        further = [*richer_laws(list(better.values()), data, settings), *other_laws(found, best, tried)]
+        more = _tried(begun, further, data, settings, each)
+        rise = {label: one.log_evidence - tried[label].log_evidence for label, one in more.items() if label in tried}
+        tried = _likelier([*tried.values(), *more.values()])
+        best = max(tried, key=lambda label: tried[label].log_evidence)
+        better = {label: one for label, one in more.items()
+                  if label not in rise or (label == best and rise[label] > settings.certain)}
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
         return None

@@ -100,7 +100,8 @@ class FindsItsStart(Protocol):
 
 @runtime_checkable
 class HasRicherLaws(Protocol):
-    """An effect with laws that begin best where a simpler one was fitted: a second mode, a mass along three axes."""
+    """An effect with laws that begin best where a simpler one was fitted: a second mode, a mass along three axes; or
+    with other local minima near the one that was found."""
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """Places (with their law) and values where a fit with a richer law may begin; score : of the fit with `one`."""

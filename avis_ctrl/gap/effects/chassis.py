@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -65,6 +65,8 @@ class ChassisSettings:
     explained : chi-square per degree of freedom below which nothing is left to explain with the measured noise.
     elsewhere : other frequencies of a coordinate, over the median of all coordinates [1].
     rounds : most coordinates that are changed one after the other.
+    followed_groups : groups of coupled coordinates with which a fit of all parameters begins once more, the most
+        promising first.
     """
 
     own_Hz: tuple[float, float, int] = (7.0, 90.0, 26)
@@ -91,6 +93,7 @@ class ChassisSettings:
     explained: float = 1.1
     elsewhere: tuple[float, ...] = (0.65, 0.8, 1.0, 1.25, 1.55)
     rounds: int = 6
+    followed_groups: int = 2
 
 
 SETTINGS = ChassisSettings()
@@ -165,6 +168,19 @@ class BaseCompliance(OfMounts):
                      len(reached.model.names), len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
         return [found] if found.chi2 > 0 else own
 
+    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+        """The same law with other frequencies of coupled coordinates, those from which one step of all parameters leads
+        lowest: the parameters of the other coordinates can compensate for a wrong frequency, and no descent leads out
+        of that local minimum."""
+        blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
+        rest = score.model.without(one.label)
+        here = Score(self._standing(rest, one.place, one.values), blocks)
+        if here.chi2 < SETTINGS.explained * here.dof:
+            return []
+        found = [min((self._expected(rest, one.place, moved, blocks), moved) for moved in group)
+                 for group in _elsewhere(one)]
+        return [(one.place, values) for left, values in sorted(found)[:SETTINGS.followed_groups] if left < np.inf]
+
     def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
                   weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit[TableModel] | None:
         """The best fit from these starts by the first weights, continued with the later ones; None where all fail.
@@ -211,7 +227,8 @@ class BaseCompliance(OfMounts):
                 return reached
             now = _effect(reached)
             rest = reached.model.without(now.label)
-            left, values = min((self._expected(rest, place, moved, blocks), moved) for moved in _elsewhere(now))
+            left, values = min((self._expected(rest, place, moved, blocks), moved) for group in _elsewhere(now)
+                               for moved in group)
             if left - noise > SETTINGS.promising * (reached.chi2 - noise):
                 return reached
             made = _short_fit(self._standing(rest, place, values), blocks, SETTINGS.later_iterations)
@@ -308,24 +325,27 @@ def _with_relative_noise(block: SpectralBlock, fraction: float) -> SpectralBlock
     return block.with_noise(block.noise + relative.noise, block.dof)
 
 
-def _elsewhere(one: ActiveEffect) -> Iterator[tuple[float, ...]]:
-    """Values of a chassis with other frequencies of coupled coordinates, about the median of all coordinates."""
+def _elsewhere(one: ActiveEffect) -> list[list[tuple[float, ...]]]:
+    """Values of a chassis with other frequencies, about the median of all coordinates; a list for each group of coupled
+    coordinates that it has."""
     names = [parameter.name for parameter in one.parameters]
     free = [way for way in WAYS if f"{way}_Hz" in names]
     middle = np.median([one.by_name[f"{way}_Hz"] for way in free])
-    for ways in [[way for way in together if way in free] for together in TOGETHER]:
-        # One of two may be right as it is.
-        for factors in product((None, *SETTINGS.elsewhere), repeat=len(ways)):
-            moved = list(one.values)
-            for way, factor in zip(ways, factors, strict=True):
-                if factor is None:
-                    continue
-                k = names.index(f"{way}_Hz")
-                moved[k] = float(min(factor * middle, 0.9 * one.parameters[k].high))
-                if len(way) > 1:
-                    moved[names.index(f"gyration_{way[1]}_m")] = SETTINGS.alike_shape[0]
-            if any(factors):
-                yield tuple(moved)
+
+    def moved(ways: Sequence[str], factors: Sequence[float | None]) -> tuple[float, ...]:
+        values = list(one.values)
+        for way, factor in zip(ways, factors, strict=True):
+            if factor is None:
+                continue
+            k = names.index(f"{way}_Hz")
+            values[k] = float(min(factor * middle, 0.9 * one.parameters[k].high))
+            if len(way) > 1:
+                values[names.index(f"gyration_{way[1]}_m")] = SETTINGS.alike_shape[0]
+        return tuple(values)
+    groups = [[way for way in together if way in free] for together in TOGETHER]
+    # One of two may be right as it is.
+    return [[moved(ways, factors) for factors in product((None, *SETTINGS.elsewhere), repeat=len(ways)) if any(factors)]
+            for ways in groups if ways]
 
 
 def _effect(found: LikelihoodFit[TableModel]) -> ActiveEffect:
