@@ -11,7 +11,7 @@ well goes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,8 +90,8 @@ def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -
 
 
 def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
-    """Richer laws of the effects that were fitted last, each begun where a simpler one has ended; and the same law from
-    elsewhere, of an effect with many local minima."""
+    """Richer laws of the effects that were fitted last, each begun where a simpler one has ended. An effect with many
+    local minima is begun again with other values."""
     found = []
     for one in fits:
         law = one.model.effects[-1].effect
@@ -216,7 +216,7 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
             continue
         best = steps[-1].fitted
         again = _again(step, best, data, settings)
-        label = max(again.tried, key=lambda label: again.tried[label].log_evidence)
+        label = _likeliest(again.tried)
         if again.tried[label].log_evidence - best.log_evidence < settings.certain:
             steps[k] = again
             continue
@@ -265,15 +265,15 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
     tried = _tried(begun, shortlist(found, settings), data, settings, each)
     if not tried:
         return None
-    better, best = tried, max(tried, key=lambda label: tried[label].log_evidence)
+    better, best, asked = tried, _likeliest(tried), set(tried)
     while better:
-        further = [*richer_laws(list(better.values()), data, settings), *other_laws(found, best, tried)]
-        more = _tried(begun, further, data, settings, each)
-        rise = {label: one.log_evidence - tried[label].log_evidence for label, one in more.items() if label in tried}
-        tried = _likelier([*tried.values(), *more.values()])
-        best = max(tried, key=lambda label: tried[label].log_evidence)
-        better = {label: one for label, one in more.items()
-                  if label not in rise or (label == best and rise[label] > settings.certain)}
+        further = [*richer_laws(list(better.values()), data, settings), *other_laws(found, best, asked)]
+        asked |= {one.effect.label for one in further}
+        more, before = _tried(begun, further, data, settings, each), tried
+        tried = _likelier([*before.values(), *more.values()])
+        best = _likeliest(tried)
+        better = {label: one for label, one in more.items() if label not in before or (
+            label == best and one.log_evidence - before[label].log_evidence > settings.certain)}
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
         return None
@@ -342,6 +342,11 @@ def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:
         if known is None or one.log_evidence > known.log_evidence:
             found[one.labels[-1]] = one
     return found
+
+
+def _likeliest(fits: Mapping[str, Fitted]) -> str:
+    """Label of the fit of the largest evidence."""
+    return max(fits, key=lambda label: fits[label].log_evidence)
 
 
 def at_full_strength(one: ActiveEffect) -> bool:

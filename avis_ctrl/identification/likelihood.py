@@ -203,11 +203,12 @@ def _descent(expand: _Expand, at: _Expansion, iterations: int, settings: FitSett
     """
     needed = 0.0
     for steps in range(iterations):
-        slope = at.g - at.z
-        if np.linalg.solve(at.H + np.eye(len(at.z)), slope) @ slope < settings.converged * len(at.now.e):
+        slope, one = at.g - at.z, np.eye(len(at.z))
+        undamped = np.linalg.solve(at.H + one, slope)
+        if undamped @ slope < settings.converged * len(at.now.e):
             return at, steps
         for damping in _dampings(at.H, needed, settings):
-            z = at.z + np.linalg.solve(at.H + (1 + damping) * np.eye(len(at.z)), slope)
+            z = at.z + (np.linalg.solve(at.H + (1 + damping) * one, slope) if damping else undamped)
             try:
                 # Of a step that may well be refused the derivative is not needed yet.
                 if not (damping or needed) or expand(z, derivative=False).whole < at.whole:

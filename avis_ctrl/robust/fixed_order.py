@@ -1,12 +1,12 @@
 """mu synthesis at a fixed order: modes are removed and added, with descent on the upper bound of mu between.
 
-It starts from the full controller and goes down order by order: first descent (`mu_descent`), then without the mode
-missed least. Few states do not roll off by themselves: the descent makes a direct term of what the full controller does
-with fast modes, hence the limit of the gain in `Task`.
+It starts from the full controller and goes down order by order: descent (`mu_descent`), then removal of the mode that
+is missed least. Few states do not roll off by themselves: the descent makes a direct term of what the full controller
+does with fast modes, hence the limit of the gain in `Task`.
 
 The descent ends in a local minimum. A controller with fewer states than asked is therefore lengthened by the mode that
-lowers the smoothed peak most to first order, and at the end modes are exchanged: one or two are added, descent follows,
-and those missed least are removed, as long as the peak falls.
+lowers the smoothed peak most to first order, and at the end modes are exchanged, as long as the peak falls: one or two
+are added, descent follows, and those that are missed least are removed.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class FixedOrderSettings:
         controller does not need.
     free : growth of mu for which balanced truncation may shorten the controller at once.
     costly : growth of mu by the removal of a mode from which the controller is improved before it is shortened.
-    passing : number of the first stages that a controller gets which is only a step to one of another order.
+    passing : number of stages of descent, the first ones, for a controller on the way to another order.
     exchanged : states by which a controller is lengthened to look for one of its own order with a smaller peak.
     worth : relative fall of the peak from which the exchange of modes goes on.
     per_decade, damping : natural frequencies per decade, and damping ratios beside a real pole, of the modes that are
         tried as additions.
-    small : gain of an added mode before descent, relative to the controller's at its natural frequency. Its effect is
-        known to first order only.
+    small : gain of an added mode before descent, relative to that of the controller at the mode's natural frequency;
+        small, because its effect is known to first order only.
     same_pole : relative distance up to which two computations of a pole are one.
     """
 
@@ -78,7 +78,9 @@ def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpa
     # The start that the first stage brings lowest goes on.
     starts = [K, *(one for one in others if one.nstates <= order and lft_lower(task.P, one).is_stable())]
     best = min((task.descended(one, task.settings.sharpness[:1]) for one in starts), key=lambda one: one.peak)
-    best = task.descended(_lengthened(task, best.K, order), task.settings.sharpness[1:])
+    # An added mode may not help, or even make the loop unstable; then the shorter controller stays.
+    best = min(task.descended(_lengthened(task, best.K, order), task.settings.sharpness[1:]), best,
+               key=lambda one: one.peak)
     yield best
     while (step := _exchanged(task, best.K, order)).peak < (1 - SETTINGS.worth) * best.peak:
         yield (best := step)
@@ -110,7 +112,7 @@ def _lengthened(task: Task, K: StateSpace, order: int) -> StateSpace:
 
 
 def _exchanged(task: Task, K: StateSpace, order: int) -> Step:
-    """K with a mode added, and then without the mode missed least: a way out of a local minimum."""
+    """K with modes added, then without those that are missed least: a way out of a local minimum."""
     try:
         *_, step = _shortened(task, _lengthened(task, K, order + SETTINGS.exchanged), order)
     except ComputationError:
@@ -167,13 +169,13 @@ def with_mode(task: Task, K: StateSpace, most: int) -> StateSpace:
     u^T D v to the slope, D = Re sum_k f(j omega_k) G_k^T: the largest singular value of D, for f of unit r.m.s. value
     over the frequencies, says how much the mode can do, and its singular vectors are u and v.
     """
-    closed = lft_lower(task.P, K)
-    grid, _ = task.with_peaks(closed, frequency_grid(closed))
+    _, grid = task.measured(K)
     _, omega, G = smoothed_peak(task, K, grid, task.P.frequency_response(grid), task.settings.sharpness[0])
     lowest, highest = np.min(omega[omega > 0]), np.max(omega)
     natural = np.geomspace(lowest, highest, int(np.ceil(SETTINGS.per_decade * np.log10(highest / lowest))) + 1)
-    _, wn, added = max((_best_mode(K, wn, zeta, omega, G, task.decentralised) for wn in natural for zeta in
-                             (None, *(SETTINGS.damping if most > 1 else ()))), key=lambda one: one[0])
+    dampings = (None, *SETTINGS.damping) if most > 1 else (None,)
+    _, wn, added = max((_best_mode(K, wn, zeta, omega, G, task.decentralised) for wn in natural for zeta in dampings),
+                       key=lambda one: one[0])
     gain, own = (np.linalg.norm(one.frequency_response(np.array([wn])), 2, (1, 2)) for one in (K, added))
     return K + replace(added, C=added.C * SETTINGS.small * gain / own)
 
@@ -181,10 +183,10 @@ def with_mode(task: Task, K: StateSpace, most: int) -> StateSpace:
 def _best_mode(K: StateSpace, wn: float, zeta: float | None, omega: Array, G: Array, decentralised: bool
                ) -> tuple[float, float, StateSpace]:
     """The fall of the smoothed peak by a mode of unit r.m.s. value, its natural frequency, and the mode itself."""
-    # Both are seen in their first state; of two states each input is one of the two numerators.
+    # The first state is the output; a mode of two states has an input for each of its two numerators.
     A = np.array([[-wn]] if zeta is None else [[-2 * zeta * wn, wn], [-wn, 0.0]])
     B = wn * np.eye(len(A))[::-1]
-    f = np.linalg.inv(1j * omega[:, None, None] * np.eye(len(A)) - A)[:, 0, :] @ B
+    f = StateSpace(A, B, np.eye(1, len(A)), np.zeros((1, len(A)))).frequency_response(omega)[:, 0]
     size = np.sqrt(np.mean(np.abs(f) ** 2, axis=0))
     D = np.einsum("kf,kyu->fuy", f / size, G).real
     if decentralised:

@@ -46,7 +46,8 @@ class DescentSettings:
     negligible : weight in the smoothed maximum, relative to the largest, below which a frequency is left out: less than
         rounding errors change.
     first : frequencies of the largest balanced norms, whose mu tells which others count.
-    between : points at which a limit of the gain is checked for each of its own, so that no peak lies between two.
+    between : frequencies at which the gain is checked for each frequency of its limit, so that no peak is missed
+        between two of these.
     """
 
     sharpness: tuple[float, ...] = (20.0, 80.0, 300.0, 1000.0)
@@ -72,12 +73,11 @@ class GainLimit:
     omega: Array
     most: Array
 
-    def frequencies(self, K: StateSpace) -> Array:
+    def frequencies(self, K: StateSpace, between: int) -> Array:
         """omega with points between, and the natural frequencies of K, where its gain can have a peak."""
-        own = np.abs(K.poles())
-        n, between = self.omega.size, SETTINGS.between
-        fine = np.exp(np.interp(np.arange((n - 1) * between + 1) / between, np.arange(n), np.log(self.omega)))
-        return merged(fine, own[(own > fine[0]) & (own < fine[-1])])
+        low, high, own = self.omega[0], self.omega[-1], np.abs(K.poles())
+        fine = np.geomspace(low, high, (self.omega.size - 1) * between + 1)
+        return merged(self.omega, np.concatenate([fine, own[(own > low) & (own < high)]]))
 
     def at(self, omega: Array) -> Array:
         """The limit at other frequencies; a power law between neighbours."""
@@ -113,31 +113,39 @@ class Task:
         return max(float(np.max(beta)), self.gain(K))
 
     def gain(self, K: StateSpace) -> float:
-        """Largest gain of K over its limit."""
+        """Largest gain of K over its limit; zero without one."""
+        return float(np.exp(np.max(self.over_limit(K)[1], initial=-np.inf)))
+
+    def over_limit(self, K: StateSpace) -> tuple[Array, Array, Array]:
+        """Frequencies (n,) [rad/s], log of the gain of K over its limit there, and G (n, n_y, n_u) with its change
+        Re tr(G dK); n is zero without a limit."""
         if self.limit is None:
-            return 0.0
-        omega = self.limit.frequencies(K)
-        return float(np.max(np.linalg.norm(K.frequency_response(omega), 2, axis=(1, 2)) / self.limit.at(omega)))
+            return np.empty(0), np.empty(0), np.empty((0, K.ninputs, K.noutputs), complex)
+        omega = self.limit.frequencies(K, self.settings.between)
+        U, s, Vh = np.linalg.svd(K.frequency_response(omega))
+        s = np.maximum(s, np.finfo(float).tiny)
+        return omega, np.log(s[:, 0] / self.limit.at(omega)), dagger(U[:, :, :1] @ Vh[:, :1]) / s[:, :1, None]
 
     def descended(self, K: StateSpace, stages: Sequence[float]) -> Step:
         """The best controller after each of some stages of descent from K, K among them."""
-        closed = lft_lower(self.P, K)
-        omega, beta = self.with_peaks(closed, frequency_grid(closed))
-        best = Step(K, max(float(np.max(beta)), self.gain(K)))
+        best, omega = self.measured(K)
         for sharpness in stages:
             form = Entries.of(K, self.decentralised)
             K = form.controller(_bfgs(Objective(self, form, omega, sharpness).value, form.start, self.settings))
-            closed = lft_lower(self.P, K)
-            omega, beta = self.with_peaks(closed, merged(omega, frequency_grid(closed)))
-            if (peak := max(float(np.max(beta)), self.gain(K))) < best.peak:
-                best = Step(K, peak)
+            step, omega = self.measured(K, omega)
+            best = min(best, step, key=lambda one: one.peak)
         return best
 
-    def with_peaks(self, closed: StateSpace, omega: Array) -> tuple[Array, Array]:
-        """The grid with the local maxima of mu found between its points, and mu on it."""
+    def measured(self, K: StateSpace, omega: Array | None = None) -> tuple[Step, Array]:
+        """K with its peak, infinite where the loop is unstable; and the grid: that of the loop and `omega`, with the
+        local maxima of mu between."""
+        closed = lft_lower(self.P, K)
+        grid = frequency_grid(closed) if omega is None else merged(omega, frequency_grid(closed))
+
         def value(at: Array) -> Array:
             return upper_bound(closed.frequency_response(at)[:, None], self.structure, self.settings.accuracy).beta
-        return refine_maxima(value, omega, value(omega), tolerance=1e-3, worth=0.95)
+        grid, beta = refine_maxima(value, grid, value(grid), tolerance=1e-3, worth=0.95)
+        return Step(K, max(float(np.max(beta)), self.gain(K)) if closed.is_stable() else np.inf), grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +210,9 @@ def smoothed_peak(task: Task, K: StateSpace, omega: Array, response: Array, shar
     dual /= np.trace(bound.scalings.X_w @ dual, axis1=1, axis2=2).real[:, None, None]
     # d log beta = d lambda / (2 lambda) = Re tr(G dK).
     G = R @ dual @ dagger(M) @ bound.scalings.X_z @ L / lam[:, None, None]
-    logs = np.log(bound.beta)
-    if task.limit is not None:
-        fast = task.limit.frequencies(K)
-        high, slopes = _gain(K, fast)
-        logs = np.concatenate([logs, high - np.log(task.limit.at(fast))])
-        omega, G = np.concatenate([omega, fast]), np.concatenate([G, slopes])
+    fast, over, slopes = task.over_limit(K)
+    logs = np.concatenate([np.log(bound.beta), over])
+    omega, G = np.concatenate([omega, fast]), np.concatenate([G, slopes])
     top = float(np.max(logs))
     weight = np.exp(sharpness * (logs - top))
     total = top + float(np.log(np.sum(weight))) / sharpness
@@ -237,13 +242,6 @@ def _highest(task: Task, M: Array, sharpness: float) -> tuple[Array, UpperBound]
 def _resolvent(K: StateSpace, omega: Array) -> Array:
     """inv(j omega I - A), (n_omega, n, n)."""
     return np.linalg.inv(1j * omega[:, None, None] * np.eye(K.nstates) - K.A)
-
-
-def _gain(K: StateSpace, omega: Array) -> tuple[Array, Array]:
-    """log of the largest singular value of K at frequencies, and G with its change Re tr(G dK), (n, n_y, n_u)."""
-    U, s, Vh = np.linalg.svd(K.frequency_response(omega))
-    s = np.maximum(s, np.finfo(float).tiny)
-    return np.log(s[:, 0]), dagger(U[:, :, :1] @ Vh[:, :1]) / s[:, :1, None]
 
 
 def _bfgs(value: Callable[[Array], tuple[float, Array]], x: Array, settings: DescentSettings) -> Array:

@@ -169,17 +169,14 @@ class BaseCompliance(OfMounts):
         return [found] if found.chi2 > 0 else own
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """The same law with other frequencies of coupled coordinates, those from which one step of all parameters leads
-        lowest: the parameters of the other coordinates can compensate for a wrong frequency, and no descent leads out
-        of that local minimum."""
+        """The same law with other frequencies of coupled coordinates."""
         blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
         rest = score.model.without(one.label)
         here = Score(self._standing(rest, one.place, one.values), blocks)
         if here.chi2 < SETTINGS.explained * here.dof:
             return []
-        found = [min((self._expected(rest, one.place, moved, blocks), moved) for moved in group)
-                 for group in _elsewhere(one)]
-        return [(one.place, values) for left, values in sorted(found)[:SETTINGS.followed_groups] if left < np.inf]
+        found = self._best_elsewhere(rest, one, blocks)[:SETTINGS.followed_groups]
+        return [(one.place, values) for left, values in found if left < np.inf]
 
     def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
                   weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit[TableModel] | None:
@@ -220,15 +217,13 @@ class BaseCompliance(OfMounts):
     def _one_by_one(self, reached: LikelihoodFit[TableModel], place: str, blocks: Sequence[SpectralBlock],
                     noise: float, enough: float) -> LikelihoodFit[TableModel]:
         """A fit refined with other frequencies of coupled coordinates, while chi-square comes nearer to `noise`, that
-        of an exact model, and until it is below `enough`. The parameters of the other coordinates can compensate for a
-        wrong frequency: a local minimum, out of which no descent leads."""
+        of an exact model, and until it is below `enough`."""
         for _ in range(SETTINGS.rounds):
             if reached.chi2 < enough:
                 return reached
             now = _effect(reached)
             rest = reached.model.without(now.label)
-            left, values = min((self._expected(rest, place, moved, blocks), moved) for group in _elsewhere(now)
-                               for moved in group)
+            left, values = self._best_elsewhere(rest, now, blocks)[0]
             if left - noise > SETTINGS.promising * (reached.chi2 - noise):
                 return reached
             made = _short_fit(self._standing(rest, place, values), blocks, SETTINGS.later_iterations)
@@ -236,6 +231,14 @@ class BaseCompliance(OfMounts):
                 return reached
             reached = made
         return reached
+
+    def _best_elsewhere(self, rest: TableModel, one: ActiveEffect, blocks: Sequence[SpectralBlock]
+                        ) -> list[tuple[float, tuple[float, ...]]]:
+        """(expected chi-square, values) of the best start with other frequencies in each group of coupled coordinates,
+        the best first. The parameters of the other coordinates can compensate for a wrong frequency: a local minimum,
+        out of which no descent leads."""
+        return sorted(min((self._expected(rest, one.place, moved, blocks), moved) for moved in group)
+                      for group in _elsewhere(one))
 
     def _expected(self, model: TableModel, place: str, values: tuple[float, ...], blocks: Sequence[SpectralBlock]
                   ) -> float:
