@@ -32,7 +32,17 @@ from avis_ctrl.gap.result import (
     missed,
 )
 from avis_ctrl.gap.score import EvidenceScore
-from avis_ctrl.gap.search import Step, forbidden, implausible, name_of, outliers, search, without_effect
+from avis_ctrl.gap.search import (
+    Step,
+    forbidden,
+    implausible,
+    is_weak,
+    name_of,
+    outliers,
+    search,
+    without_effect,
+    without_needless,
+)
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
@@ -100,7 +110,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         prepared = with_noise_from(prepared, fits.best.model, each)
         fits = _refitted(fits, prepared, known, progress, each, settings)
     more, best = outliers(fits.best, prepared.data(prepared.fitted, settings.lines), known, settings, progress, each)
-    fits = replace(fits, steps=(*fits.steps, *more), best=best)
+    fits = _without_weak(replace(fits, steps=(*fits.steps, *more), best=best), prepared, settings)
     progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
@@ -143,6 +153,14 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
         return rise < settings.trace * ground and rise < settings.minor * before
     steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
+
+
+def _without_weak(fits: Fits, prepared: Prepared, settings: GapSettings) -> Fits:
+    """Without effects whose strength has fallen to nothing beside those found later."""
+    weak = [step for step in fits.steps if is_weak(fits.best, step.label, settings)]
+    kept, best = without_needless(weak, fits.best, prepared.data(prepared.fitted, settings.lines), settings)
+    gone = {step.label for step in weak} - {step.label for step in kept}
+    return replace(fits, steps=tuple(step for step in fits.steps if step.label not in gone), best=best)
 
 
 def _left(model, data: Data) -> float:

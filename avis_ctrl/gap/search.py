@@ -4,8 +4,8 @@
 
 At each step the effects that promise most by the score test are fitted, each beside what is there already with all
 parameters of the rig and all tolerances. The one of the largest evidence is taken if it beats the present model by more
-than the number of candidates explains. Then each effect found before is left out in turn: what the others explain as
-well goes.
+than the number of candidates explains. Effects that are not certain are compared with their rivals again, beside what
+was found after them. One whose strength has fallen to nothing is left out.
 """
 
 from __future__ import annotations
@@ -223,20 +223,37 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
         one = again.tried[label]
         full = fit(one.model, one.priors, one.z, data, one.variances, settings)
         steps[k] = replace(again, fitted=full.bare(), label=label)
-        steps[-1] = replace(steps[-1], fitted=full)
-        _pruned(steps, k, data, settings)
+        steps[k + 1:], best = without_needless(steps[k + 1:], full, data, settings)
+        steps[-1] = replace(steps[-1], fitted=best)
         return True
     return False
 
 
-def _pruned(steps: list[Step], kept: int, data: Data, settings: GapSettings) -> None:
-    """Without the effects found after one that was replaced that no longer gain the evidence a name needs."""
-    for step in steps[kept + 1:]:
-        best = steps[-1].fitted
+def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
+                     ) -> tuple[list[Step], Fitted]:
+    """Without those of some effects that no longer gain the evidence a name needs beside the others, and the fit that
+    is left."""
+    kept = []
+    for step in steps:
         rest = without_effect(best, step.label, data, settings)
         if rest is not None and best.log_evidence - rest.log_evidence < settings.certain:
-            steps.remove(step)
-            steps[-1] = replace(steps[-1], fitted=rest)
+            best = rest
+        else:
+            kept.append(step)
+    return kept, best
+
+
+def is_weak(best: Fitted, label: str, settings: GapSettings) -> bool:
+    """Whether an effect's strength is hardly distinguishable from none in the last fit, because those found after it
+    explain the same: by Wald's test, its log-likelihood gains less than twice what a name needs."""
+    one = next(effect for effect in best.model.effects if effect.label == label)
+    linear = [(name, value - p.none) for name, p, value in zip(one.names, one.parameters, one.values, strict=True)
+              if p.linear and name in best.priors.names]
+    if not linear:
+        return False
+    names, strength = zip(*linear, strict=True)
+    away = np.array(strength)
+    return float(away @ np.linalg.solve(best.covariance_of(names), away)) / 2 < 2 * settings.certain
 
 
 def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
