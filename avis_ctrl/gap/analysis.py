@@ -109,8 +109,10 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         progress("noise estimated again, with the effects that were found")
         prepared = with_noise_from(prepared, fits.best.model, each)
         fits = _refitted(fits, prepared, known, progress, each, settings)
-    more, best = outliers(fits.best, prepared.data(prepared.fitted, settings.lines), known, settings, progress, each)
-    fits = _without_weak(replace(fits, steps=(*fits.steps, *more), best=best), prepared, settings)
+    data = prepared.data(prepared.fitted, settings.lines)
+    more, best = outliers(fits.best, data, known, settings, progress, each)
+    steps, best = _without_weak((*fits.steps, *more), best, data, settings)
+    fits = replace(fits, steps=steps, best=best)
     progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
@@ -155,12 +157,13 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
-def _without_weak(fits: Fits, prepared: Prepared, settings: GapSettings) -> Fits:
-    """Without effects whose strength has fallen to nothing beside those found later."""
-    weak = [step for step in fits.steps if is_weak(fits.best, step.label, settings)]
-    kept, best = without_needless(weak, fits.best, prepared.data(prepared.fitted, settings.lines), settings)
+def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
+                  ) -> tuple[tuple[Step, ...], Fitted]:
+    """Without effects whose strength has fallen to nothing beside the others."""
+    weak = [step for step in steps if is_weak(best, step.label, settings)]
+    kept, best = without_needless(weak, best, data, settings)
     gone = {step.label for step in weak} - {step.label for step in kept}
-    return replace(fits, steps=tuple(step for step in fits.steps if step.label not in gone), best=best)
+    return tuple(step for step in steps if step.label not in gone), best
 
 
 def _left(model, data: Data) -> float:
@@ -181,36 +184,47 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         probability[step.label], rivals[step.label] = probability_of(step, settings)
     for step in fits.steps:
         label = step.label
-        why = _refusal(fits.best, step, label, probability[label], held, settings)
+        why = _refusal(fits.best, step, probability[label], data, held, settings)
         if why:
             one = next(effect for effect in fits.best.model.effects if effect.label == label)
             refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
                               "has no name" if one.effect.outside else
                               f"{one.effect.name} fits best, but is not named: {why}")
             best = without_effect(best, label, data, settings) or best
+    if refused:
+        best = _without_weak([step for step in fits.steps if step.label in best.labels], best, data, settings)[1]
     kept = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, kept, {label: rivals[label] for label in kept}, refused)
 
 
-def _refusal(best: Fitted, step: Step, label: str, probability: float, held: Data, settings: GapSettings) -> str:
+def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Data, settings: GapSettings) -> str:
     """Why an effect that was found is not named; empty where it is."""
-    one = next(effect for effect in best.model.effects if effect.label == label)
+    one = next(effect for effect in best.model.effects if effect.label == step.label)
     if one.effect.outside:
         return "it is not in the library"
     if probability < settings.headline:
         return f"other explanations are as probable (its own probability is {probability:.2f})"
     if reason := forbidden(best, one):
         return reason
-    # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
-    after, before = (sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
-                     for one in (step.fitted, step.before))
-    if after <= before:
+    if not _borne_out(best, step, data, held, settings):
         return "held-out records are not more likely with it"
     absent = {name: p.none for name, p in zip(one.names, one.parameters, strict=True) if p.linear}
     for half in halves(best, _judged(one), settings, absent=absent):
         if half.change > settings.law_change:
             return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
     return ""
+
+
+def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSettings) -> bool:
+    """Whether held-out records are more likely with an effect: with what was known when it was found, or else beside
+    all that was found later, without which a weak effect may be lost in what was missing then."""
+    def likelihood(one: Fitted) -> float:
+        # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
+        return sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
+    if likelihood(step.fitted) > likelihood(step.before):
+        return True
+    rest = without_effect(best, step.label, data, settings.quick)
+    return rest is not None and likelihood(best) > likelihood(rest)
 
 
 def _judged(one: ActiveEffect) -> list[str]:

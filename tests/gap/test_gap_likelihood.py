@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
 from avis_ctrl.gap.probability import odds_against
-from avis_ctrl.gap.search import with_effect, without_effect
+from avis_ctrl.gap.search import Step, is_weak, with_effect, without_effect, without_needless
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
@@ -407,6 +407,26 @@ def test_values_beyond_their_tolerance_have_moved_as_their_effect_says(name, pla
             assert found[parameter].value == pytest.approx(factor * nominal[parameter], rel=1e-9)
     assert sum(abs(row.moved) > 1e-9 for row in found.values()) == sum(z != 0 for _, z in expected.values())
     assert len(found) == len(priors.names)
+
+
+def test_an_effect_that_those_found_later_replace_is_left_out():
+    """Relaxation is fitted to what a delay leaves; beside the delay nothing of it remains."""
+    settings, free = replace(GapSettings().quick, rounds=1), default_parameters(RIG)
+    model = TableModel(bare(free))
+    late = model.with_effect(active(library()["loop_delay"], model, "loop", (1e-3,)))
+    data = Data(tuple(block(late, seed, noise=1e-6) for seed in (5, 6)), (0.2, 0.5))
+    priors = re_identified(RIG, settings)
+    now, steps = fit(model, priors, priors.z(model.values), data, first_variances(data, settings), settings), []
+    for name, place in (("mount_relaxation", "isolators z"), ("loop_delay", "loop")):
+        start = active(library()[name], now.model, place)
+        after = with_effect(now, start, data, settings)
+        steps.append(Step(now, after, {}, 2))
+        now = after
+    relaxation, delay = now.labels
+    assert is_weak(now, relaxation, settings) and not is_weak(now, delay, settings)
+    kept, rest = without_needless(steps, now, data, settings)
+    assert [step.label for step in kept] == [delay] == list(rest.labels)
+    assert rest.model.effects[-1].values[0] == pytest.approx(1e-3, rel=0.02)
 
 
 def test_a_channel_knows_its_mount_wherever_it_is_listed():
