@@ -17,8 +17,6 @@ import numpy as np
 import scipy.optimize as so
 
 from avis_ctrl.classical.skyhook import Skyhook
-from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti.connect import lft_lower
 from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 
@@ -276,30 +274,6 @@ def _minimax_step(values: np.ndarray, slopes: np.ndarray, in_band: np.ndarray, l
                          b_ub=np.r_[log_limit - values, -values[in_band]],
                          bounds=[*zip(low, high, strict=True), (0, None), (None, None)], method="highs-ds")
     return program.x[:n] if program.status == 0 else np.zeros(n)
-
-
-def tune_skyhook(scenarios: Scenarios, axes: tuple[str, ...], search: TuningRange, band_Hz: tuple[float, float],
-                 peak_limit: float, settings: TuningSettings = TuningSettings()) -> Skyhook:
-    """The skyhook with the lowest sampled transmissibility in a band whose sampled peak stays below a limit.
-
-    Parameters
-    ----------
-    peak_limit : largest singular value allowed at any frequency (a ratio, not dB). Where no tuning found keeps it, the
-        one of least peak is returned.
-
-    Raises
-    ------
-    ComputationError : no stable tuning was found in the range (the nominal closed loop is tested at the end).
-    """
-    task = Search(scenarios, axes, search, band_Hz, settings)
-    found = [task.improved(start, peak_limit) for start in task.best_starts(peak_limit)]
-    best = search.skyhook(axes, min(found, key=lambda point: task.merit(point, peak_limit).key()))
-    closed = lft_lower(scenarios.plant.P, best.controller())
-    if not closed.is_stable():
-        raise ComputationError("no stable skyhook in the range searched",
-                               measured=f"largest real part of a pole {np.max(closed.poles().real):.3g} rad/s",
-                               cause="gains or delay too large", next_step="widen the range of gains downwards")
-    return best
 
 
 def largest_singular_value(T: np.ndarray) -> np.ndarray:

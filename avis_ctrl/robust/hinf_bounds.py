@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.hinf_plant import (
     Plant,
     as_plant,
@@ -31,7 +29,6 @@ from avis_ctrl.robust.hinf_plant import (
     pointwise,
     posed_plant,
     rank_margins,
-    regularised,
 )
 from avis_ctrl.robust.hinf_riccati import find_gamma
 from avis_ctrl.robust.hinf_settings import SETTINGS
@@ -64,42 +61,6 @@ def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = N
         if lower > best.gamma:
             return LowerBound(float(lower), complex(np.nan), "the two-Riccati test fails there")
     return best
-
-
-def limiting_weights(P: Any, nmeas: int, ncon: int, step: float = 0.02) -> tuple[tuple[str, float], ...]:
-    """Which weights forbid a smaller gamma: (signal, elasticity) of every z and w, the largest first.
-
-    An elasticity of 0.7 says that a weight lowered by 1 % lowers the optimum by 0.7 %; those of all z add up to 1,
-    and so do those of all w, since the optimum is proportional to either. Central differences of the bracketed
-    optimum over the relative `step`; in singular problems of the plant with its small extra channels.
-    ComputationError where they do not add up, to 10 %: then round-off or those channels decide.
-    """
-    P = as_plant(P, nmeas, ncon)
-    posed_plant(P, nmeas, ncon)
-    found = []
-    for count, names, of_outputs in ((P.noutputs - nmeas, P.outputs, True), (P.ninputs - ncon, P.inputs, False)):
-        for k in range(count):
-            gammas = []
-            for factor in (1 + step, 1 - step):
-                scale = np.ones(P.noutputs if of_outputs else P.ninputs)
-                scale[k] = factor
-                gammas.append(_optimum(P.scaled(left=scale) if of_outputs else P.scaled(right=scale), nmeas, ncon))
-            found.append((names[k], float(np.log(gammas[0] / gammas[1]) / np.log((1 + step) / (1 - step)))))
-        total = sum(one for _, one in found[-count:])
-        if abs(total - 1) > 0.1:
-            raise ComputationError("the weights that limit gamma cannot be told",
-                                   measured=f"elasticities of {list(names[:count])} add up to {total:.3g}, not 1",
-                                   cause="a singular problem, decided by its regularisation",
-                                   next_step="give every control a weight and every measurement white noise")
-    return tuple(sorted(found, key=lambda one: -one[1]))
-
-
-def _optimum(P: StateSpace, nmeas: int, ncon: int) -> float:
-    plant = posed_plant(P, nmeas, ncon)
-    singular = [margin < SETTINGS.rank_tolerance for margin in rank_margins(plant)]
-    if any(singular):
-        plant = regularised(plant, 1e-4, singular[0], singular[1], True)
-    return find_gamma(normal_form(plant).plant, 1e-6).upper.gamma
 
 
 def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound:

@@ -1,4 +1,4 @@
-"""Controllers of lower order, and in sampled time: what each step costs is measured, not assumed.
+"""Controllers of lower order: what each step costs is measured, not assumed.
 
 Balanced truncation bounds the error of K itself; what counts is the closed loop. So a reduced controller is kept
 only if the figure that the caller measures with it (gamma, mu, ...) grows by no more than was allowed.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, balanced_truncation, discretise, hinf_norm, lft_lower
+from avis_ctrl.lti import StateSpace, balanced_truncation, hinf_norm, lft_lower
 from avis_ctrl.robust.hinf_plant import as_plant
 
 
@@ -36,24 +36,6 @@ class Reduction:
     def growth(self) -> float:
         """Relative growth of the figure."""
         return self.figure / self.full - 1 if self.full > 0 else 0.0
-
-
-@dataclass(frozen=True)
-class SampledController:
-    """A sampled controller beside its continuous original.
-
-    fastest_pole : [rad/s] largest magnitude among the continuous controller's poles.
-    nyquist : [rad/s] half the sample rate; pole_ratio = fastest_pole / nyquist.
-    response_error : largest error of the frequency response up to a quarter of the sample rate, relative to the
-        largest gain there.
-    """
-
-    K: StateSpace
-    fastest_pole: float
-    nyquist: float
-    pole_ratio: float
-    response_error: float
-    note: str
 
 
 def closed_loop_gamma(P: StateSpace, K: StateSpace) -> float:
@@ -151,32 +133,3 @@ def split(K: StateSpace, first: Callable[[float, float], bool]) -> tuple[StateSp
     chosen = StateSpace(T[:k, :k], B[:k] - X @ B[k:], C[:, :k], K.D, K.dt, K.inputs, K.outputs)
     rest = StateSpace(T[k:, k:], B[k:], C[:, :k] @ X + C[:, k:], 0 * K.D, K.dt, K.inputs, K.outputs)
     return chosen, rest
-
-
-def discretise_controller(K: StateSpace, sample_rate_Hz: float,
-                          method: Literal["tustin", "zoh"] = "tustin") -> SampledController:
-    """K at a sample rate [Hz], with its fastest pole against half that rate and the error of its response.
-
-    Raises
-    ------
-    InputError : a rate that is not positive, or K already sampled.
-    ComputationError : a pole that the sampling makes unstable.
-    """
-    if not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
-        raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
-    sampled = discretise(K, 1.0 / sample_rate_Hz, method)
-    if K.is_stable() and not sampled.is_stable():
-        raise ComputationError("sampling made the controller unstable",
-                               measured=f"largest pole magnitude {np.max(np.abs(sampled.poles())):.6g}",
-                               cause="a pole at the edge of stability", next_step="use method='tustin'")
-    nyquist = np.pi * sample_rate_Hz
-    fastest = float(np.max(np.abs(K.poles()), initial=0.0))
-    omega = np.geomspace(1e-4, 0.5, 200) * nyquist
-    continuous, discrete = K.frequency_response(omega), sampled.frequency_response(omega)
-    largest = float(np.max(np.abs(continuous))) or 1.0
-    error = float(np.max(np.abs(continuous - discrete))) / largest
-    ratio = fastest / nyquist
-    verdict = "slow enough" if ratio < 0.5 else "too fast for this rate: the sampled controller differs from it"
-    note = (f"fastest pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate ({nyquist:.4g} rad/s), "
-            f"{verdict}; response error up to a quarter of the rate {100 * error:.2g} %")
-    return SampledController(sampled, fastest, float(nyquist), ratio, error, note)

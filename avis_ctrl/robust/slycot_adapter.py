@@ -42,15 +42,3 @@ def hinf_norm_slicot(system: StateSpace, tolerance: float = 1e-9) -> float:
     except slycot.exceptions.SlycotError as error:
         raise ComputationError("AB13DD failed", measured=str(error)) from error
     return float(gain)
-
-
-def h2_norm_slicot(system: StateSpace) -> float:
-    """H2 norm of a stable system by AB13BD."""
-    import slycot
-
-    n, m, p = system.nstates, system.ninputs, system.noutputs
-    try:
-        return float(slycot.ab13bd("D" if system.dt else "C", "H", n, m, p, system.A.copy(), system.B.copy(),
-                                   system.C.copy(), system.D.copy()))
-    except slycot.exceptions.SlycotError as error:
-        raise ComputationError("AB13BD failed", measured=str(error)) from error

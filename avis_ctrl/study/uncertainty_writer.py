@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avis_ctrl.files import write_whole
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.rig import Rig
@@ -54,14 +52,6 @@ def _spread_section(spread: FrfSpread, confidence: float = 0.95) -> SpreadSectio
     return SpreadSection(keep=list(spread.keep), frequency_Hz=spread.frequency_Hz.tolist(),
                          measured=spread.measured.tolist(), confidence=list(spread.confidences),
                          noise=spread.noise.tolist(), weight=weight)
-
-
-def write_uncertainty(path: str | Path, rig: Rig, information: Information, spreads: Sequence[FrfSpread],
-                      provenance: Mapping[str, Any] | None = None) -> UncertaintyFile:
-    """Write uncertainty.json, whole or not at all; its content is returned."""
-    content = uncertainty_content(rig, information, spreads, provenance)
-    write_whole(Path(path), uncertainty_json(content).encode())
-    return content
 
 
 def uncertainty_json(content: UncertaintyFile) -> str:

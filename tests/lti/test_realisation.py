@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, balanced_truncation, discretise, gain, hinf_norm, minimal, tf
 from avis_ctrl.lti.realisation import hankel_singular_values
-from avis_ctrl.robust.reduction import discretise_controller
 
 
 def random_stable(rng, n, n_y=2, n_u=2):
@@ -89,8 +88,6 @@ def test_unknown_ways_of_sampling_are_refused(rng, method):
     for G in (random_stable(rng, 2), gain([[1.0]])):
         with pytest.raises(InputError, match="'zoh' or 'tustin'"):
             discretise(G, 0.1, method)
-        with pytest.raises(InputError, match="'zoh' or 'tustin'"):
-            discretise_controller(G, 10.0, method)
 
 
 def test_tustin_keeps_the_norm(rng):

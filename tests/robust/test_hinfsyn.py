@@ -21,7 +21,7 @@ from avis_ctrl.lti import (
     tf,
 )
 from avis_ctrl.lti.realisation import hankel_singular_values
-from avis_ctrl.robust.hinf_bounds import hinf_lower_bound, limiting_weights
+from avis_ctrl.robust.hinf_bounds import hinf_lower_bound
 from avis_ctrl.robust.hinf_lmi import lmi_gamma
 from avis_ctrl.robust.hinf_plant import Plant
 from avis_ctrl.robust.hinf_riccati import gamma_test
@@ -193,26 +193,6 @@ class TestAgainstMatrixInequalities:
         assert reached < 0.1
         assert hinf_lower_bound(P, 2, 2).gamma <= reached
         assert hinfsyn(P, 2, 2).gamma_optimal_bounds[0] <= reached
-
-
-class TestWhichWeightForbids:
-    def test_elasticities_add_up_to_one(self):
-        """Euler's theorem: the optimum is homogeneous of degree one in all weights of z, and in all of w."""
-        P = mixed_sensitivity(([1 / 1.5, 10.0], [1, 1e-3]))
-        found = dict(limiting_weights(P, 1, 1))
-        assert found["wp_e"] + found["wu_u"] == pytest.approx(1, abs=1e-3)
-        assert found["r"] == pytest.approx(1, abs=1e-3)
-        assert found["wp_e"] > found["wu_u"] > 0
-
-    def test_a_weight_that_does_not_matter(self):
-        """Two loops side by side: only the worse one's weights count."""
-        parts = [mixed_sensitivity(([k / 1.5, k * 10.0], [1, 1e-3])) for k in (1.0, 0.1)]
-        both = append(*(p.renamed([f"{n}{k}" for n in p.inputs], [f"{n}{k}" for n in p.outputs])
-                        for k, p in enumerate(parts)))
-        both = both.select(["wp_e0", "wu_u0", "wp_e1", "wu_u1", "y0", "y1"], ["r0", "r1", "u0", "u1"])
-        found = dict(limiting_weights(both, 2, 2))
-        assert found["wp_e1"] == pytest.approx(0, abs=1e-3) and found["wu_u1"] == pytest.approx(0, abs=1e-3)
-        assert found["r0"] == pytest.approx(1, abs=1e-3)
 
 
 class TestSingularProblems:

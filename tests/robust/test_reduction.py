@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summing_junction, tf
 from avis_ctrl.robust.hinfsyn import hinfsyn
-from avis_ctrl.robust.reduction import discretise_controller, reduce_controller, split_stable, truncate_slow
+from avis_ctrl.robust.reduction import reduce_controller, split_stable, truncate_slow
 
 
 @pytest.fixture(scope="module")
@@ -73,18 +73,6 @@ def test_refusals(process):
         reduce_controller(process, gain([[0.1]]), growth=-1)
     with pytest.raises(InputError, match="does not stabilise"):
         reduce_controller(process, gain([[-100.0]]))
-    with pytest.raises(InputError, match="sample_rate_Hz"):
-        discretise_controller(gain([[1.0]]), 0.0)
-
-
-def test_sampled_controller_reports_its_fastest_pole():
-    K = tf([30.0], [1, 30.0])
-    slow, fast = discretise_controller(K, 1000.0), discretise_controller(K, 5.0)
-    assert slow.fastest_pole == pytest.approx(30.0) and slow.pole_ratio == pytest.approx(30 / (np.pi * 1000))
-    assert slow.response_error < 0.01 and "slow enough" in slow.note
-    assert fast.pole_ratio > 1 and "too fast" in fast.note
-    s = 2j * np.pi * 3
-    assert slow.K(np.exp(s * 1e-3))[0, 0] == pytest.approx(K(s)[0, 0], rel=1e-3)
 
 
 def test_slow_poles_are_left_out_and_nothing_else(rng):

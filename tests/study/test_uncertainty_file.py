@@ -25,7 +25,7 @@ from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import design_provenance
 from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
-from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json, write_uncertainty
+from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 
 NAMES = ("mass", "J1", *(f"isolator{i}.{kind}_z" for i in (1, 2, 3, 4) for kind in "kc"), "sensor.Sz1")
@@ -87,7 +87,8 @@ def folder(tmp_path, rig, content):
 
 
 def test_what_is_written_is_read_back(folder, rig, content):
-    write_uncertainty(folder / "uncertainty.json", rig, information(rig), [spread()], {"measurement": "c.h5"})
+    written = uncertainty_content(rig, information(rig), [spread()], {"measurement": "c.h5"})
+    (folder / "uncertainty.json").write_text(uncertainty_json(written), encoding="utf-8")
     assert read_uncertainty(folder / "uncertainty.json") == content
     made = content.factor() @ content.factor().T
     assert np.allclose(made, information(rig).covariance, rtol=1e-9, atol=1e-12 * made.max())
