@@ -176,7 +176,8 @@ def power(fitted: Fitted | AxisModel, by_line: bool = False) -> Any:
     f, left, whole = [], [], 0.0
     for block in model.lines.held.blocks:
         e = np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2))
-        f.append(block.omega / (2 * np.pi))
+        # The mean of a window stands at a thousandth of the first line (`records`).
+        f.append(np.where(block.omega < 0.01 * np.unique(block.omega)[:2][-1], 0.0, block.omega / (2 * np.pi)))
         left.append(e)
         whole += float(np.sum(np.abs(block.Y) ** 2))
     return (np.concatenate(f), np.concatenate(left) / whole) if by_line else float(sum(map(np.sum, left)) / whole)
@@ -291,9 +292,9 @@ def _plain(fitted: Fitted) -> dict[str, Any]:
 
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
-    """The octaves that together hold at least half of what remains, largest first."""
+    """The octaves that together hold at least half of what remains, largest first; the mean in the lowest."""
     f, left = power(best, by_line=True)
-    octave = np.floor(np.log2(np.maximum(f, 1e-3))).astype(int)
+    octave = np.floor(np.log2(np.maximum(f, np.min(f[f > 0])))).astype(int)
     found: list[dict[str, Any]] = []
     for k in sorted(np.unique(octave), key=lambda k: -float(left[octave == k].sum())):
         inside = octave == k
