@@ -193,22 +193,30 @@ class _Expand(Protocol):
         """About z; without derivative the sum of squares alone. InputError where no rig has these values."""
 
 
-def _descent(expand: _Expand, at: _Expansion, iterations: int, settings: FitSettings) -> tuple[_Expansion, int]:
-    """Gauss-Newton steps, each damped until it descends (Levenberg 1944); the last expansion, and how many steps there
-    were.
+def _descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
+             ) -> tuple[_Expansion, int]:
+    """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and how many steps
+    there were.
 
+    A parameter at its bound stays there while the sum of squares would fall beyond it, and the others find their own
+    optimum (an active set).
     Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
     hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
     hardly corrects these, and descends in ever shorter ones.
     """
-    needed = 0.0
+    needed, (low, high) = 0.0, priors.bounds()
+    at = expand(np.clip(z, low, high))
     for steps in range(iterations):
-        slope, one = at.g - at.z, np.eye(len(at.z))
-        undamped = np.linalg.solve(at.H + one, slope)
-        if undamped @ slope < settings.converged * len(at.now.e):
+        slope = at.g - at.z
+        free = np.flatnonzero(~((at.z <= low) & (slope < 0) | (at.z >= high) & (slope > 0)))
+        H, one = at.H[np.ix_(free, free)], np.eye(len(free))
+        undamped = np.linalg.solve(H + one, slope[free])
+        if undamped @ slope[free] < settings.converged * len(at.now.e):
             return at, steps
-        for damping in _dampings(at.H, needed, settings):
-            z = at.z + (np.linalg.solve(at.H + (1 + damping) * one, slope) if damping else undamped)
+        for damping in _dampings(H, needed, settings):
+            z = at.z.copy()
+            z[free] += np.linalg.solve(H + (1 + damping) * one, slope[free]) if damping else undamped
+            z = np.clip(z, low, high)
             try:
                 # Of a step that may well be refused the derivative is not needed yet.
                 if not (damping or needed) or expand(z, derivative=False).whole < at.whole:
@@ -247,7 +255,7 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, data, weights, derivative)
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
-        at, more = _descent(expand, expand(z), settings.iterations, settings)
+        at, more = _descent(expand, z, priors, settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
         reached = -0.5 * (at.whole + weights.log_determinant) + log_prior(variances, noise, settings)
         rise = reached - best[0] if best else np.inf
@@ -331,7 +339,7 @@ class Profile:
             H, g, cost = weights.normal_equations(now.J, now.e)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
             return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
-        end, _ = _descent(expand, expand(z), iterations, self.settings)
+        end, _ = _descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
         gain = 0.5 * (fall - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
         gain += _price_of_ends(self.fitted.model, self.data) - _price_of_ends(end.model, self.data)

@@ -41,6 +41,11 @@ class Priors:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.positive, np.log(values / self.mean) / self.sigma, (values - self.mean) / self.sigma)
 
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: standardised values at the lower and upper bound; infinite where there is none."""
+        low, high = (self.z(np.broadcast_to(one, len(self.names)).astype(float)) for one in (self.low, self.high))
+        return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+
     def followed_by(self, other: Priors) -> Priors:
         """Both, one after the other."""
         def both(name: str) -> np.ndarray:

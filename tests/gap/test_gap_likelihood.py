@@ -129,6 +129,22 @@ def test_parameters_stay_within_their_bounds():
     assert_allclose(priors.values(np.array([3.0, 1.0])), [0.5, np.exp(0.1)])
 
 
+def test_at_a_bound_the_other_parameters_find_their_own_optimum():
+    """The conditions of Karush, Kuhn and Tucker, where the optimum lies beyond the bound of one of several gains that
+    are hardly told apart."""
+    settings, known = GapSettings(rounds=0), bare().all_parameters()
+    names = ("actuator.Az1", "actuator.Az2", "actuator.Az3", "sensor.Sz1", "sensor.Sz2", "sensor.Sz3")
+    mean = np.array([known[name].value for name in names])
+    priors = Priors(names, mean, np.full(len(mean), 0.1), np.ones(len(mean), bool), 0.0, 1.01 * mean)
+    truth = mean * np.where(np.arange(len(mean)) == 0, 1.2, 0.97)
+    data = Data(tuple(block(bare(names).at(truth), seed, 120, 1e-7) for seed in (3, 4)), (0.2, 0.2))
+    found = fit(bare(names), priors, np.zeros(len(mean)), data, first_variances(data, settings), settings)
+    slope = (found.J @ found.e - found.z) / np.sqrt(np.sum(found.J ** 2, axis=1) + 1)
+    bound = found.z == priors.bounds()[1]
+    assert bound[0] and not np.all(bound)
+    assert np.all(slope[bound] > 1) and np.max(np.abs(slope[~bound])) < 0.05
+
+
 def found_at(seed: int = 7, bend: float = 0.0):
     """A fit of one sensor's gain; bend : by how much it is another one above 8 Hz."""
     settings = GapSettings(rounds=0)
