@@ -92,16 +92,22 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
         else:
             wrong = [worst] if worst else []
             refused += wrong
+        if not wrong:
+            free = unnamed(best, explored, problem.effects)
+            shares = Shares.of(base, best, free, names, explored, problem)
+            uncertain = [one for one in names if not shares.certain(best, one.effect, settings)]
+            wrong = sorted(uncertain, key=lambda one: shares.of_effect[one.effect.label])[:1]
+            refused += [replace(one, refused="its size is not certain to differ from zero") for one in wrong]
         for one in wrong:
             best = explored.without(best, one.effect.label) or base
         if not wrong:
             break
-    free = unnamed(best, explored, problem.effects)
     told = power(base) - power(best)
     if not names or (free is not None and told < settings.right_shape * (power(base) - power(free))):
         refused += [replace(one, refused="a function of another shape takes far more") for one in names]
         names, best, free = [], base, unnamed(base, explored, problem.effects)
-    return _gap(problem, base, best, free, names, refused, explored, settings)
+        shares = Shares.of(base, best, free, names, explored, problem)
+    return _gap(problem, base, best, free, shares, names, refused, explored, settings)
 
 
 def _better_shape(best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
@@ -160,10 +166,6 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
         return edge
     if rest is not None and not borne_out(best, rest, settings):
         return "held-out data do not bear it out"
-    std = np.sqrt(np.diag(robust(best))) * _widening(found, settings)
-    at = [best.model.names.index(f"{p.name}@{one.label}") for p in one.parameters if p.linear]
-    if all(abs(best.model.values[k]) < settings.apart * std[k] for k in at):
-        return "its size is not certain to differ from zero"
     for half in found:
         if half.change > settings.law_change:
             return f"{half.words} calls for another size, by {100 * half.change:.0f} %"
@@ -183,44 +185,46 @@ def power(fitted: Fitted | AxisModel, by_line: bool = False) -> Any:
     return (np.concatenate(f), np.concatenate(left) / whole) if by_line else float(sum(map(np.sum, left)) / whole)
 
 
-def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name],
-         refused: Sequence[Name], explored: Explored, settings: AxisSettings) -> AxisGap:
-    outside = [one.label for one in best.model.effects if one.outside]
-    whole = power(best)
-    before, after = power(base), whole
-    for label in outside:
-        rest = explored.without(best, label)
-        after = max(after, power(rest) if rest else before)
-    floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
-    excess = max(before - floor, 1e-300)
-    left = max(after - floor, 0.0) / excess
-    shares, alone = {}, {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
-    for label, left_out in alone.items():  # of what the others could not take in its place
-        rest = explored.without(best, label)
-        taken = min(left_out, power(rest) if rest else left_out) - whole
-        shares[label] = float(np.clip(taken / excess, 0.0, 1.0))
-    covariance = _widened(best, names, shares, left)
-    effects = [_reported(one, best, covariance, shares[one.effect.label], problem) for one in names]
-    effects.sort(key=lambda one: -alone[one.label])
-    told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
-    traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
-    stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
-    closed = after <= settings.within_noise * floor or max(after - floor, 0.0) < settings.small ** 2
-    verdict = ("partly explained", "explained")[closed] if told else ("unexplained", "none")[closed]
-    base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
-                                  unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
-    where = _where(best, problem)
-    onward = next((one.effect.separated_by for one in names if one.rivals), None)
-    unknown = next((one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects
-                    if one.outside), "")
-    said = _sentences(problem, verdict, told, traces, stages, names, refused, unknown)
-    ups = tuple(RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
-                for one in names for r in one.rivals)
-    return AxisGap(problem.kind, verdict, told, traces, tuple(stages), where, tuple(said), onward, base_values,
-                   _ratios(problem, best, covariance), ups,
-                   None if problem.noise is None else float(np.sqrt(after / max(problem.noise, 1e-300))), left,
-                   _pictures(base, best, stages), {"kind": problem.kind, **problem.plain, "baseline": _plain(base),
-                                                   "updated": _plain(best)})
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """What each effect takes of the gap on held-out data, and how well its parameters are known.
+
+    floor : power that noise or the best free function leaves. after : power that the model leaves, without functions
+    that have no name. left : of the gap. alone : power left without an effect, nothing refitted; of_effect : its share
+    of the gap, of what the others could not take in its place; both by label. covariance : of all parameters.
+    """
+
+    floor: float
+    after: float
+    left: float
+    alone: Mapping[str, float]
+    of_effect: Mapping[str, float]
+    covariance: np.ndarray
+
+    @staticmethod
+    def of(base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored,
+           problem: Problem) -> Shares:
+        whole = power(best)
+        before, after = power(base), whole
+        for one in best.model.effects:
+            if one.outside:
+                rest = explored.without(best, one.label)
+                after = max(after, power(rest) if rest else before)
+        floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
+        excess = max(before - floor, 1e-300)
+        left = max(after - floor, 0.0) / excess
+        shares, alone = {}, {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
+        for label, left_out in alone.items():
+            rest = explored.without(best, label)
+            taken = min(left_out, power(rest) if rest else left_out) - whole
+            shares[label] = float(np.clip(taken / excess, 0.0, 1.0))
+        return Shares(floor, after, left, alone, shares, _widened(best, names, shares, left))
+
+    def certain(self, best: Fitted, one: Effect, settings: AxisSettings) -> bool:
+        """Whether the size of an effect differs from zero by enough of its standard deviations."""
+        at = [best.model.names.index(f"{p.name}@{one.label}") for p in one.parameters if p.linear]
+        std = np.sqrt(np.diag(self.covariance))
+        return any(abs(best.model.values[k]) >= settings.apart * std[k] for k in at)
 
 
 def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], left: float) -> np.ndarray:
@@ -234,6 +238,34 @@ def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], l
             factor[k] = one.widened
             beside[k] = value ** 2 * left / (3 * max(shares[one.effect.label], left, 1e-12))
     return robust(best) * np.outer(factor, factor) + np.diag(beside)
+
+
+def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, found: Shares, names: Sequence[Name],
+         refused: Sequence[Name], explored: Explored, settings: AxisSettings) -> AxisGap:
+    covariance, left = found.covariance, found.left
+    effects = [_reported(one, best, covariance, found.of_effect[one.effect.label], problem) for one in names]
+    effects.sort(key=lambda one: -found.alone[one.label])
+    told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
+    traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
+    outside = [one.label for one in best.model.effects if one.outside]
+    stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
+    closed = found.after <= settings.within_noise * found.floor or (
+        max(found.after - found.floor, 0.0) < settings.small ** 2)
+    verdict = ("partly explained", "explained")[closed] if told else ("unexplained", "none")[closed]
+    base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
+                                  unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
+    where = _where(best, problem)
+    onward = next((one.effect.separated_by for one in names if one.rivals), None)
+    unknown = next((one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects
+                    if one.outside), "")
+    said = _sentences(problem, verdict, told, traces, stages, names, refused, unknown)
+    ups = tuple(RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
+                for one in names for r in one.rivals)
+    return AxisGap(problem.kind, verdict, told, traces, tuple(stages), where, tuple(said), onward, base_values,
+                   _ratios(problem, best, covariance), ups,
+                   None if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300))), left,
+                   _pictures(base, best, stages), {"kind": problem.kind, **problem.plain, "baseline": _plain(base),
+                                                   "updated": _plain(best)})
 
 
 def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
