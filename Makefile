@@ -19,11 +19,14 @@ lint: $(BIN)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# By file, so that what the tests of a file share is computed once.
+TEST = $(BIN)/pytest -n 2 --dist loadfile
+
 test: lint
-	$(BIN)/pytest -n 2 -m "not slow"
+	$(TEST) -m "not slow"
 
 test-slow: lint
-	AVIS_EXPLORE=1 $(BIN)/pytest -n 2
+	AVIS_EXPLORE=1 $(TEST)
 
 demo: $(BIN)/.installed
 	$(BIN)/avis design designs/avis_z_phix.toml --out reports/avis_z_phix
