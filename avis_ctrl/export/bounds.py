@@ -41,7 +41,7 @@ class CoverSettings:
     """Filters that cover the two errors.
 
     lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
-        constant.
+        constant, and the intervals as wide as the first logarithmic one.
     intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide, so that Taylor's
         remainder is small against `harmless`.
     fitted : every so many intervals are fitted; the filter is then raised over all of them.
@@ -76,8 +76,9 @@ class Grid:
 
     @staticmethod
     def of(half_rate: float, settings: CoverSettings) -> Grid:
-        ends = np.concatenate([np.linspace(0.0, settings.lowest, 9)[:-1],
-                               np.geomspace(settings.lowest, 1.0, settings.intervals + 1)]) * half_rate
+        above = np.geomspace(settings.lowest, 1.0, settings.intervals + 1)
+        below = np.linspace(0.0, above[0], int(np.ceil(above[0] / (above[1] - above[0]))) + 1)
+        ends = np.concatenate([below[:-1], above]) * half_rate
         return Grid((ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2)
 
 
@@ -178,7 +179,8 @@ def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverS
     upper = np.maximum(lower, harmless)
     # Corners lie up to `reach` beyond the frequencies fitted: none below the first logarithmic interval.
     reach = 10.0
-    every = slice(int(np.searchsorted(grid.centre, 1.01 * reach * grid.centre[8])), None, settings.fitted)
+    every = slice(int(np.searchsorted(grid.centre, 1.01 * reach * settings.lowest * grid.centre[-1])), None,
+                  settings.fitted)
     # Above half the rate nothing has to be covered: the filter must not rise there, where the proof of robust stability
     # meets it, and may fall.
     end = grid.centre[-1]
