@@ -71,11 +71,11 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     plain = c_files(controller, guard, Provenance(()))
     certificate = certify(folder, controller, plain, progress)
     if not certificate.content["stable"]:
-        other = "double precision (without --float32)" if arithmetic == "float32" else "single precision (--float32)"
+        precise = "double precision (without --float32), or " if arithmetic == "float32" else ""
         further = "a larger --order" if name in folder.added else "another controller of the folder"
         raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
                                "written", measured="; ".join(dict.fromkeys(certificate.reasons)),
-                               next_step=f"try {other}, or {further}")
+                               next_step=f"try {precise}{further}")
     if not (mu := certificate.content["mu_upper"]) <= mu_at_most:
         raise ComputationError(f"mu of the exported controller {name!r} is not proved to be at most {mu_at_most:g}; "
                                "nothing was written", measured=f"upper bound of mu {mu:.4g}",

@@ -242,7 +242,9 @@ def test_six_states_by_descent_on_mu_are_certified(shipped, package, tmp_path, r
     peak = mu_peak(lft_lower(P.P, K), P.all_blocks)
     assert orders[-1][0] == K.nstates and peak.guaranteed
     assert peak.lower <= orders[-1][1] <= 1.01 * peak.upper
-    assert orders[0][0] == 12 and all(more > fewer for (more, _), (fewer, _) in pairwise(orders))
+    # At the last order modes are exchanged: the same number of states, and a smaller peak.
+    assert orders[0][0] == shipped.controller("mu").nstates
+    assert all(more[0] > fewer[0] or (more[0] == fewer[0] and more[1] > fewer[1]) for more, fewer in pairwise(orders))
     # The loop gain of the nominal table on a dense grid, hold and all images left out.
     omega = np.geomspace(np.pi * shipped.rig.sample_rate_Hz, 1e6, 2000)
     table = P.P.select(P.y, P.u).frequency_response(omega)
