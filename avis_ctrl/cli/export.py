@@ -69,6 +69,9 @@ def export(
     if order is not None:
         _orders(console, folder.added[controller].orders)
     _summary(console, made)
+    if (mu := made.certificate.content["mu_upper"]) > (allowed := mu_asked(folder.design)):
+        console.print(f"The bound of mu, {mu:.4g}, is above the {allowed:g} that the design requires of its own "
+                      "controller.")
     console.print(f"{len(files)} files in {path}")
 
 

@@ -41,7 +41,7 @@ class CoverSettings:
     """Filters that cover the two errors.
 
     lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
-        constant, and the intervals as wide as the first logarithmic one.
+        constant, and the intervals at most as wide as the first logarithmic one.
     intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide, so that Taylor's
         remainder is small against `harmless`.
     fitted : every so many intervals are fitted; the filter is then raised over all of them.

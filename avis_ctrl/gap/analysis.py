@@ -46,7 +46,7 @@ from avis_ctrl.gap.search import (
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import left_by, levels, named
 from avis_ctrl.gap.table_model import ActiveEffect
-from avis_ctrl.gap.tolerances import moved, of_effect, with_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, moved, of_effect, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
@@ -110,9 +110,9 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         prepared = with_noise_from(prepared, fits.best.model, each)
         fits = _refitted(fits, prepared, known, progress, each, settings)
     data = prepared.data(prepared.fitted, settings.lines)
-    more, best = outliers(fits.best, data, known, settings, progress, each)
-    steps, best = _without_weak((*fits.steps, *more), best, data, settings)
-    fits = replace(fits, steps=steps, best=best)
+    steps, best = _without_weak(fits.steps, fits.best, data, settings)
+    more, best = outliers(best, data, known, settings, progress, each)
+    fits = replace(fits, steps=(*steps, *more), best=best)
     progress("validation of the effects on held-out records")
     names = _names(fits, prepared, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
@@ -159,8 +159,9 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
 
 def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
                   ) -> tuple[tuple[Step, ...], Fitted]:
-    """Without effects whose strength has fallen to nothing beside the others."""
-    weak = [step for step in steps if is_weak(best, step.label, settings)]
+    """Without weak effects (`is_weak`) that the evidence does not need, and the fit that is left. A value beyond its
+    tolerance has its evidence in how far others had to move, or by narrower priors (`outliers`)."""
+    weak = [step for step in steps if name_of(step.label)[0] not in BEYOND and is_weak(best, step.label, settings)]
     kept, best = without_needless(weak, best, data, settings)
     gone = {step.label for step in weak} - {step.label for step in kept}
     return tuple(step for step in steps if step.label not in gone), best
@@ -192,9 +193,12 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
                               f"{one.effect.name} fits best, but is not named: {why}")
             best = without_effect(best, label, data, settings) or best
     if refused:
-        best = _without_weak([step for step in fits.steps if step.label in best.labels], best, data, settings)[1]
-    kept = {label: value for label, value in probability.items() if label in best.labels}
-    return Names(best, kept, {label: rivals[label] for label in kept}, refused)
+        left = [step for step in fits.steps if step.label in best.labels]
+        kept, best = _without_weak(left, best, data, settings)
+        refused |= {step.label: f"{name_of(step.label)[0]} is not named: without the effects above, no strength of it "
+                                "is left" for step in left if step not in kept}
+    named = {label: value for label, value in probability.items() if label in best.labels}
+    return Names(best, named, {label: rivals[label] for label in named}, refused)
 
 
 def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Data, settings: GapSettings) -> str:
@@ -216,14 +220,14 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
 
 
 def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSettings) -> bool:
-    """Whether held-out records are more likely with an effect: with what was known when it was found, or else beside
-    all that was found later, without which a weak effect may be lost in what was missing then."""
+    """Whether held-out records are more likely with an effect: when it was found, or, if not, beside all effects found
+    later. A weak effect may not show while a stronger one is missing."""
     def likelihood(one: Fitted) -> float:
         # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
         return sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
     if likelihood(step.fitted) > likelihood(step.before):
         return True
-    rest = without_effect(best, step.label, data, settings.quick)
+    rest = without_effect(best, step.label, data, settings)
     return rest is not None and likelihood(best) > likelihood(rest)
 
 

@@ -5,7 +5,7 @@
 At each step the effects that promise most by the score test are fitted, each beside what is there already with all
 parameters of the rig and all tolerances. The one of the largest evidence is taken if it beats the present model by more
 than the number of candidates explains. Effects that are not certain are compared with their rivals again, beside what
-was found after them. One whose strength has fallen to nothing is left out.
+was found after them. If a rival replaces one, effects found later that no longer raise the evidence are removed.
 """
 
 from __future__ import annotations
@@ -231,8 +231,8 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
 
 def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
                      ) -> tuple[list[Step], Fitted]:
-    """Without those of some effects that no longer gain the evidence a name needs beside the others, and the fit that
-    is left."""
+    """Leave out, one after the other, effects without which the evidence falls by less than a name needs. Returns the
+    steps that stay, and the fit."""
     kept = []
     for step in steps:
         rest = without_effect(best, step.label, data, settings)
@@ -244,8 +244,8 @@ def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: 
 
 
 def is_weak(best: Fitted, label: str, settings: GapSettings) -> bool:
-    """Whether an effect's strength is hardly distinguishable from none in the last fit, because those found after it
-    explain the same: by Wald's test, its log-likelihood gains less than twice what a name needs."""
+    """Whether an effect's strength is hardly distinguishable from none: by Wald's test it raises the log-likelihood by
+    less than twice the gain that a name needs."""
     one = next(effect for effect in best.model.effects if effect.label == label)
     linear = [(name, value - p.none) for name, p, value in zip(one.names, one.parameters, one.values, strict=True)
               if p.linear and name in best.priors.names]

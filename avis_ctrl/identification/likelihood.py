@@ -193,30 +193,25 @@ class _Expand(Protocol):
         """About z; without derivative the sum of squares alone. InputError where no rig has these values."""
 
 
-def _descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
+def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
              ) -> tuple[_Expansion, int]:
     """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and how many steps
     there were.
 
-    A parameter at its bound stays there while the sum of squares would fall beyond it, and the others find their own
-    optimum (an active set).
+    No parameter leaves its bounds, and the others find their own optimum beside one that has reached its bound
+    (`_bounded_step`).
     Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
     hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
     hardly corrects these, and descends in ever shorter ones.
     """
-    needed, (low, high) = 0.0, priors.bounds()
-    at = expand(np.clip(z, low, high))
+    needed, bounds = 0.0, priors.bounds
+    at = expand(np.clip(z, *bounds))
     for steps in range(iterations):
-        slope = at.g - at.z
-        free = np.flatnonzero(~((at.z <= low) & (slope < 0) | (at.z >= high) & (slope > 0)))
-        H, one = at.H[np.ix_(free, free)], np.eye(len(free))
-        undamped = np.linalg.solve(H + one, slope[free])
-        if undamped @ slope[free] < settings.converged * len(at.now.e):
+        undamped = _bounded_step(at, 0.0, bounds)
+        if (undamped - at.z) @ (at.g - at.z) < settings.converged * len(at.now.e):
             return at, steps
-        for damping in _dampings(H, needed, settings):
-            z = at.z.copy()
-            z[free] += np.linalg.solve(H + (1 + damping) * one, slope[free]) if damping else undamped
-            z = np.clip(z, low, high)
+        for damping in _dampings(at.H, needed, settings):
+            z = _bounded_step(at, damping, bounds) if damping else undamped
             try:
                 # Of a step that may well be refused the derivative is not needed yet.
                 if not (damping or needed) or expand(z, derivative=False).whole < at.whole:
@@ -229,6 +224,28 @@ def _descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, se
         else:
             return at, steps
     return at, iterations
+
+
+def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """z (n,) after a damped Gauss-Newton step within bounds.
+
+    Parameters that would leave their bounds are moved to them, and the step of the others is solved again. One that is
+    at its bound already stays there while the sum of squares falls towards the other side of it.
+    """
+    slope, (low, high) = at.g - at.z, bounds
+    M = at.H + (1 + damping) * np.eye(len(at.z))
+    z = at.z.copy()
+    free = ~((z <= low) & (slope < 0) | (z >= high) & (slope > 0))
+    while np.any(free):
+        moved = z - at.z
+        z[free] = at.z[free] + np.linalg.solve(M[np.ix_(free, free)],
+                                               slope[free] - M[np.ix_(free, ~free)] @ moved[~free])
+        beyond = free & ((z < low) | (z > high))
+        if not np.any(beyond):
+            break
+        z = np.clip(z, low, high)
+        free &= ~beyond
+    return z
 
 
 def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[float]:
@@ -255,7 +272,7 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, data, weights, derivative)
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
-        at, more = _descent(expand, z, priors, settings.iterations, settings)
+        at, more = descent(expand, z, priors, settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
         reached = -0.5 * (at.whole + weights.log_determinant) + log_prior(variances, noise, settings)
         rise = reached - best[0] if best else np.inf
@@ -339,7 +356,7 @@ class Profile:
             H, g, cost = weights.normal_equations(now.J, now.e)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
             return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
-        end, _ = _descent(expand, z, priors, iterations, self.settings)
+        end, _ = descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
         gain = 0.5 * (fall - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
         gain += _price_of_ends(self.fitted.model, self.data) - _price_of_ends(end.model, self.data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -34,17 +35,23 @@ class Priors:
         """(n,) of the parameters at standardised values z (n,)."""
         found = np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
                          self.mean + self.sigma * z)
-        return np.clip(found, self.low, self.high)
+        # At its bound a parameter has exactly that value, whatever rounding makes of it.
+        low, high = self.bounds
+        return np.clip(np.where(z <= low, self.low, np.where(z >= high, self.high, found)), self.low, self.high)
 
     def z(self, values: np.ndarray) -> np.ndarray:
         """(n,) standardised values; the inverse of `values`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.positive, np.log(values / self.mean) / self.sigma, (values - self.mean) / self.sigma)
 
+    @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: standardised values at the lower and upper bound; infinite where there is none."""
-        low, high = (self.z(np.broadcast_to(one, len(self.names)).astype(float)) for one in (self.low, self.high))
-        return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+        low, high = (np.broadcast_to(one, len(self.names)).astype(float) for one in (self.low, self.high))
+        # A positive parameter has no least standardised value where its lower bound is zero or less.
+        low = np.where(self.positive & (low <= 0), -np.inf, low)
+        z_low, z_high = (np.where(np.isinf(one), one, self.z(one)) for one in (low, high))
+        return z_low, z_high
 
     def followed_by(self, other: Priors) -> Priors:
         """Both, one after the other."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
@@ -22,7 +22,7 @@ from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_to
 from avis_ctrl.gap.validation import halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS
-from avis_ctrl.identification.likelihood import Data, first_variances, fit
+from avis_ctrl.identification.likelihood import Data, descent, first_variances, fit
 from avis_ctrl.identification.maximum_likelihood import transient_unknowns
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.priors import Priors, beside, identified, re_identified, with_tolerances
@@ -140,9 +140,28 @@ def test_at_a_bound_the_other_parameters_find_their_own_optimum():
     data = Data(tuple(block(bare(names).at(truth), seed, 120, 1e-7) for seed in (3, 4)), (0.2, 0.2))
     found = fit(bare(names), priors, np.zeros(len(mean)), data, first_variances(data, settings), settings)
     slope = (found.J @ found.e - found.z) / np.sqrt(np.sum(found.J ** 2, axis=1) + 1)
-    bound = found.z == priors.bounds()[1]
+    bound = found.z == priors.bounds[1]
     assert bound[0] and not np.all(bound)
     assert np.all(slope[bound] > 1) and np.max(np.abs(slope[~bound])) < 0.05
+
+
+@pytest.mark.parametrize("bounded", [2, 4])
+def test_a_step_within_bounds_is_that_of_bounded_least_squares(bounded, rng):
+    """Against SciPy, parameters strongly tied to each other: one step is enough for a linear model."""
+    for _ in range(20):
+        root = rng.standard_normal((80, 8)) @ np.diag(np.geomspace(1, 100, 8)) @ rng.standard_normal((8, 8))
+        target, low = 10 * rng.standard_normal(80), np.full(8, -np.inf)
+        low[:bounded] = 0.0
+        names = tuple("abcdefgh")
+        priors = Priors(names, np.zeros(8), np.ones(8), np.zeros(8, bool), low, np.full(8, np.inf))
+
+        def expand(z, derivative=True, root=root, target=target):
+            e = target - root @ z
+            return SimpleNamespace(z=z, H=root.T @ root, g=root.T @ e, whole=float(e @ e + z @ z),
+                                   now=SimpleNamespace(e=e))
+        end, _ = descent(expand, np.full(8, 0.1), priors, 12, SETTINGS)
+        best = lsq_linear(np.vstack([root, np.eye(8)]), np.r_[target, np.zeros(8)], (low, np.inf), tol=1e-14)
+        assert end.whole <= 2 * best.cost * (1 + 1e-8) + 1e-6 and np.all(end.z >= low)
 
 
 def found_at(seed: int = 7, bend: float = 0.0):

@@ -190,8 +190,9 @@ class Shares:
     """What each effect takes of the gap on held-out data, and how well its parameters are known.
 
     floor : power that noise or the best free function leaves. after : power that the model leaves, without functions
-    that have no name. left : of the gap. alone : power left without an effect, nothing refitted; of_effect : its share
-    of the gap, of what the others could not take in its place; both by label. covariance : of all parameters.
+    that have no name. left : share of the gap that remains. alone : power left without an effect, nothing refitted;
+    of_effect : share of the gap that it takes and the others, refitted, could not; both by label. covariance : of all
+    parameters.
     """
 
     floor: float
