@@ -70,8 +70,7 @@ def export(
         _orders(console, folder.added[controller].orders)
     _summary(console, made)
     if (mu := made.certificate.content["mu_upper"]) > (allowed := mu_asked(folder.design)):
-        console.print(f"The bound of mu, {mu:.4g}, is above the {allowed:g} that the design requires of its own "
-                      "controller.")
+        console.print(f"mu of the code is at most {mu:.4g}; the design requires at most {allowed:g}.")
     console.print(f"{len(files)} files in {path}")
 
 

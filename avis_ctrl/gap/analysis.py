@@ -163,8 +163,7 @@ def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: Gap
     tolerance has its evidence in how far others had to move, or by narrower priors (`outliers`)."""
     weak = [step for step in steps if name_of(step.label)[0] not in BEYOND and is_weak(best, step.label, settings)]
     kept, best = without_needless(weak, best, data, settings)
-    gone = {step.label for step in weak} - {step.label for step in kept}
-    return tuple(step for step in steps if step.label not in gone), best
+    return tuple(step for step in steps if step in kept or step not in weak), best
 
 
 def _left(model, data: Data) -> float:
@@ -187,7 +186,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         label = step.label
         why = _refusal(fits.best, step, probability[label], data, held, settings)
         if why:
-            one = next(effect for effect in fits.best.model.effects if effect.label == label)
+            one = fits.best.model.effect(label)
             refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
                               "has no name" if one.effect.outside else
                               f"{one.effect.name} fits best, but is not named: {why}")
@@ -195,15 +194,15 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
     if refused:
         left = [step for step in fits.steps if step.label in best.labels]
         kept, best = _without_weak(left, best, data, settings)
-        refused |= {step.label: f"{name_of(step.label)[0]} is not named: without the effects above, no strength of it "
-                                "is left" for step in left if step not in kept}
+        refused |= {step.label: f"{name_of(step.label)[0]} is not named: without the effects that are refused, its "
+                                "strength is hardly distinguishable from zero" for step in left if step not in kept}
     named = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, named, {label: rivals[label] for label in named}, refused)
 
 
 def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Data, settings: GapSettings) -> str:
     """Why an effect that was found is not named; empty where it is."""
-    one = next(effect for effect in best.model.effects if effect.label == step.label)
+    one = best.model.effect(step.label)
     if one.effect.outside:
         return "it is not in the library"
     if probability < settings.headline:
@@ -212,8 +211,7 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
         return reason
     if not _borne_out(best, step, data, held, settings):
         return "held-out records are not more likely with it"
-    absent = {name: p.none for name, p in zip(one.names, one.parameters, strict=True) if p.linear}
-    for half in halves(best, _judged(one), settings, absent=absent):
+    for half in halves(best, _judged(one), settings, absent=one.absent):
         if half.change > settings.law_change:
             return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
     return ""

@@ -125,7 +125,7 @@ def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
 def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings) -> Fitted | None:
     """The fit with one effect less."""
     model = fitted.model.without(label)
-    one = next(effect for effect in fitted.model.effects if effect.label == label)
+    one = fitted.model.effect(label)
     rows = [fitted.priors.names.index(name) for name in model.names]
     priors = released(fitted.priors, one, settings)
     return _try(fitted, model, priors.of(model.names), fitted.z[rows], data, settings)
@@ -246,13 +246,12 @@ def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: 
 def is_weak(best: Fitted, label: str, settings: GapSettings) -> bool:
     """Whether an effect's strength is hardly distinguishable from none: by Wald's test it raises the log-likelihood by
     less than twice the gain that a name needs."""
-    one = next(effect for effect in best.model.effects if effect.label == label)
-    linear = [(name, value - p.none) for name, p, value in zip(one.names, one.parameters, one.values, strict=True)
-              if p.linear and name in best.priors.names]
-    if not linear:
+    one = best.model.effect(label)
+    values = dict(zip(one.names, one.values, strict=True))
+    names = [name for name in one.absent if name in best.priors.names]
+    if not names:
         return False
-    names, strength = zip(*linear, strict=True)
-    away = np.array(strength)
+    away = np.array([values[name] - one.absent[name] for name in names])
     return float(away @ np.linalg.solve(best.covariance_of(names), away)) / 2 < 2 * settings.certain
 
 
@@ -370,7 +369,7 @@ def at_full_strength(one: ActiveEffect) -> bool:
     """Whether an effect adds a resonance that has no strength that may be small. Mass and stiffness that the fit
     without it has found must move by more than to first order, so that nothing is known before they are fitted
     together."""
-    return one.effect.resonant and not any(parameter.linear for parameter in one.parameters)
+    return one.effect.resonant and not one.absent
 
 
 def _small(found: Fitted | None) -> Fitted | None:

@@ -60,6 +60,11 @@ class ActiveEffect:
     def by_name(self) -> dict[str, float]:
         return dict(zip((one.name for one in self.parameters), self.values, strict=True))
 
+    @property
+    def absent(self) -> dict[str, float]:
+        """Values of its linear parameters, by their names in a model, at which it does not act."""
+        return {name: p.none for name, p in zip(self.names, self.parameters, strict=True) if p.linear}
+
     def at(self, values: Sequence[float]) -> ActiveEffect:
         return replace(self, values=tuple(float(v) for v in values))
 
@@ -189,6 +194,9 @@ class TableModel:
         """The model with one effect more, whose parameters alone are free."""
         return replace(self, base=replace(self.base, names=()), nominal=replace(self.nominal or self.base, names=()),
                        effects=(*self.effects, effect), held=frozenset(one.label for one in self.effects))
+
+    def effect(self, label: str) -> ActiveEffect:
+        return next(one for one in self.effects if one.label == label)
 
     def without(self, label: str) -> TableModel:
         return replace(self, effects=tuple(one for one in self.effects if one.label != label))

@@ -194,12 +194,12 @@ class _Expand(Protocol):
 
 
 def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
-             ) -> tuple[_Expansion, int]:
+            ) -> tuple[_Expansion, int]:
     """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and how many steps
     there were.
 
-    No parameter leaves its bounds, and the others find their own optimum beside one that has reached its bound
-    (`_bounded_step`).
+    No parameter leaves its bounds; where one has reached its bound, the others still find their optimum.
+
     Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
     hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
     hardly corrects these, and descends in ever shorter ones.
@@ -229,8 +229,8 @@ def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, set
 def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """z (n,) after a damped Gauss-Newton step within bounds.
 
-    Parameters that would leave their bounds are moved to them, and the step of the others is solved again. One that is
-    at its bound already stays there while the sum of squares falls towards the other side of it.
+    Parameters that would leave their bounds are moved to them, and the step of the others is solved again. A parameter
+    at its bound stays there while the sum of squares falls only beyond it.
     """
     slope, (low, high) = at.g - at.z, bounds
     M = at.H + (1 + damping) * np.eye(len(at.z))

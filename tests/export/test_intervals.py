@@ -63,8 +63,7 @@ def test_grid_has_no_gaps():
     assert low[0] == 0.0
     assert high[-1] == pytest.approx(1000.0)
     assert np.allclose(high[:-1], low[1:], rtol=1e-9)
-    # The remainder of Taylor's theorem grows with the square of the width: neighbours are about
-    # equally wide.
+    # Neighbours are about equally wide, for the remainder of Taylor's theorem grows with the square of the width.
     assert np.max(np.abs(np.log(grid.half[1:] / grid.half[:-1]))) < 0.02
 
 

@@ -147,7 +147,7 @@ def test_at_a_bound_the_other_parameters_find_their_own_optimum():
 
 @pytest.mark.parametrize("bounded", [2, 4])
 def test_a_step_within_bounds_is_that_of_bounded_least_squares(bounded, rng):
-    """Against SciPy, parameters strongly tied to each other: one step is enough for a linear model."""
+    """Of a linear model whose parameters are strongly correlated, against SciPy."""
     for _ in range(20):
         root = rng.standard_normal((80, 8)) @ np.diag(np.geomspace(1, 100, 8)) @ rng.standard_normal((8, 8))
         target, low = 10 * rng.standard_normal(80), np.full(8, -np.inf)

@@ -145,11 +145,16 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     probability = min(1 / (1 + nothing + sum(by_key.values())), settings.most_sure)
     near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
     # What shapes a force is often known from a part of the data alone.
-    parameters = [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
+    parameters = _sizes(one)
     found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
     return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
         others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
                 _widening(found, settings))
+
+
+def _sizes(one: Effect) -> list[str]:
+    """Names in a model of the parameters in which an effect is linear."""
+    return [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
 
 
 def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
@@ -172,17 +177,26 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
     return ""
 
 
-def power(fitted: Fitted | AxisModel, by_line: bool = False) -> Any:
-    """What a model leaves of the power of held-out data; by_line : (frequency [Hz], power over the whole's)."""
-    model = fitted.model if isinstance(fitted, Fitted) else fitted
-    f, left, whole = [], [], 0.0
-    for block in model.lines.held.blocks:
-        e = np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2))
-        # The mean of a window stands at a thousandth of the first line (`records`).
-        f.append(np.where(block.omega < 0.01 * np.unique(block.omega)[:2][-1], 0.0, block.omega / (2 * np.pi)))
-        left.append(e)
-        whole += float(np.sum(np.abs(block.Y) ** 2))
-    return (np.concatenate(f), np.concatenate(left) / whole) if by_line else float(sum(map(np.sum, left)) / whole)
+def power(fitted: Fitted | AxisModel) -> float:
+    """What a model leaves of the power of held-out data."""
+    left, whole = _power(fitted.model if isinstance(fitted, Fitted) else fitted)
+    return float(sum(map(np.sum, left)) / whole)
+
+
+def power_by_line(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) each: frequency [Hz], and the power that a model leaves there of held-out data, over the whole's."""
+    left, whole = _power(fitted.model)
+    # The mean of a window stands at a thousandth of the distance between lines (`records`).
+    f = [np.where(omega < 0.01 * np.unique(omega)[:2][-1], 0.0, omega / (2 * np.pi))
+         for omega in (block.omega for block in fitted.model.lines.held.blocks)]
+    return np.concatenate(f), np.concatenate(left) / whole
+
+
+def _power(model: AxisModel) -> tuple[list[np.ndarray], float]:
+    """Power on each line (n,) of each held-out block that a model leaves, and the whole power of the data."""
+    blocks = model.lines.held.blocks
+    left = [np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2)) for block in blocks]
+    return left, sum(float(np.sum(np.abs(block.Y) ** 2)) for block in blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,8 +237,7 @@ class Shares:
 
     def certain(self, best: Fitted, one: Effect, settings: AxisSettings) -> bool:
         """Whether the size of an effect differs from zero by enough of its standard deviations."""
-        at = [best.model.names.index(f"{p.name}@{one.label}") for p in one.parameters if p.linear]
-        std = np.sqrt(np.diag(self.covariance))
+        at, std = [best.model.names.index(name) for name in _sizes(one)], np.sqrt(np.diag(self.covariance))
         return any(abs(best.model.values[k]) >= settings.apart * std[k] for k in at)
 
 
@@ -326,7 +339,7 @@ def _plain(fitted: Fitted) -> dict[str, Any]:
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
     """The octaves that together hold at least half of what remains, largest first; the mean in the lowest."""
-    f, left = power(best, by_line=True)
+    f, left = power_by_line(best)
     octave = np.floor(np.log2(np.maximum(f, np.min(f[f > 0])))).astype(int)
     found: list[dict[str, Any]] = []
     for k in sorted(np.unique(octave), key=lambda k: -float(left[octave == k].sum())):
@@ -347,7 +360,7 @@ def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[
                      tuple(one.name for one in stages))
     series = []
     for name, fitted in (("base", base), ("updated", best)):
-        f, left = power(fitted, by_line=True)
+        f, left = power_by_line(fitted)
         lines = np.unique(np.round(f, 9))
         lines = lines[lines > 0]
         series.append(Series(name, lines, np.array([np.sqrt(np.mean(left[np.round(f, 9) == one])) for one in lines]),
