@@ -3,8 +3,12 @@
 The design's uncertain plant stays in continuous time, and so does a rational controller K_s in its loop; what the
 emitted controller does beyond that is covered by two more uncertain blocks, of measured size (`sampled_response`):
 
-    force = K_s seen + W_a Delta_a seen        |W_a| >= |R - K_s exp(-j omega tau)|
-    seen  = G force + W_E Delta_E force        |W_E| >= |E|, the images of the sample rate
+    force = K_s seen + W_a Delta_a [K_s; k I] seen     |W_a| >= |M|, R - K_s exp(-j omega tau) = M [K_s; k I]
+    seen  = G force + W_E Delta_E force                |W_E| >= |E|, the images of the sample rate
+
+An error of the controller is thus relative to the controller, direction by direction: the singular values of a
+controller of several axes may differ by a factor of a thousand, and an error of its largest one in all directions would
+be no small error. k, far below the largest gain, only bounds the error where the controller has no gain.
 
 Whatever the rounded, sampled and held controller does to frequencies below half the sample rate lies in this set, so
 that the bounds of `mu_peak` and `worst_case_gain` for it are bounds for the code. K_s is the design's own controller;
@@ -28,7 +32,7 @@ from avis_ctrl.export.sampled_response import SampledAxes
 from avis_ctrl.lti.connect import connect, summing_junction
 from avis_ctrl.lti.magnitude_fit import covering_fits
 from avis_ctrl.lti.rational import Rational
-from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, stability_bound, worst_case_gain
 from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.workers import each
@@ -42,14 +46,17 @@ class CoverSettings:
 
     lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
         constant, and the intervals at most as wide as the first logarithmic one.
-    intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide, so that Taylor's
-        remainder is small against `harmless`.
+    intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide.
+    remainder, divisions : intervals in which Taylor's remainder is above `harmless` and this fraction of the error are
+        divided, into at most so many: near the controller's own modes.
     fitted : every so many intervals are fitted; the filter is then raised over all of them.
     beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
-    harmless : errors below this fraction of the largest gain of the controller, or of the table, need not be followed
-        closely. With several axes the smallest singular value may be a thousandth of the largest, and an error of one
-        per cent of it moves mu by about one per cent.
+    harmless : errors below this fraction of the controller, and below `harmless_images` of the largest gain of the
+        table, need not be followed closely. The smallest gain of the table may be a thousandth of the largest.
+    least : smallest gain to which the controller's error is relative, as a fraction of its gain at half the sample
+        rate: there the error is largest, and what an error in all directions adds to it should be small. At low
+        frequencies, where a controller may have no gain, rounding leaves a little.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     points, few_points : frequencies of the upper bound of the worst-case gain, for its curve, and where
         only the largest gain is wanted.
@@ -57,11 +64,15 @@ class CoverSettings:
 
     lowest: float = 1e-7
     intervals: int = 4000
+    remainder: float = 0.1
+    divisions: int = 32
     fitted: int = 20
     beyond: float = 30.0
     points_beyond: int = 15
     excess_dB: float = 2.0
-    harmless: float = 1e-5
+    harmless: float = 3e-4
+    harmless_images: float = 1e-5
+    least: float = 0.1
     most: int = 6
     points: int = 40
     few_points: int = 4
@@ -80,6 +91,58 @@ class Grid:
         below = np.linspace(0.0, above[0], int(np.ceil(above[0] / (above[1] - above[0]))) + 1)
         ends = np.concatenate([below[:-1], above]) * half_rate
         return Grid((ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2)
+
+    def divided(self, parts: np.ndarray) -> Grid:
+        """Each interval divided into so many (n,) equal ones."""
+        within = np.arange(np.sum(parts)) - np.repeat(np.cumsum(parts) - parts, parts)
+        half, start = np.repeat(self.half / parts, parts), np.repeat(self.centre - self.half, parts)
+        return Grid(start + (2 * within + 1) * half, half)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """The controller of the proof with what the emitted one does beyond it.
+
+    K : continuous, from seen velocities to forces. W_a : covers the error relative to [K; least I], least in N s/m.
+    unit : a gain [N s/m] about as large as K, by which the channels of that error are scaled.
+    W_E : covers the images of the sample rate [m/(N s)].
+    """
+
+    K: StateSpace
+    least: float
+    unit: float
+    W_a: Rational
+    W_E: Rational
+
+    def closed(self, plant: GeneralizedPlant, W_v: Rational | None = None, W_f: Rational | None = None
+               ) -> tuple[StateSpace, BlockStructure]:
+        """The loop closed with K, the two errors' blocks behind those of the plant.
+
+        W_v, W_f : of further outputs W_v force, and of further inputs that add W_f times them to what is seen.
+        """
+        P, blocks, n = plant.P, plant.blocks, plant.nmeas
+        force, seen = [f"{name} applied" for name in plant.u], [f"{name} alone" for name in plant.y]
+        parts = {"plant": P.renamed(dict(zip(plant.u, force, strict=True)), dict(zip(plant.y, seen, strict=True))),
+                 "K": self.K.renamed(plant.y, plant.u)}
+        for k in range(n):
+            terms = [seen[k], f"w_E{k}"]
+            if W_f is not None and W_v is not None:
+                terms.append(f"folded {k}")
+                parts[f"W_f {k}"] = W_f.system(f"floor above {k}", f"folded {k}")
+                parts[f"W_v {k}"] = W_v.system(force[k], f"velocity above {k}")
+            parts[f"seen {k}"] = summing_junction(plant.y[k], terms)
+            parts[f"force {k}"] = summing_junction(force[k], [plant.u[k], f"error {k}"])
+            parts[f"W_a {k}"] = self.W_a.scaled(self.unit).system(f"w_a{k}", f"error {k}")
+            parts[f"K {k}"] = gain([[1 / self.unit]], [plant.u[k]], [f"z_a{k}"])
+            parts[f"least {k}"] = gain([[self.least / self.unit]], [plant.y[k]], [f"z_a{n + k}"])
+            parts[f"W_E {k}"] = self.W_E.system(force[k], f"z_E{k}")
+        w = [f"w_{kind}{k}" for kind in "aE" for k in range(n)]
+        z = [*(f"z_a{k}" for k in range(2 * n)), *(f"z_E{k}" for k in range(n))]
+        above = range(n if W_f is not None else 0)
+        closed = connect(parts, [*P.inputs[:blocks.n_w], *w, *plant.w, *(f"floor above {k}" for k in above)],
+                         [*P.outputs[:blocks.n_z], *z, *plant.z, *(f"velocity above {k}" for k in above)])
+        return closed, BlockStructure((*blocks.blocks, ComplexFull(n, 2 * n, "sampled controller"),
+                                       ComplexFull(n, n, "images of the sample rate")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +176,17 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     plant, K = folder.plant, folder.controller(axes.controller.name)
     K = balanced(K)
     grid = Grid.of(axes.half_rate, settings)
-    size = np.linalg.norm(K.frequency_response(grid.centre), ord=2, axis=(1, 2))
-    W_a = _cover(grid, axes.controller_error(K, grid.centre, grid.half), settings.harmless * size, settings)
-    W_E = _cover(grid, axes.folding(grid.centre, grid.half),
-                 settings.harmless * _table(plant.synthesis, grid.centre), settings)
+    gains = _gain(K, grid.centre)
+    least, largest = settings.least * gains[-1], float(np.max(gains))
+    W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
+                 np.full(grid.centre.size, settings.harmless), settings)
+    table = plant.synthesis.P.select(plant.synthesis.y, plant.synthesis.u)
+    W_E = _cover(grid, axes.folding(grid.centre, grid.half), settings.harmless_images * _gain(table, grid.centre),
+                 settings)
+    errors = Errors(K, least, largest, W_a, W_E)
     below = (0.0, axes.half_rate)
-    performance, blocks = _with_errors(plant.synthesis, K, W_a, W_E)
-    motion, _ = _with_errors(plant.full.restricted(plant.floor_velocities, plant.velocities), K, W_a, W_E)
+    performance, blocks = errors.closed(plant.synthesis)
+    motion, _ = errors.closed(plant.full.restricted(plant.floor_velocities, plant.velocities))
     if not performance.is_stable():
         raise ComputationError("the closed loop of the design's controller is unstable with the nominal plant",
                                cause="files of different designs in one folder", next_step="run avis design again")
@@ -128,28 +195,43 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     # One proof of robust stability for all gains: the further channels do not change the loop of the blocks.
     robust = stability_bound(motion.select(range(blocks.n_z), range(blocks.n_w)), blocks)
 
-    def gain(system: StateSpace, band: tuple[float, float] = below, points: int = settings.few_points) -> MuPeak:
+    def worst(system: StateSpace, band: tuple[float, float] = below, points: int = settings.few_points) -> MuPeak:
         return worst_case_gain(system, blocks, band=band, slack=SLACK, robust=robust, points=points)
     in_band = low, min(high, axes.half_rate)
-    from_below, from_above = _between_samples(axes, K, W_a, W_E, grid, settings)
+    from_below, from_above = _between_samples(axes, errors, grid, settings)
     mu, peak, band, *between = each(lambda one: one(), [
-        lambda: mu_peak(performance, whole, band=below, slack=SLACK), lambda: gain(motion, points=settings.points),
-        lambda: gain(motion, in_band), lambda: gain(from_below), lambda: gain(from_above)])
+        lambda: mu_peak(performance, whole, band=below, slack=SLACK), lambda: worst(motion, points=settings.points),
+        lambda: worst(motion, in_band), lambda: worst(from_below), lambda: worst(from_above)])
     all_times, above = (one.upper if one.guaranteed else np.inf for one in between)
-    return Bounds(mu, peak, band, all_times, above + axes.passive_above(), _gain_above(axes, K, W_a, W_E, settings))
+    return Bounds(mu, peak, band, all_times, above + axes.passive_above(), _gain_above(axes, errors, settings))
 
 
-def _gain_above(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, settings: CoverSettings) -> float:
+def _controller_error(axes: SampledAxes, K: StateSpace, least: float, grid: Grid, settings: CoverSettings
+                      ) -> np.ndarray:
+    """(n,) bound over each interval of the emitted controller's error relative to [K; least I]."""
+    error, remainder = axes.controller_error(K, least, grid.centre, grid.half)
+    allowed = np.maximum(settings.harmless, settings.remainder * (error - remainder))
+    parts = np.clip(np.ceil(np.sqrt(remainder / allowed)), 1, settings.divisions).astype(int)
+    again = np.flatnonzero(parts > 1)
+    if again.size:
+        finer = Grid(grid.centre[again], grid.half[again]).divided(parts[again])
+        bound, _ = axes.controller_error(K, least, finer.centre, finer.half)
+        error[again] = np.maximum.reduceat(bound, np.cumsum(parts[again]) - parts[again])
+    return error
+
+
+def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> float:
     """Bound of the loop gain from half the sample rate on, both errors included."""
     omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
-    size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)) + W_a.magnitude(omega)
+    size = _gain(errors.K, omega)
+    size += errors.W_a.magnitude(omega) * np.hypot(size, errors.least)
     table = axes.force_to_seen(omega)
-    table[0] += W_E.magnitude(omega[:1])[0]  # the images belong to half the rate itself
+    table[0] += errors.W_E.magnitude(omega[:1])[0]  # the images belong to half the rate itself
     return float(np.max(size * table))
 
 
-def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Rational, grid: Grid,
-                     settings: CoverSettings) -> tuple[StateSpace, StateSpace]:
+def _between_samples(axes: SampledAxes, errors: Errors, grid: Grid, settings: CoverSettings
+                     ) -> tuple[StateSpace, StateSpace]:
     """The lifted loop from the floor up to half the sample rate, and from that above, to all of the payload.
 
     The held forces move the payload above half the rate by at most W_v times their r.m.s. The floor there acts on the
@@ -158,29 +240,27 @@ def _between_samples(axes: SampledAxes, K: StateSpace, W_a: Rational, W_E: Ratio
     plant = axes.folder.plant
     part = plant.full.restricted(plant.floor_velocities, plant.velocities)
     held, folded = axes.held_images(grid.centre, grid.half), axes.folded_floor(grid.centre, grid.half)
-    W_v = _cover(grid, held, settings.harmless * np.full(held.size, np.max(held)), settings)
-    W_f = _cover(grid, folded, settings.harmless * np.full(folded.size, np.max(folded)), settings)
-    motion, blocks = _with_errors(part, K, W_a, W_E, W_v, W_f)
+    W_v = _cover(grid, held, settings.harmless_images * np.full(held.size, np.max(held)), settings)
+    W_f = _cover(grid, folded, settings.harmless_images * np.full(folded.size, np.max(folded)), settings)
+    motion, blocks = errors.closed(part, W_v, W_f)
     n_w, n_d = blocks.n_w, len(part.w)
     first, second = (motion.select(None, [*range(n_w), *inputs])
                      for inputs in (range(n_w, n_w + n_d), range(n_w + n_d, motion.ninputs)))
     return first, second
 
 
-def _table(plant: GeneralizedPlant, omega: np.ndarray) -> np.ndarray:
-    """(n_omega,) gain of the nominal table from forces to seen velocities."""
-    G = plant.P.select(plant.y, plant.u).frequency_response(omega)
-    return np.linalg.norm(G, ord=2, axis=(1, 2))
+def _gain(system: StateSpace, omega: np.ndarray) -> np.ndarray:
+    """(n_omega,) largest singular values."""
+    return np.linalg.norm(system.frequency_response(omega), ord=2, axis=(1, 2))
 
 
 def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverSettings) -> Rational:
     """A filter with |W| >= error over all intervals, of the lowest order that is near it where it is not harmless."""
     lower = np.maximum(error, np.finfo(float).tiny)
     upper = np.maximum(lower, harmless)
-    # Corners lie up to `reach` beyond the frequencies fitted: none below the first logarithmic interval.
+    # Corners lie up to `reach` beyond the frequencies fitted: far above the width of the first intervals.
     reach = 10.0
-    every = slice(int(np.searchsorted(grid.centre, 1.01 * reach * settings.lowest * grid.centre[-1])), None,
-                  settings.fitted)
+    every = slice(int(np.searchsorted(grid.centre, settings.lowest * grid.centre[-1])), None, settings.fitted)
     # Above half the rate nothing has to be covered: the filter must not rise there, where the proof of robust stability
     # meets it, and may fall.
     end = grid.centre[-1]
@@ -198,32 +278,3 @@ def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverS
     slope, _ = log_slopes([*W.zeros(), *W.poles()], grid.centre, grid.half)
     reached = W.magnitude(grid.centre) * np.exp(-grid.half * slope)
     return W.scaled(max(1.0, float(np.max(lower / reached))))
-
-
-def _with_errors(plant: GeneralizedPlant, K: StateSpace, W_a: Rational, W_E: Rational, W_v: Rational | None = None,
-                 W_f: Rational | None = None) -> tuple[StateSpace, BlockStructure]:
-    """The loop closed with K, the two errors' blocks behind those of the plant.
-
-    W_v, W_f : of further outputs W_v force, and of further inputs that add W_f times them to what is seen.
-    """
-    P, blocks, n = plant.P, plant.blocks, plant.nmeas
-    force, seen = [f"{name} applied" for name in plant.u], [f"{name} alone" for name in plant.y]
-    parts = {"plant": P.renamed(dict(zip(plant.u, force, strict=True)), dict(zip(plant.y, seen, strict=True))),
-             "K": K.renamed(plant.y, plant.u)}
-    for k in range(n):
-        terms = [seen[k], f"w_E{k}"]
-        if W_f is not None and W_v is not None:
-            terms.append(f"folded {k}")
-            parts[f"W_f {k}"] = W_f.system(f"floor above {k}", f"folded {k}")
-            parts[f"W_v {k}"] = W_v.system(force[k], f"velocity above {k}")
-        parts[f"seen {k}"] = summing_junction(plant.y[k], terms)
-        parts[f"force {k}"] = summing_junction(force[k], [plant.u[k], f"w_a{k}"])
-        parts[f"W_a {k}"] = W_a.system(plant.y[k], f"z_a{k}")
-        parts[f"W_E {k}"] = W_E.system(force[k], f"z_E{k}")
-    added_w, added_z = ([f"{kind}{k}" for kind in (f"{letter}_a", f"{letter}_E") for k in range(n)]
-                        for letter in "wz")
-    above = range(n if W_f is not None else 0)
-    closed = connect(parts, [*P.inputs[:blocks.n_w], *added_w, *plant.w, *(f"floor above {k}" for k in above)],
-                     [*P.outputs[:blocks.n_z], *added_z, *plant.z, *(f"velocity above {k}" for k in above)])
-    return closed, BlockStructure((*blocks.blocks, ComplexFull(n, n, "sampled controller"),
-                                   ComplexFull(n, n, "images of the sample rate")))

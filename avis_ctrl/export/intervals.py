@@ -42,7 +42,31 @@ class Jet:
     def bound(self, half: np.ndarray) -> np.ndarray:
         """(n,) largest norm over each interval, of a matrix function."""
         value, slope = (np.linalg.norm(part, ord=2, axis=(1, 2)) for part in (self.value, self.slope))
-        return value + half * slope + half ** 2 / 2 * self.curve
+        return value + half * slope + self.remainder(half)
+
+    def remainder(self, half: np.ndarray) -> np.ndarray:
+        """(n,) largest distance from value and slope at the centre over each interval."""
+        return half ** 2 / 2 * self.curve
+
+    def relative_to(self, K: Jet, least: float, half: np.ndarray, further: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) bound over each interval of |M| in E + F = M [K; least I], E this function and |F| <= further; and the
+        part of it that falls with the square of the interval's width.
+
+        With P = [K; least I] at the centre, M = E P^+ and N = (E' - M P') P^+, anywhere in the interval
+        E = (M + t N) P + G, |t| <= half, where G has only remainders; and the smallest singular value of P is at least
+        `least`, and at most half |P'| and its remainder below that at the centre.
+        """
+        n = K.value.shape[-1]
+        below = np.broadcast_to(np.eye(n), (len(half), n, n))
+        P, dP = np.concatenate([K.value, least * below], axis=1), np.concatenate([K.slope, 0 * below], axis=1)
+        inverse = np.linalg.pinv(P, rcond=0.0)
+        M = self.value @ inverse
+        N = (self.slope - M @ dP) @ inverse
+        size, slope, steep = (np.linalg.norm(part, ord=2, axis=(1, 2)) for part in (M, N, dP))
+        size += half * slope
+        smallest = np.maximum(np.linalg.norm(P, ord=-2, axis=(1, 2)) - half * steep - K.remainder(half), least)
+        left = (self.remainder(half) + size * K.remainder(half) + half ** 2 * slope * steep) / smallest
+        return size + further / smallest + left, left
 
 
 def roots_jet(zeros: Iterable[complex], poles: Iterable[complex], leading: float, centre: np.ndarray,

@@ -142,11 +142,13 @@ class SampledAxes:
         """Largest gain from the seen velocities of the axes to their forces far below every pole [N s/m]."""
         return float(np.linalg.norm(self.response(np.array([self.settings.rest * self.half_rate]))[0], 2))
 
-    def controller_error(self, K: StateSpace, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        """(n,) bound over |omega - centre| <= half of |R - K exp(-j omega tau)| and of what rounded decoding adds
-        [N s/m].
+    def controller_error(self, K: StateSpace, least: float, centre: np.ndarray, half: np.ndarray
+                         ) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) bound over |omega - centre| <= half of |M| in R - K exp(-j omega tau) = M [K; least I], with what the
+        rounded decoding adds; and the part of it that falls with the square of the interval's width.
 
-        K : continuous, from seen velocities to forces; the delay is that of the design's model.
+        K : continuous, from seen velocities to forces [N s/m]; the delay is that of the design's model.
+        least : gain [N s/m] from which an error is relative to the controller in its direction.
         """
         T, rig, own = self.period_s, self.folder.rig, self.controller.system
         design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
@@ -160,7 +162,8 @@ class SampledAxes:
         held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
         R = held * (unfiltered * system_jet(code, centre, half))
         # What rounding sends beside the axes is some 1e-7 of R and as smooth: doubled for the interval.
-        return (R - system_jet(K, centre, half)).bound(half) + 2 * self._beside(centre)
+        alone = system_jet(K, centre, half)
+        return (R - alone).relative_to(alone, least, half, 2 * self._beside(centre))
 
     def folding(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound of |E| [m/(N s)] over |omega - centre| <= half, up to half the sample rate."""

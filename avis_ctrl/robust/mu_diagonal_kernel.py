@@ -226,3 +226,38 @@ def balanced_squares(norm2, sweeps):
                     col += norm2[b, j, k] * d2[b, j]
                 d2[b, k] = np.sqrt(d2[b, k] ** 2 * (col / d2[b, k]) / (row * d2[b, k]))
     return d2
+
+
+@njit(cache=True)
+def level_squares(norm2):
+    """d2 (B, n) > 0 such that no norm2_kj d2_k / d2_j exceeds the largest geometric mean of norm2 (B, n, n) around a
+    cycle of blocks, which does not depend on the units of the signals; 1 if there is no cycle.
+
+    The mean is found by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walks to each block.
+    """
+    batch, n = norm2.shape[:2]
+    d2 = np.ones((batch, n))
+    walk = np.empty((n + 1, n))
+    size = np.empty((n, n))
+    for b in range(batch):
+        for k in range(n):
+            for j in range(n):
+                size[k, j] = np.log(norm2[b, k, j]) if norm2[b, k, j] > 0.0 else -np.inf
+        walk[0] = 0.0
+        for m in range(n):
+            for j in range(n):
+                walk[m + 1, j] = np.max(walk[m] + size[:, j])
+        mean = -np.inf
+        for j in range(n):
+            if walk[n, j] > -np.inf:
+                least = np.inf
+                for m in range(n):
+                    least = min(least, (walk[n, j] - walk[m, j]) / (n - m))
+                mean = max(mean, least)
+        if mean > -np.inf:
+            longest = np.zeros(n)
+            for _ in range(n):
+                for j in range(n):
+                    longest[j] = max(longest[j], np.max(longest + size[:, j]) - mean)
+            d2[b] = np.exp(longest - np.mean(longest))
+    return d2

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal
+from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal, level_squares
 from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
 from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follow, least_level, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -49,9 +49,12 @@ def block_balance(M: Array, structure: BlockStructure, sweeps: int = 20) -> Arra
     norm2 = np.stack([rows[:, :, w].sum(axis=2) for _, w, _ in places], axis=2)
     n = len(places)
     norm2[:, np.arange(n), np.arange(n)] = 0.0
+    # First the units of each block, so that what is small is so beside others of its kind.
+    units = level_squares(norm2)
+    norm2 = norm2 * units[:, :, None] / units[:, None, :]
     # A floor keeps the scaling finite where a block is not coupled both ways.
     norm2 = norm2 + 1e-16 * np.max(norm2, axis=(1, 2), initial=0.0)[:, None, None] + 1e-300
-    d2 = balanced_squares(norm2, sweeps)
+    d2 = units * balanced_squares(norm2, sweeps)
     return np.sqrt(d2 / np.exp(np.mean(np.log(d2), axis=1, keepdims=True)))
 
 

@@ -46,6 +46,40 @@ def test_bound_of_a_difference_that_nearly_cancels(rng, dt):
     assert np.median(bound / largest) < 1.05
 
 
+@pytest.mark.parametrize("least", [1e-6, 1.0])
+def test_bound_relative_to_a_controller_of_unlike_gains(rng, least):
+    """R = (1 + delta) K with gains in the ratio 1 to 1e3: the error relative to [K; least I] is at most |delta|, far
+    less than |R - K| over the smallest gain; never below that of the best M at any frequency, and close to it."""
+    n, further = 5, 1e-9
+    A = rng.normal(size=(n, n))
+    A = A - (np.max(np.linalg.eigvals(A).real) + 2.0) * np.eye(n)
+    rows = np.array([[1.0], [1e-3]])
+    K = StateSpace(A, rng.normal(size=(n, 2)), rows * rng.normal(size=(2, n)), rows * rng.normal(size=(2, 2)))
+    half = HALF / 100
+    alone = system_jet(K, CENTRE, half)
+    error = roots_jet((-3.0,), (-40.0,), 0.02, CENTRE, half) * alone
+    bound, remainder = error.relative_to(alone, least, half, np.full(CENTRE.size, further))
+
+    def true(w):
+        response = K.frequency_response(w)
+        below = np.broadcast_to(least * np.eye(2), response.shape)
+        return (0.02 * (1j * w + 3) / (1j * w + 40))[:, None, None] * response @ np.linalg.pinv(
+            np.concatenate([response, below], axis=1))
+    largest = np.max([np.linalg.norm(true(CENTRE + t * half), ord=2, axis=(1, 2)) for t in np.linspace(-1, 1, 21)],
+                     axis=0)
+    assert np.all(bound >= largest * (1 - 1e-9))
+    assert np.median(bound / largest) < 1.05
+    assert np.all((remainder >= 0) & (remainder < bound))
+
+
+def test_an_interval_divided_is_covered():
+    grid = Grid(np.array([1.0, 3.0]), np.array([0.5, 0.1]))
+    finer = grid.divided(np.array([4, 1]))
+    ends = np.concatenate([finer.centre - finer.half, finer.centre[-1:] + finer.half[-1:]])
+    assert ends == pytest.approx([0.5, 0.75, 1.0, 1.25, 2.9, 3.1])
+    assert finer.centre + finer.half == pytest.approx([0.75, 1.0, 1.25, 1.5, 3.1])
+
+
 def test_slopes_are_derivatives():
     """Central differences."""
     step = 1e-6 * CENTRE
