@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -29,7 +30,7 @@ from avis_ctrl.robust.hinf_plant import as_plant
 from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
-from avis_ctrl.robust.musyn_state import Iteration, Loop, State
+from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
@@ -133,10 +134,63 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     if apart and nmeas != ncon:
         raise InputError("a decentralised controller has as many outputs as inputs", field="nmeas, ncon",
                          value=(nmeas, ncon))
-    uncertainty, complexified = _structures(P, blocks, nmeas, ncon)
-    cap = P.nstates + 20 if max_added_states is None else max_added_states
     if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
         raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
+    made = dk_iteration(P, blocks, nmeas, ncon, callback=callback, target=target, max_iterations=max_iterations,
+                        backoff=backoff, polish=polish, max_added_states=max_added_states, starts=starts, state=state)
+    with threadpool_limits(1, user_api="blas"):
+        best, notes = made.best, tuple[str, ...]()
+        if apart or (order is not None and best.K.nstates > order):
+            task = Task(made.problem.P, made.problem.structure, decentralised=apart)
+            *_, short = fixed_order(task, best.K, best.K.nstates if order is None else order)
+            K, peak = short.K, short.peak
+            notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
+                     f"instead of {best.mu:.4g}",)
+            best = Loop(K, best.scalings, np.nan, peak)
+        return _result(P, made, best, sample_rate_Hz, notes)
+
+
+@dataclass(frozen=True, eq=False)
+class DKIteration:
+    """Where D-K iteration ended, before the bounds of the result are computed.
+
+    best : the controller of least complex mu on the grid of the iteration; of a sampled plant its continuous image.
+    """
+
+    problem: Problem
+    uncertainty: BlockStructure
+    state: State
+    status: str
+
+    @property
+    def best(self) -> Loop:
+        assert self.state.best is not None
+        return self.state.best
+
+    @property
+    def history(self) -> tuple[Iteration, ...]:
+        return self.state.history
+
+    @cached_property
+    def omega_peak(self) -> float:
+        """Where complex mu of the best loop is largest on the grid of the last iteration [rad/s]."""
+        points = self.state.points
+        assert points is not None
+        if self.state.last is not self.best:
+            points = analysed(self.problem.P, self.best.K, self.problem.structure, points.omega)
+        return float(points.omega[np.argmax(points.mu)])
+
+
+def dk_iteration(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: int, *,
+                 callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
+                 max_iterations: int = 30, backoff: float = 0.01, polish: bool = True,
+                 max_added_states: int | None = None, starts: Sequence[StateSpace] = (),
+                 state: dict[str, Any] | None = None) -> DKIteration:
+    """The iteration of `musyn` alone, with its parameters and errors: for callers who change the controller before
+    they compute its bounds."""
+    P = as_plant(P, nmeas, ncon)
+    uncertainty, complexified = _structures(P, blocks, nmeas, ncon)
+    cap = P.nstates + 20 if max_added_states is None else max_added_states
     options = _options(target, max_iterations, backoff, polish, cap, callback)
     problem = Problem(continuous_image(P), complexified, nmeas, ncon)
     given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
@@ -145,16 +199,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         if state is not None:
             current, known = State.from_dict(state, complexified, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, (*known, *given), options)
-        assert current.best is not None
-        best, notes = current.best, tuple[str, ...]()
-        if apart or (order is not None and best.K.nstates > order):
-            task = Task(problem.P, complexified, decentralised=apart)
-            *_, short = fixed_order(task, best.K, best.K.nstates if order is None else order)
-            K, peak = short.K, short.peak
-            notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
-                     f"instead of {best.mu:.4g}",)
-            best = Loop(K, best.scalings, np.nan, peak)
-        return _result(P, problem, uncertainty, current, best, status, sample_rate_Hz, notes)
+        return DKIteration(problem, uncertainty, current, status)
 
 
 def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
@@ -210,9 +255,10 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
     return min(candidates, key=lambda pair: pair[1])
 
 
-def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state: State, best: Loop, status: str,
-            sample_rate_Hz: float | None, said: tuple[str, ...]) -> MuSynthesis:
-    """The best controller in the clock of P, with mu measured anew on its loop with P as given."""
+def _result(P: StateSpace, made: DKIteration, best: Loop, sample_rate_Hz: float | None, said: tuple[str, ...]
+            ) -> MuSynthesis:
+    """A controller in the clock of P, with mu measured anew on its loop with P as given."""
+    problem, uncertainty, state = made.problem, made.uncertainty, made.state
     K = sampled_image(best.K, P.dt) if P.dt else best.K
     closed = lft_lower(P, K)
     # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
@@ -231,5 +277,5 @@ def _result(P: StateSpace, problem: Problem, uncertainty: BlockStructure, state:
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
     return MuSynthesis(K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
-                       scalings, gamma, closed, fastest, state.history, status, tuple(notes),
+                       scalings, gamma, closed, fastest, state.history, made.status, tuple(notes),
                        state.as_dict(problem.P, problem.structure, problem.nmeas, problem.ncon, P.dt))

@@ -44,7 +44,7 @@ def closed_loop_gamma(P: StateSpace, K: StateSpace) -> float:
 
 
 def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], float] | None = None,
-                      growth: float = 0.01, orders: range | None = None) -> Reduction:
+                      growth: float = 0.01, orders: range | None = None, limit: float | None = None) -> Reduction:
     """The controller of lowest order whose measured figure grows by at most `growth` (relative).
 
     Parameters
@@ -55,6 +55,7 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
     growth : allowed relative growth of the figure.
     orders : orders to choose from, by default all from the unstable part's to K's own. They are searched by halving:
         the order below the one returned was tried and failed; the figure is not looked at on every order.
+    limit : largest figure allowed, instead of `growth`. `measure` may then be exact above it only.
 
     Raises
     ------
@@ -67,6 +68,7 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
     if not lft_lower(P, K).is_stable():
         raise InputError("the controller to reduce does not stabilise the plant", field="K", value=repr(K))
     full = float(figure(K))
+    allowed = (1 + growth) * full if limit is None else limit
     stable, unstable = split_stable(K)
     choices = [k for k in sorted(orders or range(K.nstates)) if unstable.nstates <= k < K.nstates]
     tried: list[tuple[int, float]] = [(K.nstates, full)]
@@ -76,7 +78,7 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
         candidate = balanced_truncation(stable, choices[middle] - unstable.nstates) + unstable
         found = float(figure(candidate)) if lft_lower(P, candidate).is_stable() else np.inf
         tried.append((choices[middle], found))
-        if found <= (1 + growth) * full:
+        if found <= allowed:
             best, value, passed = candidate, found, middle
         else:
             failed = middle

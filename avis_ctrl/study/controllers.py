@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,26 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.musyn import MuSynthesis, musyn
+from avis_ctrl.robust.musyn import DKIteration, dk_iteration
 from avis_ctrl.robust.reduction import reduce_controller, residualise_fast, truncate_slow
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
 
-# Coarse: it only ranks controllers of different order; what is reported is computed on the one chosen. The resonances
-# of the table at rest and the peak of mu join it, for both are narrower than its steps. Below the band mu bounds what
-# the offset of the electronics costs.
-REDUCTION_HZ = np.concatenate([np.geomspace(1e-3, 0.03, 5), np.geomspace(0.05, 300.0, 25)])
+
+@dataclass(frozen=True)
+class ReductionSettings:
+    """frequencies_Hz : at which controllers of different order are compared. They are coarse, for what is reported is
+        computed anew for the one chosen; the resonances of the table at rest and the peak of mu join them, because both
+        are narrower than the steps. Below the band mu bounds what the offset of the electronics costs.
+    accuracy : of the square of mu there, a fraction of what the reduction may cost.
+    """
+
+    frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
+    accuracy: float = 1e-3
+
+
+SETTINGS = ReductionSettings()
 
 
 def passive() -> Candidate:
@@ -40,44 +51,48 @@ def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
 
 
 def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[[Any], Any] | None = None,
-               rivals: Sequence[Candidate] = ()) -> tuple[Candidate, MuSynthesis]:
+               rivals: Sequence[Candidate] = ()) -> tuple[Candidate, DKIteration]:
     """D-K iteration on the whole uncertainty set, then reduction to the lowest order with nearly the same mu.
 
     rivals : controllers that the study already has. The iteration starts from the best of them, and its complex mu is
         never larger than theirs; that of the reduced controller is within reduction_cost_percent of it.
     """
     P, asked = plant.synthesis, design.synthesis
-    made = musyn(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=asked.target_mu,
-                 polish=asked.polish is not False, max_iterations=asked.max_iterations,
-                 backoff=asked.backoff_percent / 100, starts=[one.K for one in rivals if one.K is not None],
-                 sample_rate_Hz=rig.sample_rate_Hz)
+    made = dk_iteration(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=asked.target_mu,
+                        polish=asked.polish is not False, max_iterations=asked.max_iterations,
+                        backoff=asked.backoff_percent / 100, starts=[one.K for one in rivals if one.K is not None])
     K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100, design.control_effort.offset_corner_Hz)
-    before = tuple(f"before reduction: {one}" for one in made.notes)
     old = ("synthesis.time_limit_s is ignored: max_iterations and target_mu end the iteration",)
-    notes = (made.status, *(old if asked.time_limit_s is not None else ()), *before, note)
+    notes = (made.status, *(old if asked.time_limit_s is not None else ()), note)
     return Candidate("mu", "mu synthesis", "mu", K, notes), made
 
 
-def _reduced(plant: DesignPlant, rig: Rig, made: MuSynthesis, cost: float, offset_corner_Hz: float
+def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offset_corner_Hz: float
              ) -> tuple[StateSpace, str]:
     """The controller of lowest order whose complex mu grows by no more than the cost, and a note that says so."""
     P = plant.synthesis
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
-    def peak_on_grid(K: StateSpace) -> float:
-        return float(np.max(upper_bound(P.closed(K).frequency_response(omega)[:, None], blocks, 1e-3).beta))
+    def peak_on_grid(K: StateSpace, goal: float = 0.0) -> float:
+        """Complex mu; only an upper bound of it where that is below the goal."""
+        M = P.closed(K).frequency_response(omega)[:, None]
+        return float(np.max(upper_bound(M, blocks, SETTINGS.accuracy, goal).beta))
+    K = made.best.K
+    full = peak_on_grid(K)
+    limit = (1 + cost) * full
+
+    def harmless(candidate: StateSpace) -> bool:
+        return P.closed(candidate).is_stable() and peak_on_grid(candidate, limit) <= limit
     # Poles beyond the Nyquist frequency cannot be implemented; what removing them costs is in the measured figure.
-    full, slow = peak_on_grid(made.K), residualise_fast(made.K, np.pi * rig.sample_rate_Hz)
-    harmless = P.closed(slow).is_stable() and peak_on_grid(slow) <= (1 + cost) * full
-    start = slow if harmless else made.K
+    slow = residualise_fast(K, np.pi * rig.sample_rate_Hz)
+    start = slow if harmless(slow) else K
     # Below the corner to which the offset may drift no weight changes.
     lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
-    if P.closed(lasting).is_stable() and peak_on_grid(lasting) <= (1 + cost) * full:
-        start = lasting
-    reduced = reduce_controller(P.P, start, peak_on_grid, cost)
-    return reduced.K, (f"reduced from {made.K.nstates} to {reduced.order} states: complex mu on a grid of {omega.size} "
-                       f"frequencies changes from {full:.4f} to {reduced.figure:.4f}")
+    start = lasting if harmless(lasting) else start
+    reduced = reduce_controller(P.P, start, partial(peak_on_grid, goal=limit), limit=limit).K
+    return reduced, (f"reduced from {K.nstates} to {reduced.nstates} states: complex mu on a grid of {omega.size} "
+                     f"frequencies changes from {full:.4f} to {peak_on_grid(reduced):.4f}")
 
 
 def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:
@@ -97,6 +112,6 @@ def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> Control
 
 def reduction_grid(plant: DesignPlant, omega_peak: float) -> np.ndarray:
     """Frequencies [rad/s] at which controllers of lower order are compared, the peaks that mu may have among them."""
-    even = 2 * np.pi * REDUCTION_HZ
+    even = 2 * np.pi * np.array(SETTINGS.frequencies_Hz)
     at_rest = resonances(plant.rig.system.poles())
     return merged(even, np.append(at_rest, omega_peak))

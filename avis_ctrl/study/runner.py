@@ -17,7 +17,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
-from avis_ctrl.robust.musyn import MuSynthesis
+from avis_ctrl.robust.musyn import DKIteration
 from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
 from avis_ctrl.study.analysis import analyse, worst_by_axis
 from avis_ctrl.study.at_rest import at_rest
@@ -109,10 +109,8 @@ def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Pr
 
 @dataclass(frozen=True)
 class Early:
-    """The pool, bounds under way in it by the controllers' names, and the peak that the tuned skyhook among them may
-    have at worst."""
+    """Bounds under way by the controllers' names, and the peak that the tuned skyhook among them may have at worst."""
 
-    workers: Workers
     bounds: Mapping[str, Future]
     peak_limit: float | None
 
@@ -124,11 +122,11 @@ def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candida
     jobs = {}
     if limit is not None:
         jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples)
-    return Early(workers, jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
+    return Early(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
 
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate],
-               progress: Progress = lambda text: None, stop: Stop = NEVER) -> tuple[Candidate, MuSynthesis]:
+               progress: Progress = lambda text: None, stop: Stop = NEVER) -> tuple[Candidate, DKIteration]:
     """The mu controller, and the D-K iteration, which starts from the best of the others."""
     with threadpool_limits(1):
         def shown(row: Any) -> bool:
@@ -146,7 +144,7 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
         return mu, made
 
 
-def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: MuSynthesis, compared: Compared, seconds: float,
+def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteration, compared: Compared, seconds: float,
              source: Path | None = None) -> DesignResult:
     """The verdict, with what the reduction to the kept axes leaves out, and the provenance."""
     controllers = compared.controllers
@@ -179,7 +177,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     Runs on two processes. The simulation, and the tuning of a skyhook whose peak the design does not limit, wait for
     the bounds of all the others, because the best of these is delivered as the mu controller.
 
-    early : bounds that were started before.
+    early : bounds that were started before, on processes that give way to those for the mu controller.
 
     Raises
     ------
@@ -187,7 +185,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     begun = early.bounds if early is not None else {}
-    with Workers() if early is None else nullcontext(early.workers) as workers:
+    with Workers() as workers:
         jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name
                 for c in candidates}
         if "loops" in design.compare_with:

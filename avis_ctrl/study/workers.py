@@ -14,15 +14,19 @@ from typing import Any
 
 MOST = 2
 WATCH_S = 1.0
+# Added to the niceness of processes that work beside one that everything waits for.
+BESIDE = 10
 
 
-def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL) -> None:
+def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, niceness: int = 0) -> None:
     """Make this process a worker: Ctrl-C and SIGTERM end it at once and silently (the parent speaks); so does the
     parent's own death.
 
     on_interrupt : SIG_IGN where Ctrl-C, which reaches all processes, is the parent's to decide on: it may go on with
         what it has.
     """
+    if niceness and hasattr(os, "nice"):
+        os.nice(niceness)
     signal.signal(signal.SIGINT, on_interrupt)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
@@ -50,20 +54,20 @@ def alone() -> Iterator[None]:
 class Workers:
     """A pool where there are processors for one, else the same calls one after the other in this process.
 
-    beside : this process computes, too, and decides on Ctrl-C.
+    beside : this process computes, too, and before the others; it decides on Ctrl-C.
     """
 
     def __init__(self, count: int | None = None, beside: bool = False):
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         most = 1 if _alone else MOST
         self._count = min(most, available) if count is None else count
-        self._on_interrupt = signal.SIG_IGN if beside else signal.SIG_DFL
+        self._manners = (signal.SIG_IGN, BESIDE) if beside else (signal.SIG_DFL, 0)
 
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
         self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), as_worker,
-                                          (os.getpid(), self._on_interrupt)) if self._count > 1 else None)
+                                          (os.getpid(), *self._manners)) if self._count > 1 else None)
         self._others = set(multiprocessing.active_children())
         return self
 
