@@ -124,6 +124,21 @@ def test_six_sharp_resonances_are_found_from_a_model_without(values):
     assert seed.values[0] == pytest.approx(values[0], rel=0.1)
 
 
+def test_a_small_recoil_in_one_coordinate_is_significant():
+    """A heavy chassis moves up and down at 34 Hz: its own five parameters are tested, not those of the rig with them."""
+    truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/translation",
+                                     [1500.0, 0.018, 280.0, 280.0, 34.0]))
+    omega, rng, noise, blocks = 2 * np.pi * np.linspace(0.5, 60.0, 150), np.random.default_rng(5), 4e-3, []
+    for k in range(2):
+        U = np.zeros((len(omega), 11, 1), complex)
+        U[:, :8] = 0.3 * gaussian(rng, len(omega), 8, 1)
+        made = SpectralBlock(f"{k:02d}", omega, U, np.zeros((len(omega), 6, 1), complex), transient=False)
+        Y = truth.answer(made, None, False).Y + noise * gaussian(rng, len(omega), 6, 1)
+        blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
+    seed = seeds(library()["base_compliance"], Score(fitted(MODEL, blocks).model, blocks), "chassis/translation")[0]
+    assert seed.p_value < 1e-6
+
+
 def test_what_holds_no_states_leaves_none():
     model = with_effect("actuator_gain", "Az1", [1.1])
     assert model.inner_transients(OMEGA).shape == (len(OMEGA), 6, 0)

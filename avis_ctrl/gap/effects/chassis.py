@@ -163,9 +163,10 @@ class BaseCompliance(OfMounts):
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
                 reached = self._one_by_one(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
-        # The rig's parameters fit a part of the noise too, on few lines a larger one.
-        found = Seed(_effect(reached).values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
-                     len(reached.model.names), len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
+        # The rig's parameters fit a part of the noise too, on few lines a larger one; before and after alike.
+        values = _effect(reached).values
+        found = Seed(values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2, len(values),
+                     len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
         return [found] if found.chi2 > 0 else own
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
