@@ -7,8 +7,9 @@ emitted controller does beyond that is covered by two more uncertain blocks, of 
     seen  = G force + W_E Delta_E force                |W_E| >= |E|, the images of the sample rate
 
 An error of the controller is thus relative to the controller, direction by direction: the singular values of a
-controller of several axes may differ by a factor of a thousand, and an error of its largest one in all directions would
-be no small error. k, far below the largest gain, only bounds the error where the controller has no gain.
+controller of several axes may differ by a factor of a hundred or more; an error that is small beside the largest of
+them, but allowed in all directions, can exceed the smallest. k bounds the error in directions where the controller has
+little gain.
 
 Whatever the rounded, sampled and held controller does to frequencies below half the sample rate lies in this set, so
 that the bounds of `mu_peak` and `worst_case_gain` for it are bounds for the code. K_s is the design's own controller;
@@ -54,9 +55,10 @@ class CoverSettings:
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
     harmless : errors below this fraction of the controller, and below `harmless_images` of the largest gain of the
         table, need not be followed closely. The smallest gain of the table may be a thousandth of the largest.
-    least : smallest gain to which the controller's error is relative, as a fraction of its gain at half the sample
-        rate: there the error is largest, and what an error in all directions adds to it should be small. At low
-        frequencies, where a controller may have no gain, rounding leaves a little.
+    least, least_of_all : gain below which the controller's error is measured absolutely, as a fraction of its gain at
+        half the sample rate, and at least as a fraction of its largest gain. The error is largest at half the rate, and
+        this gain should add little to it; at low frequencies, where a controller may have no gain, rounding leaves a
+        little.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     points, few_points : frequencies of the upper bound of the worst-case gain, for its curve, and where
         only the largest gain is wanted.
@@ -73,6 +75,7 @@ class CoverSettings:
     harmless: float = 3e-4
     harmless_images: float = 1e-5
     least: float = 0.1
+    least_of_all: float = 1e-6
     most: int = 6
     points: int = 40
     few_points: int = 4
@@ -177,7 +180,8 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     K = balanced(K)
     grid = Grid.of(axes.half_rate, settings)
     gains = _gain(K, grid.centre)
-    least, largest = settings.least * gains[-1], float(np.max(gains))
+    largest = float(np.max(gains))
+    least = max(settings.least * gains[-1], settings.least_of_all * largest)
     W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
                  np.full(grid.centre.size, settings.harmless), settings)
     table = plant.synthesis.P.select(plant.synthesis.y, plant.synthesis.u)
@@ -258,7 +262,8 @@ def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverS
     """A filter with |W| >= error over all intervals, of the lowest order that is near it where it is not harmless."""
     lower = np.maximum(error, np.finfo(float).tiny)
     upper = np.maximum(lower, harmless)
-    # Corners lie up to `reach` beyond the frequencies fitted: far above the width of the first intervals.
+    # Corners may lie a factor `reach` outside the fitted frequencies: the lowest is still far above the width of the
+    # first intervals.
     reach = 10.0
     every = slice(int(np.searchsorted(grid.centre, settings.lowest * grid.centre[-1])), None, settings.fitted)
     # Above half the rate nothing has to be covered: the filter must not rise there, where the proof of robust stability

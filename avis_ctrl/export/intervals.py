@@ -54,7 +54,7 @@ class Jet:
 
         With P = [K; least I] at the centre, M = E P^+ and N = (E' - M P') P^+, anywhere in the interval
         E = (M + t N) P + G, |t| <= half, where G has only remainders; and the smallest singular value of P is at least
-        `least`, and at most half |P'| and its remainder below that at the centre.
+        `least`, and at least its value at the centre minus half |P'| minus the remainder.
         """
         n = K.value.shape[-1]
         below = np.broadcast_to(np.eye(n), (len(half), n, n))

@@ -54,9 +54,11 @@ class NamedEffect:
                 **({} if self.share is None else {"share": self.share})}
 
     def in_words(self) -> str:
-        """With its place, first parameters and probability; how single mounts differ stands in the table alone."""
-        first = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")][:3]
-        sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in first)
+        """With its place, probability, and its first parameters that differ from zero by two standard deviations; how
+        single mounts differ stands in the table alone."""
+        own = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")]
+        certain = [(name, p) for name, p in own if not (p.std or 0.0) > abs(p.value) / 2]
+        sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in (certain or own)[:3])
         ties = (f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"
                 if self.indistinguishable_from else "")
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"

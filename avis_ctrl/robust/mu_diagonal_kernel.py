@@ -229,11 +229,13 @@ def balanced_squares(norm2, sweeps):
 
 
 @njit(cache=True)
-def level_squares(norm2):
-    """d2 (B, n) > 0 such that no norm2_kj d2_k / d2_j exceeds the largest geometric mean of norm2 (B, n, n) around a
-    cycle of blocks, which does not depend on the units of the signals; 1 if there is no cycle.
+def level_squares(norm2, enough2, most):
+    """d2 (B, n) > 0 for which every norm2_kj d2_k / d2_j is at most the largest geometric mean of norm2 (B, n, n)
+    around a cycle of blocks, or at most enough2 (B,) if that is larger; 1 without a cycle where enough2 is zero. The
+    mean does not depend on the units of the signals.
 
-    The mean is found by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walks to each block.
+    It is found by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walks to each block, within
+    most of their middle: a chain of blocks with round-off behind it asks for more than numbers can hold.
     """
     batch, n = norm2.shape[:2]
     d2 = np.ones((batch, n))
@@ -254,10 +256,14 @@ def level_squares(norm2):
                 for m in range(n):
                     least = min(least, (walk[n, j] - walk[m, j]) / (n - m))
                 mean = max(mean, least)
+        if enough2[b] > 0.0:
+            mean = max(mean, np.log(enough2[b]))
         if mean > -np.inf:
             longest = np.zeros(n)
             for _ in range(n):
                 for j in range(n):
                     longest[j] = max(longest[j], np.max(longest + size[:, j]) - mean)
-            d2[b] = np.exp(longest - np.mean(longest))
+            middle = (np.max(longest) + np.min(longest)) / 2
+            for j in range(n):
+                d2[b, j] = np.exp(min(max(longest[j] - middle, -most), most))
     return d2

@@ -19,6 +19,8 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 BATCH_BYTES = 64e6
 # Of many blocks, the matrices whose bound with one number a block is above this share of the largest get the full one.
 WORTH = 0.97
+# Squares of scalings are within so many decades of their middle.
+MOST_DECADES = 80.0
 # A start from scalings that prove a level begins at this multiple of the level's square, with room around them.
 ROOM = 1.1
 
@@ -41,16 +43,18 @@ class UpperBound(NamedTuple):
                                                                         strict=True))))
 
 
-def block_balance(M: Array, structure: BlockStructure, sweeps: int = 20) -> Array:
-    """Osborne's scaling: d (B, n_blocks) > 0 that evens out the block norms of M (B, n_shared, n_z, n_w)."""
+def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0, sweeps: int = 20) -> Array:
+    """Osborne's scaling: d (B, n_blocks) > 0 that evens out the block norms of M (B, n_shared, n_z, n_w); norms below
+    goal (B,) need no scaling."""
     power = np.sum(np.abs(M) ** 2, axis=1)
     places = list(structure.slices())
     rows = np.stack([power[:, z].sum(axis=1) for _, _, z in places], axis=1)
     norm2 = np.stack([rows[:, :, w].sum(axis=2) for _, w, _ in places], axis=2)
     n = len(places)
     norm2[:, np.arange(n), np.arange(n)] = 0.0
-    # First the units of each block, so that what is small is so beside others of its kind.
-    units = level_squares(norm2)
+    # First remove the units of the blocks: the floor below is relative to the largest entry.
+    goal2 = np.broadcast_to(np.square(goal), M.shape[:1]).astype(float)
+    units = level_squares(norm2, goal2, MOST_DECADES * np.log(10.0))
     norm2 = norm2 * units[:, :, None] / units[:, None, :]
     # A floor keeps the scaling finite where a block is not coupled both ways.
     norm2 = norm2 + 1e-16 * np.max(norm2, axis=(1, 2), initial=0.0)[:, None, None] + 1e-300
@@ -117,11 +121,12 @@ def _replace(found: UpperBound, which: Array, better: UpperBound) -> None:
 
 def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array, start: UpperBound | None = None
                  ) -> UpperBound:
-    d_z, d_w = expand(structure, block_balance(M, structure))
+    d_z, d_w = expand(structure, block_balance(M, structure, goal))
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
     live = size > 0
-    size = np.where(live, size, 1.0)
+    # With a goal, norms far below it do not matter.
+    size = np.where(live, np.maximum(size, goal), 1.0)
     unit = balanced / size[:, None, None, None]
     floor = np.where(goal > 0, (goal / size) ** 2, -1e-8)
     if _is_diagonal(structure):

@@ -26,7 +26,7 @@ class ReductionSettings:
     """frequencies_Hz : at which controllers of different order are compared. They are coarse, for what is reported is
         computed anew for the one chosen; the resonances of the table at rest and the peak of mu join them, because both
         are narrower than the steps. Below the band mu bounds what the offset of the electronics costs.
-    accuracy : of the square of mu there, a fraction of what the reduction may cost.
+    accuracy : relative accuracy of the square of mu there, small beside the default reduction cost.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())

@@ -174,8 +174,8 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     """Bounds of every controller, one loop an axis tuned on mu and a skyhook tuned to the worst-case peak of mu where
     the design compares with them, and the simulation of mu.
 
-    Runs on two processes. The simulation, and the tuning of a skyhook whose peak the design does not limit, wait for
-    the bounds of all the others, because the best of these is delivered as the mu controller.
+    Runs on two processes, beside those of `early`. The simulation, and the tuning of a skyhook whose peak the design
+    does not limit, wait for the bounds of all the others, because the best of these is delivered as the mu controller.
 
     early : bounds that were started before, on processes that give way to those for the mu controller.
 

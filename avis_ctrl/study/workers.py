@@ -14,7 +14,7 @@ from typing import Any
 
 MOST = 2
 WATCH_S = 1.0
-# Added to the niceness of processes that work beside one that everything waits for.
+# Niceness added to workers that run beside the main computation.
 BESIDE = 10
 
 
@@ -54,7 +54,7 @@ def alone() -> Iterator[None]:
 class Workers:
     """A pool where there are processors for one, else the same calls one after the other in this process.
 
-    beside : this process computes, too, and before the others; it decides on Ctrl-C.
+    beside : this process computes as well, with priority over the workers, and decides what Ctrl-C does.
     """
 
     def __init__(self, count: int | None = None, beside: bool = False):

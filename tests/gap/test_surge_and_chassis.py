@@ -125,7 +125,7 @@ def test_six_sharp_resonances_are_found_from_a_model_without(values):
 
 
 def test_a_small_recoil_in_one_coordinate_is_significant():
-    """A heavy chassis moves up and down at 34 Hz: its own five parameters are tested, not those of the rig with them."""
+    """A heavy chassis moves up and down at 34 Hz: its own five parameters are tested, not those of the rig, too."""
     truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/translation",
                                      [1500.0, 0.018, 280.0, 280.0, 34.0]))
     omega, rng, noise, blocks = 2 * np.pi * np.linspace(0.5, 60.0, 150), np.random.default_rng(5), 4e-3, []

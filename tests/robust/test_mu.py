@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu import mu, mu_upper
 from avis_ctrl.robust.mu_lower import is_singular
-from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.mu_upper import skewed_upper_bound, upper_bound
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 from benchmarks.mu_by_bisection import mu_upper_by_bisection
@@ -254,6 +254,26 @@ def test_invariant_under_commuting_scalings(case):
     d_z, d_w = np.repeat(d, [b.cols for b in blocks]), np.repeat(d, [b.rows for b in blocks])
     scaled = M * d_z[:, None] / d_w
     assert mu_upper(scaled, blocks).upper == pytest.approx(mu_upper(M, blocks).upper, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize(("n", "most"), [(6, 0.101), (42, 1.1)])
+@pytest.mark.parametrize("feedback", [0.0, 1e-16, 1e-150])
+def test_a_chain_of_blocks_with_round_off_behind_it(n, most, feedback):
+    """Couplings of one, forwards only: mu is that of the diagonal. The scalings of a long chain have bounds, but the
+    result is an upper bound, and no more than the norm."""
+    M = np.diag(np.ones(n - 1), 1) + 0.1 * np.eye(n)
+    M[1, 0] = feedback
+    found = mu(M, [ComplexScalar()] * n)
+    assert found.lower == pytest.approx(0.1, rel=1e-2)
+    assert 0.1 <= found.upper < most
+
+
+def test_stages_in_series_have_the_product_of_their_gains_as_worst_case():
+    """Three uncertain stages without feedback, gain 0.3 (1 + 0.3 delta) each; round-off must not spoil the bound."""
+    M = np.array([[0, 0, 0, 1.0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]) * np.array([[0.3], [0.3], [0.3], [1.0]])
+    M[0, 2] = 1e-17
+    bound = skewed_upper_bound(M[None, None] + 0j, BlockStructure.of([ComplexScalar()] * 3 + [ComplexFull(1, 1)]))
+    assert bound.beta[0] == pytest.approx(0.3 ** 3, rel=1e-2)
 
 
 @settings(max_examples=10, deadline=None)
