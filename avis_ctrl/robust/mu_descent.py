@@ -226,7 +226,8 @@ def _highest(task: Task, M: Array, sharpness: float) -> tuple[Array, UpperBound]
     the frequency does not count. The highest norms come first: their mu tells which of the others count.
     """
     structure, settings = task.structure, task.settings
-    d_z, d_w = expand(structure, block_balance(M[:, None], structure))
+    # The units of a descent's plant are alike: only the floor is needed.
+    d_z, d_w = expand(structure, block_balance(M[:, None], structure, goal=np.inf))
     size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
     falling = np.argsort(-size)
     first = upper_bound(M[falling[:settings.first]][:, None], structure, settings.accuracy)

@@ -163,10 +163,11 @@ class BaseCompliance(OfMounts):
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
                 reached = self._one_by_one(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
-        # The rig's parameters fit a part of the noise too, on few lines a larger one; before and after alike.
-        values = _effect(reached).values
+        # The rig's parameters fit a part of the noise too, on few lines a larger one; before and after alike. The
+        # frequency of each coordinate was sought by itself.
+        values, ways = _effect(reached).values, 3 if place.endswith("translation") else 6
         found = Seed(values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2, len(values),
-                     len(own) + SETTINGS.alike_Hz[2], few - reached.chi2)
+                     SETTINGS.own_Hz[2] ** ways, few - reached.chi2)
         return [found] if found.chi2 > 0 else own
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
