@@ -48,8 +48,8 @@ class CoverSettings:
     lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
         constant, and the intervals at most as wide as the first logarithmic one.
     intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide.
-    remainder, divisions : intervals in which Taylor's remainder is above `harmless` and this fraction of the error are
-        divided, into at most so many: near the controller's own modes.
+    remainder, divisions : an interval in which Taylor's remainder is above `harmless` and above this fraction of the
+        error is divided, into at most so many parts. This happens near the controller's own modes.
     fitted : every so many intervals are fitted; the filter is then raised over all of them.
     beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
     excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
@@ -104,16 +104,14 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """The controller of the proof with what the emitted one does beyond it.
+    """The controller in the proof, and filters that cover what the emitted one does differently.
 
     K : continuous, from seen velocities to forces. W_a : covers the error relative to [K; least I], least in N s/m.
-    unit : a gain [N s/m] about as large as K, by which the channels of that error are scaled.
     W_E : covers the images of the sample rate [m/(N s)].
     """
 
     K: StateSpace
     least: float
-    unit: float
     W_a: Rational
     W_E: Rational
 
@@ -135,12 +133,11 @@ class Errors:
                 parts[f"W_v {k}"] = W_v.system(force[k], f"velocity above {k}")
             parts[f"seen {k}"] = summing_junction(plant.y[k], terms)
             parts[f"force {k}"] = summing_junction(force[k], [plant.u[k], f"error {k}"])
-            parts[f"W_a {k}"] = self.W_a.scaled(self.unit).system(f"w_a{k}", f"error {k}")
-            parts[f"K {k}"] = gain([[1 / self.unit]], [plant.u[k]], [f"z_a{k}"])
-            parts[f"least {k}"] = gain([[self.least / self.unit]], [plant.y[k]], [f"z_a{n + k}"])
+            parts[f"W_a {k}"] = self.W_a.system(f"w_a{k}", f"error {k}")
+            parts[f"least {k}"] = gain([[self.least]], [plant.y[k]], [f"z_a{k}"])
             parts[f"W_E {k}"] = self.W_E.system(force[k], f"z_E{k}")
         w = [f"w_{kind}{k}" for kind in "aE" for k in range(n)]
-        z = [*(f"z_a{k}" for k in range(2 * n)), *(f"z_E{k}" for k in range(n))]
+        z = [*plant.u, *(f"z_{kind}{k}" for kind in "aE" for k in range(n))]
         above = range(n if W_f is not None else 0)
         closed = connect(parts, [*P.inputs[:blocks.n_w], *w, *plant.w, *(f"floor above {k}" for k in above)],
                          [*P.outputs[:blocks.n_z], *z, *plant.z, *(f"velocity above {k}" for k in above)])
@@ -180,14 +177,13 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     K = balanced(K)
     grid = Grid.of(axes.half_rate, settings)
     gains = _gain(K, grid.centre)
-    largest = float(np.max(gains))
-    least = max(settings.least * gains[-1], settings.least_of_all * largest)
+    least = max(settings.least * float(gains[-1]), settings.least_of_all * float(np.max(gains)))
     W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
                  np.full(grid.centre.size, settings.harmless), settings)
     table = plant.synthesis.P.select(plant.synthesis.y, plant.synthesis.u)
     W_E = _cover(grid, axes.folding(grid.centre, grid.half), settings.harmless_images * _gain(table, grid.centre),
                  settings)
-    errors = Errors(K, least, largest, W_a, W_E)
+    errors = Errors(K, least, W_a, W_E)
     below = (0.0, axes.half_rate)
     performance, blocks = errors.closed(plant.synthesis)
     motion, _ = errors.closed(plant.full.restricted(plant.floor_velocities, plant.velocities))

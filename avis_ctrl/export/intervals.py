@@ -39,22 +39,17 @@ class Jet:
         return Jet(self.value - other.value, self.slope - other.slope, self.size + other.size,
                    self.steep + other.steep, self.curve + other.curve)
 
-    def bound(self, half: np.ndarray) -> np.ndarray:
-        """(n,) largest norm over each interval, of a matrix function."""
-        value, slope = (np.linalg.norm(part, ord=2, axis=(1, 2)) for part in (self.value, self.slope))
-        return value + half * slope + self.remainder(half)
-
     def remainder(self, half: np.ndarray) -> np.ndarray:
         """(n,) largest distance from value and slope at the centre over each interval."""
         return half ** 2 / 2 * self.curve
 
     def relative_to(self, K: Jet, least: float, half: np.ndarray, further: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) bound over each interval of |M| in E + F = M [K; least I], E this function and |F| <= further; and the
-        part of it that falls with the square of the interval's width.
+        """(n,) bound over each interval of |M| in E + F = M [K; least I], where E is this function and |F| <= further;
+        and the part of the bound that falls with the square of the interval's width.
 
-        With P = [K; least I] at the centre, M = E P^+ and N = (E' - M P') P^+, anywhere in the interval
-        E = (M + t N) P + G, |t| <= half, where G has only remainders; and the smallest singular value of P is at least
-        `least`, and at least its value at the centre minus half |P'| minus the remainder.
+        P = [K; least I]. With M = E P^+ and N = (E' - M P') P^+ at the centre, E = (M + t N) P + G anywhere in the
+        interval, |t| <= half, where G contains only remainders. The smallest singular value of P is at least `least`,
+        and at least its value at the centre minus half |P'| minus the remainder.
         """
         n = K.value.shape[-1]
         below = np.broadcast_to(np.eye(n), (len(half), n, n))

@@ -148,7 +148,7 @@ class SampledAxes:
         rounded decoding adds; and the part of it that falls with the square of the interval's width.
 
         K : continuous, from seen velocities to forces [N s/m]; the delay is that of the design's model.
-        least : gain [N s/m] from which an error is relative to the controller in its direction.
+        least : gain [N s/m] below which the error is measured absolutely.
         """
         T, rig, own = self.period_s, self.folder.rig, self.controller.system
         design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)

@@ -226,7 +226,7 @@ def _highest(task: Task, M: Array, sharpness: float) -> tuple[Array, UpperBound]
     the frequency does not count. The highest norms come first: their mu tells which of the others count.
     """
     structure, settings = task.structure, task.settings
-    # The units of a descent's plant are alike: only the floor is needed.
+    # The signals of a design plant are scaled alike, so that no norm has to be levelled first.
     d_z, d_w = expand(structure, block_balance(M[:, None], structure, goal=np.inf))
     size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
     falling = np.argsort(-size)

@@ -234,8 +234,9 @@ def level_squares(norm2, enough2, most):
     around a cycle of blocks, or at most enough2 (B,) if that is larger; 1 without a cycle where enough2 is zero. The
     mean does not depend on the units of the signals.
 
-    It is found by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walks to each block, within
-    most of their middle: a chain of blocks with round-off behind it asks for more than numbers can hold.
+    The mean is found by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walk to each block.
+
+    most : largest distance of log d2 from the middle of its range.
     """
     batch, n = norm2.shape[:2]
     d2 = np.ones((batch, n))

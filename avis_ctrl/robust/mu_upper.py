@@ -7,6 +7,7 @@ an upper bound however far the optimisation got.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +17,24 @@ from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
 from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follow, least_level, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-BATCH_BYTES = 64e6
-# Of many blocks, the matrices whose bound with one number a block is above this share of the largest get the full one.
-WORTH = 0.97
-# Squares of scalings are within so many decades of their middle.
-MOST_DECADES = 80.0
-# A start from scalings that prove a level begins at this multiple of the level's square, with room around them.
-ROOM = 1.1
+
+@dataclass(frozen=True)
+class UpperBoundSettings:
+    """batch_bytes : memory of the matrices that are treated together.
+    worth : of many blocks, the matrices whose bound with one number a block is above this fraction of the largest get
+        the full bound.
+    most_decades : largest distance of a squared scaling from the middle of their range, in decades: chains that only
+        round-off closes would need a range that floating-point numbers do not have.
+    room : a start from scalings that prove a level begins at this multiple of the level's square.
+    """
+
+    batch_bytes: float = 64e6
+    worth: float = 0.97
+    most_decades: float = 80.0
+    room: float = 1.1
+
+
+SETTINGS = UpperBoundSettings()
 
 
 class UpperBound(NamedTuple):
@@ -54,7 +66,7 @@ def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0
     norm2[:, np.arange(n), np.arange(n)] = 0.0
     # First remove the units of the blocks: the floor below is relative to the largest entry.
     goal2 = np.broadcast_to(np.square(goal), M.shape[:1]).astype(float)
-    units = level_squares(norm2, goal2, MOST_DECADES * np.log(10.0))
+    units = level_squares(norm2, goal2, SETTINGS.most_decades * np.log(10.0))
     norm2 = norm2 * units[:, :, None] / units[:, None, :]
     # A floor keeps the scaling finite where a block is not coupled both ways.
     norm2 = norm2 + 1e-16 * np.max(norm2, axis=(1, 2), initial=0.0)[:, None, None] + 1e-300
@@ -86,7 +98,7 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, go
     goals = np.broadcast_to(goal, M.shape[:1])
     if _is_diagonal(structure):
         return _upper_chunk(M, structure, tolerance, goals)
-    n_chunk = max(1, int(BATCH_BYTES / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
+    n_chunk = max(1, int(SETTINGS.batch_bytes / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
     parts = [np.arange(k, min(k + n_chunk, M.shape[0])) for k in range(0, M.shape[0], n_chunk)]
     return UpperBound.joined([_upper_chunk(M[part], structure, tolerance, goals[part],
                                            None if start is None else start.at(part)) for part in parts])
@@ -108,7 +120,7 @@ def highest(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound
         return upper_bound(M, structure, tolerance)
     found, full = upper_bound(M, structure.simplified(), tolerance), np.zeros(M.shape[0], bool)
     while not full[np.argmax(found.beta)]:
-        left = np.flatnonzero(~full & (found.beta >= WORTH * np.max(found.beta)))
+        left = np.flatnonzero(~full & (found.beta >= SETTINGS.worth * np.max(found.beta)))
         _replace(found, left, upper_bound(M[left], structure, tolerance, start=found.at(left)))
         full[left] = True
     return found
@@ -125,7 +137,7 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
     live = size > 0
-    # With a goal, norms far below it do not matter.
+    # Below the goal nothing need be resolved.
     size = np.where(live, np.maximum(size, goal), 1.0)
     unit = balanced / size[:, None, None, None]
     floor = np.where(goal > 0, (goal / size) ** 2, -1e-8)
@@ -137,7 +149,7 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
         if start is not None:
             theta = space.theta(rescaled(start.scalings, 1 / d_z, 1 / d_w, 1 / size))
             theta = theta * (space.core.size / (theta @ space.trace))[:, None]
-            lam = ROOM * (start.beta / size) ** 2
+            lam = SETTINGS.room * (start.beta / size) ** 2
         if np.any(live):
             found, _ = follow(space, unit[live], theta[live], lam[live], floor[live], tolerance)
             theta[live] = found

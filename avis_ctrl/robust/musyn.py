@@ -127,7 +127,6 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     >>> made.guaranteed, round(made.mu_upper, 2)
     (True, 0.91)
     """
-    P = as_plant(P, nmeas, ncon)
     if structure not in ("full", "decentralised"):
         raise InputError("expected 'full' or 'decentralised'", field="structure", value=structure)
     apart = structure == "decentralised"
@@ -147,16 +146,18 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
             notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
                      f"instead of {best.mu:.4g}",)
             best = Loop(K, best.scalings, np.nan, peak)
-        return _result(P, made, best, sample_rate_Hz, notes)
+        return _result(made, best, sample_rate_Hz, notes)
 
 
 @dataclass(frozen=True, eq=False)
 class DKIteration:
     """Where D-K iteration ended, before the bounds of the result are computed.
 
+    P, uncertainty : as given, performance as the last block. problem : as the synthesis sees them.
     best : the controller of least complex mu on the grid of the iteration; of a sampled plant its continuous image.
     """
 
+    P: StateSpace
     problem: Problem
     uncertainty: BlockStructure
     state: State
@@ -199,7 +200,7 @@ def dk_iteration(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, n
         if state is not None:
             current, known = State.from_dict(state, complexified, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, (*known, *given), options)
-        return DKIteration(problem, uncertainty, current, status)
+        return DKIteration(P, problem, uncertainty, current, status)
 
 
 def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
@@ -255,10 +256,9 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
     return min(candidates, key=lambda pair: pair[1])
 
 
-def _result(P: StateSpace, made: DKIteration, best: Loop, sample_rate_Hz: float | None, said: tuple[str, ...]
-            ) -> MuSynthesis:
+def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, said: tuple[str, ...]) -> MuSynthesis:
     """A controller in the clock of P, with mu measured anew on its loop with P as given."""
-    problem, uncertainty, state = made.problem, made.uncertainty, made.state
+    P, problem, uncertainty, state = made.P, made.problem, made.uncertainty, made.state
     K = sampled_image(best.K, P.dt) if P.dt else best.K
     closed = lft_lower(P, K)
     # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.

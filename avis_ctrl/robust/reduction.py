@@ -55,8 +55,8 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
     growth : allowed relative growth of the figure.
     orders : orders to choose from, by default all from the unstable part's to K's own. They are searched by halving:
         the order below the one returned was tried and failed; the figure is not looked at on every order.
-    limit : largest figure of a reduced controller, instead of `growth`. `measure` need then only be exact above the
-        limit; the figures returned below it are upper bounds. If no reduced controller keeps it, K is returned.
+    limit : largest figure of a reduced controller, instead of `growth`. `measure` then need only be exact above the
+        limit; the figures returned below it are upper bounds. If no reduced controller stays below it, K is returned.
 
     Raises
     ------

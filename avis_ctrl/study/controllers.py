@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,25 +73,26 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
-    def peak_on_grid(K: StateSpace, goal: float = 0.0) -> float:
-        """Complex mu; only an upper bound of it where that is below the goal."""
-        M = P.closed(K).frequency_response(omega)[:, None]
+    def peak_on_grid(closed: StateSpace, goal: float = 0.0) -> float:
+        """Complex mu of a closed loop; where it is below the goal, only an upper bound of it."""
+        M = closed.frequency_response(omega)[:, None]
         return float(np.max(upper_bound(M, blocks, SETTINGS.accuracy, goal).beta))
     K = made.best.K
-    full = peak_on_grid(K)
+    full = peak_on_grid(P.closed(K))
     limit = (1 + cost) * full
 
     def harmless(candidate: StateSpace) -> bool:
-        return P.closed(candidate).is_stable() and peak_on_grid(candidate, limit) <= limit
+        closed = P.closed(candidate)
+        return closed.is_stable() and peak_on_grid(closed, limit) <= limit
     # Poles beyond the Nyquist frequency cannot be implemented; what removing them costs is in the measured figure.
     slow = residualise_fast(K, np.pi * rig.sample_rate_Hz)
     start = slow if harmless(slow) else K
     # Below the corner to which the offset may drift no weight changes.
     lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
     start = lasting if harmless(lasting) else start
-    reduced = reduce_controller(P.P, start, partial(peak_on_grid, goal=limit), limit=limit).K
+    reduced = reduce_controller(P.P, start, lambda one: peak_on_grid(P.closed(one), limit), limit=limit).K
     return reduced, (f"reduced from {K.nstates} to {reduced.nstates} states: complex mu on a grid of {omega.size} "
-                     f"frequencies changes from {full:.4f} to {peak_on_grid(reduced):.4f}")
+                     f"frequencies changes from {full:.4f} to {peak_on_grid(P.closed(reduced)):.4f}")
 
 
 def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:

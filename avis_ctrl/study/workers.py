@@ -10,12 +10,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
-MOST = 2
-WATCH_S = 1.0
-# Niceness added to workers that run beside the main computation.
-BESIDE = 10
+
+@dataclass(frozen=True)
+class WorkerSettings:
+    """most : processes of a pool: the commands are made for two processors.
+    watch_s : time between two looks at whether the parent still lives [s].
+    niceness : added to that of workers beside the main computation, so that it keeps a processor of its own.
+    """
+
+    most: int = 2
+    watch_s: float = 1.0
+    niceness: int = 10
+
+
+SETTINGS = WorkerSettings()
 
 
 def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, niceness: int = 0) -> None:
@@ -32,7 +43,7 @@ def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, nicen
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(WATCH_S)
+            time.sleep(SETTINGS.watch_s)
         os._exit(1)
     threading.Thread(target=watch, daemon=True).start()
 
@@ -59,9 +70,9 @@ class Workers:
 
     def __init__(self, count: int | None = None, beside: bool = False):
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        most = 1 if _alone else MOST
+        most = 1 if _alone else SETTINGS.most
         self._count = min(most, available) if count is None else count
-        self._manners = (signal.SIG_IGN, BESIDE) if beside else (signal.SIG_DFL, 0)
+        self._manners = (signal.SIG_IGN, SETTINGS.niceness) if beside else (signal.SIG_DFL, 0)
 
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.

@@ -29,6 +29,18 @@ def with_effect(name: str, place: str, values: list[float]) -> TableModel:
     return bare.with_effect(active(library()[name], bare, place, values))
 
 
+def recorded(truth: TableModel, count: int, noise: float) -> list[SpectralBlock]:
+    """Lines of periodic records, all drives random, the floor at rest; noise : r.m.s. of each sensor's."""
+    omega, rng, blocks = 2 * np.pi * np.linspace(0.5, 60.0, 150), np.random.default_rng(5), []
+    for k in range(count):
+        U = np.zeros((len(omega), 11, 1), complex)
+        U[:, :8] = 0.3 * gaussian(rng, len(omega), 8, 1)
+        made = SpectralBlock(f"{k:02d}", omega, U, np.zeros((len(omega), 6, 1), complex), transient=False)
+        Y = truth.answer(made, None, False).Y + noise * gaussian(rng, len(omega), 6, 1)
+        blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
+    return blocks
+
+
 def test_a_push_on_the_mass_inside_a_mount():
     """Against the table with the four masses as coordinates of their own."""
     f, share, zeta, uneven = 17.0, 0.4, 0.05, np.array([0.02, -0.01, 0.03, -0.04])
@@ -110,13 +122,7 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
 def test_six_sharp_resonances_are_found_from_a_model_without(values):
     """Each a per cent of damping wide, none at the frequency of another, and the rig fitted without them before."""
     truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/rocking", values))
-    omega, rng, noise, blocks = 2 * np.pi * np.linspace(0.5, 60.0, 150), np.random.default_rng(5), 3e-4, []
-    for k in range(4):
-        U = np.zeros((len(omega), 11, 1), complex)
-        U[:, :8] = 0.3 * gaussian(rng, len(omega), 8, 1)
-        made = SpectralBlock(f"{k:02d}", omega, U, np.zeros((len(omega), 6, 1), complex), transient=False)
-        Y = truth.answer(made, None, False).Y + noise * gaussian(rng, len(omega), 6, 1)
-        blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
+    blocks = recorded(truth, 4, 3e-4)
     base = fitted(MODEL, blocks)
     assert base.chi2_per_dof > 5
     seed, = seeds(library()["base_compliance"], Score(base.model, blocks), "chassis/rocking")
@@ -125,16 +131,10 @@ def test_six_sharp_resonances_are_found_from_a_model_without(values):
 
 
 def test_a_small_recoil_in_one_coordinate_is_significant():
-    """A heavy chassis moves up and down at 34 Hz: its own five parameters are tested, not those of the rig, too."""
+    """A heavy chassis that moves up and down at 34 Hz: the test counts its own five parameters, not the rig's."""
     truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/translation",
                                      [1500.0, 0.018, 280.0, 280.0, 34.0]))
-    omega, rng, noise, blocks = 2 * np.pi * np.linspace(0.5, 60.0, 150), np.random.default_rng(5), 4e-3, []
-    for k in range(2):
-        U = np.zeros((len(omega), 11, 1), complex)
-        U[:, :8] = 0.3 * gaussian(rng, len(omega), 8, 1)
-        made = SpectralBlock(f"{k:02d}", omega, U, np.zeros((len(omega), 6, 1), complex), transient=False)
-        Y = truth.answer(made, None, False).Y + noise * gaussian(rng, len(omega), 6, 1)
-        blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
+    blocks = recorded(truth, 2, 4e-3)
     seed = seeds(library()["base_compliance"], Score(fitted(MODEL, blocks).model, blocks), "chassis/translation")[0]
     assert seed.p_value < 1e-3
 

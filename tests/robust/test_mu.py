@@ -259,8 +259,8 @@ def test_invariant_under_commuting_scalings(case):
 @pytest.mark.parametrize(("n", "most"), [(6, 0.101), (42, 1.1)])
 @pytest.mark.parametrize("feedback", [0.0, 1e-16, 1e-150])
 def test_a_chain_of_blocks_with_round_off_behind_it(n, most, feedback):
-    """Couplings of one, forwards only: mu is that of the diagonal. The scalings of a long chain have bounds, but the
-    result is an upper bound, and no more than the norm."""
+    """Couplings of one, forwards only: mu is that of the diagonal. The range of the scalings is limited, so that a long
+    chain has a loose upper bound, but one below the norm."""
     M = np.diag(np.ones(n - 1), 1) + 0.1 * np.eye(n)
     M[1, 0] = feedback
     found = mu(M, [ComplexScalar()] * n)
@@ -269,7 +269,7 @@ def test_a_chain_of_blocks_with_round_off_behind_it(n, most, feedback):
 
 
 def test_stages_in_series_have_the_product_of_their_gains_as_worst_case():
-    """Three uncertain stages without feedback, gain 0.3 (1 + 0.3 delta) each; round-off must not spoil the bound."""
+    """Three gains of 0.3, each followed by a perturbation, without feedback; round-off must not spoil the bound."""
     M = np.array([[0, 0, 0, 1.0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]) * np.array([[0.3], [0.3], [0.3], [1.0]])
     M[0, 2] = 1e-17
     bound = skewed_upper_bound(M[None, None] + 0j, BlockStructure.of([ComplexScalar()] * 3 + [ComplexFull(1, 1)]))

@@ -163,11 +163,11 @@ class BaseCompliance(OfMounts):
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
                 reached = self._one_by_one(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
-        # The rig's parameters fit a part of the noise too, on few lines a larger one; before and after alike. The
-        # frequency of each coordinate was sought by itself.
-        values, ways = _effect(reached).values, 3 if place.endswith("translation") else 6
+        # The rig's parameters fit a part of the noise with and without the chassis, so that only its own ones count.
+        # The frequency of each coordinate was chosen from a grid: any combination could have been the best.
+        values = _effect(reached).values
         found = Seed(values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2, len(values),
-                     SETTINGS.own_Hz[2] ** ways, few - reached.chi2)
+                     SETTINGS.own_Hz[2] ** len(_ways(place)), few - reached.chi2)
         return [found] if found.chi2 > 0 else own
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
@@ -210,8 +210,9 @@ class BaseCompliance(OfMounts):
                ) -> list[tuple[float, tuple[float, ...]]]:
         """(expected chi-square, values) of starts with one frequency for all coordinates, the best first."""
         payload = model.rig.mounted_body().mass
-        shape = () if place.endswith("translation") else SETTINGS.alike_shape
-        starts = [(SETTINGS.alike_mass * payload, 0.05, *[f] * (6 if shape else 3), *shape)
+        ways = _ways(place)
+        shape = SETTINGS.alike_shape if len(ways) > 3 else ()
+        starts = [(SETTINGS.alike_mass * payload, 0.05, *[f] * len(ways), *shape)
                   for f in np.geomspace(*SETTINGS.alike_Hz).tolist()]
         expected = [(self._expected(model, place, values, blocks), values) for values in starts]
         return sorted(one for one in expected if one[0] < np.inf)
@@ -255,7 +256,7 @@ class BaseCompliance(OfMounts):
 
     def _by_coordinate(self, score: Score, place: str) -> list[Seed]:
         """From the best resonance of each coordinate by itself; the masses are estimated together."""
-        ways = WAYS[:3] if place.endswith("translation") else WAYS
+        ways = _ways(place)
         zeta, grid = SETTINGS.first_damping, np.geomspace(*SETTINGS.own_Hz)
         rows, labels = [], []
         for f in grid:
@@ -305,6 +306,11 @@ class BaseCompliance(OfMounts):
             D = s[:, :, 0] ** 2 * mass[along, along] + held
             B[:, along, along], H[:, along, along] = 1 / D, held / D
         ops.recoil, ops.follow = B, H
+
+
+def _ways(place: str) -> tuple[str, ...]:
+    """Coordinates in which a chassis moves."""
+    return WAYS[:3] if place.endswith("translation") else WAYS
 
 
 def of_chassis(values: Values) -> np.ndarray:
