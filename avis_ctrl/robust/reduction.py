@@ -19,6 +19,25 @@ from avis_ctrl.robust.hinf_plant import as_plant
 
 
 @dataclass(frozen=True)
+class LagSettings:
+    """Lags that replace fast poles (`with_lags`).
+
+    order : number of lags in a chain. Three can follow the lead that compensates an anti-alias filter of third order.
+    kept : as a fraction of the limit; slower poles of the controller are kept.
+    lowest, points : frequencies of the fit, from this fraction of the limit to the limit, evenly spaced on a
+        logarithmic axis. They begin far below the limit, because the phase of fast poles matters there, too.
+    """
+
+    order: int = 3
+    kept: float = 2 / 3
+    lowest: float = 1 / 500
+    points: int = 60
+
+
+LAGS = LagSettings()
+
+
+@dataclass(frozen=True)
 class Reduction:
     """The controller kept and what was measured on the way.
 
@@ -111,6 +130,34 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
                                measured=f"{np.max(np.abs(fast.poles())):.4g} rad/s, limit {limit:.4g} rad/s",
                                next_step="raise the back-off, or sample faster")
     return replace(slow, D=slow.D + fast.dcgain())
+
+
+def with_lags(K: StateSpace, limit: float, settings: LagSettings = LAGS) -> StateSpace:
+    """K whose poles near and beyond `limit` [rad/s] are replaced by lags with corners at the limit.
+
+    Fast poles may give a controller phase lead below the limit, which their gain at rest (`residualise_fast`) does not
+    have. Powers of the lag 1/(1 + s/limit), one chain for each input, are fitted to them up to the limit by least
+    squares, relative to the gain of K; K(0) is kept exactly. Stability of the loop is for the caller to check, for
+    unstable poles are replaced, too. Raises InputError for sampled K.
+    """
+    if K.dt:
+        raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
+    slow, fast = split(K, lambda re, im: np.hypot(re, im) <= settings.kept * limit)
+    if not fast.nstates:
+        return K
+    n_u, n_y, count = K.noutputs, K.ninputs, settings.order
+    omega = np.geomspace(settings.lowest * limit, limit, settings.points)
+    lag = 1 / (1 + 1j * omega / limit)
+    size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2))
+    # Differences of successive powers vanish at rest.
+    basis = np.stack([(lag ** k - lag ** (k + 1)) / size for k in range(count)], axis=1)
+    target = ((fast.frequency_response(omega) - fast.dcgain()) / size[:, None, None]).reshape(omega.size, -1)
+    gains = np.linalg.lstsq(np.r_[basis.real, basis.imag], np.r_[target.real, target.imag])[0]
+    gains = np.concatenate([gains.reshape(count, n_u, n_y), np.zeros((1, n_u, n_y))])
+    A = limit * np.kron(np.diag(np.ones(count - 1), -1) - np.eye(count), np.eye(n_y))
+    B = limit * np.kron(np.eye(count, 1), np.eye(n_y))
+    C = np.concatenate(list(gains[1:] - gains[:-1]), axis=1)
+    return replace(slow, D=slow.D + fast.dcgain() + gains[0]) + StateSpace(A, B, C, np.zeros((n_u, n_y)))
 
 
 def truncate_slow(K: StateSpace, limit: float) -> StateSpace:

@@ -14,7 +14,7 @@ from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import DKIteration, dk_iteration
-from avis_ctrl.robust.reduction import reduce_controller, residualise_fast, truncate_slow
+from avis_ctrl.robust.reduction import reduce_controller, residualise_fast, truncate_slow, with_lags
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
@@ -85,8 +85,8 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
         closed = P.closed(candidate)
         return closed.is_stable() and peak_on_grid(closed, limit) <= limit
     # Poles beyond the Nyquist frequency cannot be implemented; what removing them costs is in the measured figure.
-    slow = residualise_fast(K, np.pi * rig.sample_rate_Hz)
-    start = slow if harmless(slow) else K
+    fastest = np.pi * rig.sample_rate_Hz
+    start = next(filter(harmless, (residualise_fast(K, fastest), with_lags(K, fastest))), K)
     # Below the corner to which the offset may drift no weight changes.
     lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
     start = lasting if harmless(lasting) else start

@@ -16,7 +16,7 @@ NAMES = sorted(path.stem for path in DESIGNS.glob("*.toml"))
 
 
 def test_every_design_file_has_its_script():
-    assert NAMES == ["avis_six_axes", "avis_z_phix", "from_campaign", "halcyonics_z_phix"]
+    assert NAMES == ["avis_six_axes", "avis_z_phix", "from_campaign", "halcyonics_six_axes", "halcyonics_z_phix"]
     # One axis by itself has no rig of six coordinates, hence no design file.
     assert sorted(path.stem for path in DESIGNS.glob("*.py")) == sorted([*NAMES, "single_axis"])
 
