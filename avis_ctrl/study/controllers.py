@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -26,10 +27,13 @@ class ReductionSettings:
         computed anew for the one chosen; the resonances of the table at rest and the peak of mu join them, because both
         are narrower than the steps. Below the band mu bounds what the offset of the electronics costs.
     accuracy : relative accuracy of the square of mu there, small beside the default reduction cost.
+    lags : corners of the lags that replace fast poles, as fractions of half the sample rate; the first that cost no
+        more than allowed are taken. The lower the corner, the less the controller differs from its sampled form.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
     accuracy: float = 1e-3
+    lags: tuple[float, ...] = (0.2, 0.3, 0.45, 0.7, 1.0)
 
 
 SETTINGS = ReductionSettings()
@@ -86,7 +90,8 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
         return closed.is_stable() and peak_on_grid(closed, limit) <= limit
     # Poles beyond the Nyquist frequency cannot be implemented; what removing them costs is in the measured figure.
     fastest = np.pi * rig.sample_rate_Hz
-    start = next(filter(harmless, (residualise_fast(K, fastest), with_lags(K, fastest))), K)
+    candidates = chain([residualise_fast(K, fastest)], (with_lags(K, part * fastest) for part in SETTINGS.lags))
+    start = next(filter(harmless, candidates), K)
     # Below the corner to which the offset may drift no weight changes.
     lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
     start = lasting if harmless(lasting) else start
