@@ -1,4 +1,4 @@
-"""The loaded Halcyonics table, all six axes: halcyonics_six_axes.toml in Python.   halcyonics_six_axes.py [FOLDER]"""
+"""The loaded Halcyonics table, six axes: halcyonics_six_axes.toml in Python. python halcyonics_six_axes.py [FOLDER]"""
 
 import sys
 

@@ -20,12 +20,12 @@ from avis_ctrl.robust.hinf_plant import as_plant
 
 @dataclass(frozen=True)
 class LagSettings:
-    """Lags that replace fast poles (`with_lags`).
+    """Fit of `replace_fast_by_lags`.
 
-    order : number of lags in a chain. Three can follow the lead that compensates an anti-alias filter of third order.
-    kept : as a fraction of the limit; slower poles of the controller are kept.
-    lowest, points : frequencies of the fit, from this fraction of the limit to the limit, evenly spaced on a
-        logarithmic axis. They begin far below the limit, because the phase of fast poles matters there, too.
+    order : highest power of the lag; three for the lead that compensates a third-order anti-alias filter.
+    kept : poles slower than this fraction of the corner frequency are kept.
+    lowest, points : the fit uses so many frequencies, evenly spaced on a logarithmic axis from `lowest` times the
+        corner to the corner. They begin far below it, because fast poles contribute phase there.
     """
 
     order: int = 3
@@ -132,30 +132,31 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
     return replace(slow, D=slow.D + fast.dcgain())
 
 
-def with_lags(K: StateSpace, limit: float, settings: LagSettings = LAGS) -> StateSpace:
-    """K whose poles near and beyond `limit` [rad/s] are replaced by lags with corners at the limit.
+def replace_fast_by_lags(K: StateSpace, corner: float, settings: LagSettings = LAGS) -> StateSpace:
+    """K with its poles faster than `settings.kept` times `corner` [rad/s] replaced by first-order lags of that corner.
 
-    Fast poles may give a controller phase lead below the limit, which their gain at rest (`residualise_fast`) does not
-    have. Powers of the lag 1/(1 + s/limit), one chain for each input, are fitted to them up to the limit by least
-    squares, relative to the gain of K; K(0) is kept exactly. Stability of the loop is for the caller to check, for
-    unstable poles are replaced, too. Raises InputError for sampled K.
+    Fast poles may give K phase lead below the corner, which is lost if only their gain at zero frequency is kept
+    (`residualise_fast`). Their sum is approximated by that of G_k / (1 + s/corner)^k, k = 0 to `settings.order`, with
+    constant matrices G_k: by least squares at frequencies up to the corner, relative to the largest singular value of
+    K. K(0) is unchanged. The lags have order times K.ninputs states. Unstable fast poles are replaced, too; the caller
+    must check the stability of the closed loop. Raises InputError for sampled K.
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
-    slow, fast = split(K, lambda re, im: np.hypot(re, im) <= settings.kept * limit)
+    slow, fast = split(K, lambda re, im: np.hypot(re, im) <= settings.kept * corner)
     if not fast.nstates:
         return K
     n_u, n_y, count = K.noutputs, K.ninputs, settings.order
-    omega = np.geomspace(settings.lowest * limit, limit, settings.points)
-    lag = 1 / (1 + 1j * omega / limit)
+    omega = np.geomspace(settings.lowest * corner, corner, settings.points)
+    lag = 1 / (1 + 1j * omega / corner)
     size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2))
-    # Differences of successive powers vanish at rest.
+    # lag^k - lag^(k + 1) is zero at s = 0: the fit cannot change K(0).
     basis = np.stack([(lag ** k - lag ** (k + 1)) / size for k in range(count)], axis=1)
     target = ((fast.frequency_response(omega) - fast.dcgain()) / size[:, None, None]).reshape(omega.size, -1)
     gains = np.linalg.lstsq(np.r_[basis.real, basis.imag], np.r_[target.real, target.imag])[0]
     gains = np.concatenate([gains.reshape(count, n_u, n_y), np.zeros((1, n_u, n_y))])
-    A = limit * np.kron(np.diag(np.ones(count - 1), -1) - np.eye(count), np.eye(n_y))
-    B = limit * np.kron(np.eye(count, 1), np.eye(n_y))
+    A = corner * np.kron(np.diag(np.ones(count - 1), -1) - np.eye(count), np.eye(n_y))
+    B = corner * np.kron(np.eye(count, 1), np.eye(n_y))
     C = np.concatenate(list(gains[1:] - gains[:-1]), axis=1)
     return replace(slow, D=slow.D + fast.dcgain() + gains[0]) + StateSpace(A, B, C, np.zeros((n_u, n_y)))
 

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, connect, gain, hinf_norm, lft_lower, summing_junction, tf
 from avis_ctrl.robust.hinfsyn import hinfsyn
-from avis_ctrl.robust.reduction import reduce_controller, residualise_fast, split_stable, truncate_slow, with_lags
+from avis_ctrl.robust.reduction import (
+    reduce_controller,
+    replace_fast_by_lags,
+    residualise_fast,
+    split_stable,
+    truncate_slow,
+)
 
 
 @pytest.fixture(scope="module")
@@ -90,26 +96,26 @@ def test_slow_poles_are_left_out_and_nothing_else(rng):
 
 
 def test_lags_keep_the_phase_lead_of_fast_poles():
-    """A slow mode beside a lead of second order, made proper by poles a hundred times faster: a decade below the limit
-    most of it is kept, where the gain at rest of the fast poles alone is wrong by half."""
+    """A slow mode and the lead (1 + s/300)^2 with two poles at 1e5 rad/s. Up to a tenth of the corner frequency the
+    result differs from K by less than 10 %; if only the gain at zero frequency is kept, by more than 50 %."""
     lead = tf(np.polymul([1 / 300, 1], [1 / 300, 1]), np.polymul([1e-5, 1], [1e-5, 1]), ["y"], ["u"])
     slow = tf([2.0], [1.0, 0.2, 4.0], ["y"], ["u"])
-    K, limit = lead + slow, 1000.0
-    made = with_lags(K, limit)
-    omega = np.geomspace(0.01, limit, 200)
-    wanted, found, held = (one.frequency_response(omega)[:, 0, 0] for one in (K, made, residualise_fast(K, limit)))
-    assert np.max(np.abs(made.poles())) <= limit * (1 + 1e-3)
+    K, corner = lead + slow, 1000.0
+    made = replace_fast_by_lags(K, corner)
+    omega = np.geomspace(0.01, corner, 200)
+    wanted, found, held = (one.frequency_response(omega)[:, 0, 0] for one in (K, made, residualise_fast(K, corner)))
+    assert np.max(np.abs(made.poles())) <= corner * (1 + 1e-3)
     assert made.dcgain() == pytest.approx(K.dcgain(), rel=1e-9)
-    assert np.max(np.abs(found / wanted - 1)[omega < limit / 10]) < 0.1
-    assert np.max(np.abs(held / wanted - 1)[omega < limit / 10]) > 0.5
+    assert np.max(np.abs(found / wanted - 1)[omega < corner / 10]) < 0.1
+    assert np.max(np.abs(held / wanted - 1)[omega < corner / 10]) > 0.5
 
 
-def test_lags_of_several_channels_and_of_a_slow_controller(rng):
+def test_lags_of_several_channels_and_a_controller_without_fast_poles(rng):
     slow = StateSpace(np.diag([-1.0, -3.0]), rng.standard_normal((2, 2)), rng.standard_normal((3, 2)), np.zeros((3, 2)))
-    assert with_lags(slow, 100.0) is slow
+    assert replace_fast_by_lags(slow, 100.0) is slow
     fast = StateSpace(np.diag([-300.0, -900.0]), rng.standard_normal((2, 2)), rng.standard_normal((3, 2)),
                       np.zeros((3, 2)))
-    made = with_lags(slow + fast, 100.0)
+    made = replace_fast_by_lags(slow + fast, 100.0)
     assert made.nstates == 2 + 3 * 2
     assert made.dcgain() == pytest.approx((slow + fast).dcgain(), rel=1e-12)
     omega = np.geomspace(0.1, 100, 50)
@@ -117,4 +123,4 @@ def test_lags_of_several_channels_and_of_a_slow_controller(rng):
     error = np.linalg.norm((made - (slow + fast)).frequency_response(omega), ord=2, axis=(1, 2))
     assert np.max(error / gain) < 0.02
     with pytest.raises(InputError, match="continuous"):
-        with_lags(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1), 1.0)
+        replace_fast_by_lags(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1), 1.0)
