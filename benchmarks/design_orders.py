@@ -32,8 +32,8 @@ def main() -> None:
     arguments = parser.parse_args()
     script = runpy.run_path(str(DESIGN))
     print(f"{os.cpu_count()} processors, load average {os.getloadavg()[0]:.1f}")
-    print(f"{'axes':>4s} {'plant order':>11s} {'blocks':>6s} {'controller order':>16s} {'mu upper':>8s} {'time [s]':>8s}",
-          flush=True)
+    print(f"{'axes':>4s} {'plant order':>11s} {'blocks':>6s} {'controller order':>16s} {'mu upper':>8s} "
+          f"{'time [s]':>8s}")
     orders, seconds = [], []
     for count in arguments.axes:
         sections = copy.deepcopy(script["sections"])

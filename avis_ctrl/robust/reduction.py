@@ -149,7 +149,7 @@ def replace_fast_by_lags(K: StateSpace, corner: float, settings: LagSettings = L
     n_u, n_y, count = K.noutputs, K.ninputs, settings.order
     omega = np.geomspace(settings.lowest * corner, corner, settings.points)
     lag = 1 / (1 + 1j * omega / corner)
-    size = np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2))
+    size = np.maximum(np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)), np.finfo(float).tiny)
     # lag^k - lag^(k + 1) is zero at s = 0: the fit cannot change K(0).
     basis = np.stack([(lag ** k - lag ** (k + 1)) / size for k in range(count)], axis=1)
     target = ((fast.frequency_response(omega) - fast.dcgain()) / size[:, None, None]).reshape(omega.size, -1)

@@ -15,7 +15,13 @@ from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import DKIteration, dk_iteration
-from avis_ctrl.robust.reduction import reduce_controller, replace_fast_by_lags, residualise_fast, truncate_slow
+from avis_ctrl.robust.reduction import (
+    LagSettings,
+    reduce_controller,
+    replace_fast_by_lags,
+    residualise_fast,
+    truncate_slow,
+)
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
@@ -27,13 +33,15 @@ class ReductionSettings:
         computed anew for the one chosen; the resonances of the table at rest and the peak of mu join them, because both
         are narrower than the steps. Below the band mu bounds what the offset of the electronics costs.
     accuracy : relative accuracy of the square of mu there, small beside the default reduction cost.
-    lag_corners : corner frequencies tried for `replace_fast_by_lags`, as fractions of half the sample rate. The first
-        that raises mu by no more than the reduction cost is used: the lower it is, the less sampling by Tustin's rule
-        changes the controller.
+    lag_orders, lag_corners : orders and corner frequencies tried for `replace_fast_by_lags`, the corners as fractions
+        of half the sample rate. The first that raise mu by no more than the reduction cost are used: the lower the
+        corner, the less sampling by Tustin's rule changes the controller. Three lags can compensate an anti-alias
+        filter of order three; amplifier and delay may need more.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
     accuracy: float = 1e-3
+    lag_orders: tuple[int, ...] = (3, 6)
     lag_corners: tuple[float, ...] = (0.2, 0.3, 0.45, 0.7, 1.0)
 
 
@@ -93,7 +101,8 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
     # then lags. If each raises mu by more than the cost, or makes the loop unstable, K is kept.
     fastest = np.pi * rig.sample_rate_Hz
     candidates = chain([residualise_fast(K, fastest, also_unstable=True)],
-                       (replace_fast_by_lags(K, part * fastest) for part in SETTINGS.lag_corners))
+                       (replace_fast_by_lags(K, part * fastest, LagSettings(order=order))
+                        for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners))
     start = next(filter(harmless, candidates), K)
     # Below the corner to which the offset may drift no weight changes.
     lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
