@@ -41,6 +41,9 @@ def replay_worst_plant(folder: DesignFolder, certificate: Certificate, controlle
                        files: Mapping[str, str], settings: ReplaySettings = ReplaySettings()) -> Replay:
     """Move the floor of the worst plant with a sine at the worst frequency, in the worst direction.
 
+    The motion that the noise of sensors and converter causes is subtracted: it is that of a second simulation with the
+    same noise and a floor at rest.
+
     Raises
     ------
     ComputationError : no compiler.
@@ -57,8 +60,10 @@ def replay_worst_plant(folder: DesignFolder, certificate: Certificate, controlle
     size = settings.velocity_rms * np.sqrt(2) * folder.plant.floor.rms(low, high)
     floor = np.zeros((time.size, len(COORDINATES)))
     floor[:, kept] = size * np.real(worst.direction * np.exp(1j * worst.omega * time)[:, None]) / arms
-    code = CompiledController(files, controller)
-    record = simulate(loop, measured / rate, settle_s=settle / rate, floor=floor, code=code.step)
+    record, noise = (simulate(loop, measured / rate, settle_s=settle / rate, floor=motion,
+                              code=CompiledController(files, controller).step) for motion in (floor, 0 * floor))
+    if record.diverged:
+        return Replay(np.inf, record)
     wave = np.exp(-1j * worst.omega * (record.time + settle / rate))[:, None]
-    moved = 2 * np.mean(record.q_dot[:, kept] * arms * wave, axis=0)
+    moved = 2 * np.mean((record.q_dot - noise.q_dot)[:, kept] * arms * wave, axis=0)
     return Replay(float(np.linalg.norm(moved) / size), record)

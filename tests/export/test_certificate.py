@@ -20,6 +20,7 @@ from avis_ctrl.export.design_folder import open_design
 from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
 from avis_ctrl.export.package import CERTIFICATE, CONTINUOUS, CONTROLLER, check_package, make_package
 from avis_ctrl.export.protection import Processor, protection
+from avis_ctrl.export.replay import ReplaySettings, replay_worst_plant
 from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import parse_controller
 from avis_ctrl.lti import lft_lower
@@ -172,6 +173,14 @@ def test_the_worst_plant_replayed_through_the_code(package, gcc):
     assert not package.replay.record.diverged
     assert package.replay.gain == pytest.approx(package.certificate.worst.gain, rel=0.02)
     assert package.replay.gain <= ratio(package.certificate.content["worst_case_peak_transmissibility_dB"])
+
+
+def test_the_replay_does_not_measure_noise(shipped, package, gcc):
+    """Ten times the floor motion, with noise as before, gives the same gain: the table is nearly linear there."""
+    files = {name: data.decode() for name, data in package.contents.items() if name.startswith("avis_controller.")}
+    stronger = replay_worst_plant(shipped, package.certificate, package.controller, files,
+                                  ReplaySettings(velocity_rms=10 * ReplaySettings().velocity_rms))
+    assert stronger.gain == pytest.approx(package.replay.gain, rel=1e-3)
 
 
 def test_rounding_stays_below_its_bound(shipped, package, gcc):
