@@ -33,10 +33,10 @@ class ReductionSettings:
         computed anew for the one chosen; the resonances of the table at rest and the peak of mu join them, because both
         are narrower than the steps. Below the band mu bounds what the offset of the electronics costs.
     accuracy : relative accuracy of the square of mu there, small beside the default reduction cost.
-    lag_orders, lag_corners : orders and corner frequencies tried for `replace_fast_by_lags`, the corners as fractions
-        of half the sample rate. The first that raise mu by no more than the reduction cost are used: the lower the
-        corner, the less sampling by Tustin's rule changes the controller. Three lags can compensate an anti-alias
-        filter of order three; amplifier and delay may need more.
+    lag_orders, lag_corners : orders and corner frequencies tried for `replace_fast_by_lags` where poles beyond half the
+        sample rate would be left, the corners as fractions of half this rate. The first that raise mu by no more than
+        the reduction cost are used: the lower the corner, the less sampling by Tustin's rule changes the controller.
+        Three lags can compensate an anti-alias filter of order three; amplifier and delay may need more.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
@@ -97,17 +97,21 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
     def harmless(candidate: StateSpace) -> bool:
         closed = P.closed(candidate)
         return closed.is_stable() and peak_on_grid(closed, limit) <= limit
-    # Tustin's rule distorts poles near and beyond the Nyquist frequency. Their gain at zero frequency is tried first,
-    # then lags. If each raises mu by more than the cost, or makes the loop unstable, K is kept.
-    fastest = np.pi * rig.sample_rate_Hz
-    candidates = chain([residualise_fast(K, fastest, also_unstable=True)],
-                       (replace_fast_by_lags(K, part * fastest, LagSettings(order=order))
-                        for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners))
-    start = next(filter(harmless, candidates), K)
-    # Below the corner to which the offset may drift no weight changes.
-    lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
-    start = lasting if harmless(lasting) else start
-    reduced = reduce_controller(P.P, start, lambda one: peak_on_grid(P.closed(one), limit), limit=limit).K
+
+    def lowest_order(start: StateSpace) -> StateSpace:
+        # Below the corner to which the offset may drift no weight changes.
+        lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
+        start = lasting if harmless(lasting) else start
+        return reduce_controller(P.P, start, lambda one: peak_on_grid(P.closed(one), limit), limit=limit).K
+    # Tustin's rule distorts poles near and beyond the Nyquist frequency. Of poles beyond it only the gain at zero
+    # frequency is kept, if that is enough. If the reduced controller still has such poles, lags replace them.
+    nyquist = np.pi * rig.sample_rate_Hz
+    residual = residualise_fast(K, nyquist, also_unstable=True)
+    first = lowest_order(residual if harmless(residual) else K)
+    lags = (replace_fast_by_lags(K, part * nyquist, LagSettings(order=order))
+            for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners)
+    candidates = chain([first], map(lowest_order, filter(harmless, lags)))
+    reduced = next((one for one in candidates if np.max(np.abs(one.poles()), initial=0.0) <= nyquist), first)
     return reduced, (f"reduced from {K.nstates} to {reduced.nstates} states: complex mu on a grid of {omega.size} "
                      f"frequencies changes from {full:.4f} to {peak_on_grid(P.closed(reduced)):.4f}")
 

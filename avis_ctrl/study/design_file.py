@@ -153,7 +153,7 @@ class FloorSection(Section):
 
 
 class SynthesisSection(Section):
-    """D-K iteration and its limits: only counts, so that the same file gives the same controller on any machine.
+    """D-K iteration and its limits: only counts, so that the result does not depend on the speed of the machine.
 
     max_iterations : most K-steps. target_mu : end once mu is proved below it; without it, go on while mu falls.
     polish : minimise gamma over the scalings when D-K iteration stalls; by default yes.
