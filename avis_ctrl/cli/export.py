@@ -17,8 +17,8 @@ def export(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
     controller: Annotated[str, typer.Option("--controller", metavar="NAME", help="a controller of the design")] = "mu",
     order: Annotated[int | None, typer.Option("--order", metavar="N", help="export a new controller with at most "
-                                              "N states for the axes of the design, found by descent on mu (one or "
-                                              "two minutes)")] = None,
+                                              "N states for the axes of the design, found by descent on mu (two "
+                                              "minutes or more)")] = None,
     mu_at_most: Annotated[float | None, typer.Option("--mu-at-most", metavar="MU", help="with --order: mu that the "
                                                      "new controller may have, instead of the design's requirement"
                                                      )] = None,
