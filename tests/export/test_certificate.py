@@ -176,11 +176,12 @@ def test_the_worst_plant_replayed_through_the_code(package, gcc):
 
 
 def test_the_replay_does_not_measure_noise(shipped, package, gcc):
-    """Ten times the floor motion, with noise as before, gives the same gain: the table is nearly linear there."""
+    """With a tenth of the floor motion, beside which the same noise is ten times as large, the gain is the same. The
+    rounding of single precision is not subtracted; it changes the gain by less than 1 %."""
     files = {name: data.decode() for name, data in package.contents.items() if name.startswith("avis_controller.")}
-    stronger = replay_worst_plant(shipped, package.certificate, package.controller, files,
-                                  ReplaySettings(velocity_rms=10 * ReplaySettings().velocity_rms))
-    assert stronger.gain == pytest.approx(package.replay.gain, rel=1e-3)
+    weaker = replay_worst_plant(shipped, package.certificate, package.controller, files,
+                                ReplaySettings(velocity_rms=0.1 * ReplaySettings().velocity_rms))
+    assert weaker.gain == pytest.approx(package.replay.gain, rel=1e-2)
 
 
 def test_rounding_stays_below_its_bound(shipped, package, gcc):
