@@ -42,7 +42,7 @@ gallery: export AVIS_DOCS = gallery
 gallery: docs
 
 # Minutes each; the campaigns of hours beside them (gates, random_plants, sound_campaigns, mutations, own_tables, blind)
-# are started by hand.
+# and the twenty minutes of design_orders are started by hand.
 BENCHMARKS = ekf_vs_filterpy hinfsyn interval_coverage maximum_likelihood mu_upper musyn_vs_dkpy sequential sweep
 
 # The peers that we measure ourselves against are no dependency of the product.

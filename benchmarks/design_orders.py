@@ -11,7 +11,6 @@ the exponent p of time = c order^p, fitted by least squares to the logarithms.
 from __future__ import annotations
 
 import argparse
-import copy
 import os
 import runpy
 import time
@@ -36,10 +35,8 @@ def main() -> None:
           f"{'time [s]':>8s}")
     orders, seconds = [], []
     for count in arguments.axes:
-        sections = copy.deepcopy(script["sections"])
-        sections["keep"] = list(AXES[:count])
         began = time.perf_counter()
-        study = ac.design(script["rig"], **sections)
+        study = ac.design(script["rig"], **{**script["sections"], "keep": list(AXES[:count])})
         elapsed = time.perf_counter() - began
         plant, mu = study.result.plant.synthesis, study.result.controller("mu")
         orders.append(plant.P.nstates)

@@ -30,8 +30,8 @@ class ReplaySettings:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """gain : payload velocity over floor velocity of the kept axes, in the sine's worst direction. record : of the
-    measured periods."""
+    """gain : payload velocity over floor velocity of the kept axes, in the sine's worst direction; inf if the loop
+    diverged. record : of the measured periods."""
 
     gain: float
     record: SimulationRecord
@@ -60,10 +60,12 @@ def replay_worst_plant(folder: DesignFolder, certificate: Certificate, controlle
     size = settings.velocity_rms * np.sqrt(2) * folder.plant.floor.rms(low, high)
     floor = np.zeros((time.size, len(COORDINATES)))
     floor[:, kept] = size * np.real(worst.direction * np.exp(1j * worst.omega * time)[:, None]) / arms
-    record, noise = (simulate(loop, measured / rate, settle_s=settle / rate, floor=motion,
-                              code=CompiledController(files, controller).step) for motion in (floor, 0 * floor))
+    code = CompiledController(files, controller)
+    record = simulate(loop, measured / rate, settle_s=settle / rate, floor=floor, code=code.step)
     if record.diverged:
         return Replay(np.inf, record)
+    code.reset()
+    noise = simulate(loop, measured / rate, settle_s=settle / rate, floor=0 * floor, code=code.step)
     wave = np.exp(-1j * worst.omega * (record.time + settle / rate))[:, None]
     moved = 2 * np.mean((record.q_dot - noise.q_dot)[:, kept] * arms * wave, axis=0)
     return Replay(float(np.linalg.norm(moved) / size), record)

@@ -94,8 +94,8 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     target : stop as soon as the norm of the scaled loop is below this value (so is mu, at every frequency).
     max_iterations : largest number of K-steps, including the first H-infinity controller. There is no time limit, so
         the same call gives the same controller on the same machine; on another processor, rounding may lead D-K
-        iteration along another path. A call with more iterations, or with a lower target,
-        repeats the steps of one with fewer and continues.
+        iteration along another path. A call with more iterations, or with a lower target, repeats the steps of one with
+        fewer and continues.
     backoff : relative distance of each controller from the H-infinity optimum. It raises mu by about the same fraction;
         a smaller value gives faster controller poles.
     polish : where D-K iteration stalls, continue with descent on gamma (and scalings of higher order where they lower

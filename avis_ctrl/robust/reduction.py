@@ -22,13 +22,11 @@ from avis_ctrl.robust.hinf_plant import as_plant
 class LagSettings:
     """Fit of `replace_fast_by_lags`.
 
-    order : highest power of the lag; three for the lead that compensates a third-order anti-alias filter.
     kept : poles slower than this fraction of the corner frequency are kept.
     lowest, points : the fit uses so many frequencies, evenly spaced on a logarithmic axis from `lowest` times the
         corner to the corner. They begin far below it, because fast poles contribute phase there.
     """
 
-    order: int = 3
     kept: float = 2 / 3
     lowest: float = 1 / 500
     points: int = 60
@@ -132,31 +130,31 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
     return replace(slow, D=slow.D + fast.dcgain())
 
 
-def replace_fast_by_lags(K: StateSpace, corner: float, settings: LagSettings = LAGS) -> StateSpace:
-    """K with its poles faster than `settings.kept` times `corner` [rad/s] replaced by first-order lags of that corner.
+def replace_fast_by_lags(K: StateSpace, corner: float, order: int = 3) -> StateSpace:
+    """K with its poles faster than `LAGS.kept` times `corner` [rad/s] replaced by first-order lags of that corner.
 
     Fast poles may give K phase lead below the corner, which is lost if only their gain at zero frequency is kept
-    (`residualise_fast`). Their sum is approximated by that of G_k / (1 + s/corner)^k, k = 0 to `settings.order`, with
-    constant matrices G_k: by least squares at frequencies up to the corner, relative to the largest singular value of
-    K. K(0) is unchanged. The lags have order times K.ninputs states. Unstable fast poles are replaced, too; the caller
+    (`residualise_fast`). Their sum is approximated by that of G_k / (1 + s/corner)^k, k = 0 to `order`, with constant
+    matrices G_k: by least squares at frequencies up to the corner, relative to the largest singular value of K. K(0) is
+    unchanged. The lags have `order` times K.ninputs states. Unstable fast poles are replaced, too; the caller
     must check the stability of the closed loop. Raises InputError for sampled K.
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
-    slow, fast = split(K, lambda re, im: np.hypot(re, im) <= settings.kept * corner)
+    slow, fast = split(K, lambda re, im: np.hypot(re, im) <= LAGS.kept * corner)
     if not fast.nstates:
         return K
-    n_u, n_y, count = K.noutputs, K.ninputs, settings.order
-    omega = np.geomspace(settings.lowest * corner, corner, settings.points)
+    n_u, n_y = K.noutputs, K.ninputs
+    omega = np.geomspace(LAGS.lowest * corner, corner, LAGS.points)
     lag = 1 / (1 + 1j * omega / corner)
     size = np.maximum(np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)), np.finfo(float).tiny)
     # lag^k - lag^(k + 1) is zero at s = 0: the fit cannot change K(0).
-    basis = np.stack([(lag ** k - lag ** (k + 1)) / size for k in range(count)], axis=1)
+    basis = np.stack([(lag ** k - lag ** (k + 1)) / size for k in range(order)], axis=1)
     target = ((fast.frequency_response(omega) - fast.dcgain()) / size[:, None, None]).reshape(omega.size, -1)
     gains = np.linalg.lstsq(np.r_[basis.real, basis.imag], np.r_[target.real, target.imag])[0]
-    gains = np.concatenate([gains.reshape(count, n_u, n_y), np.zeros((1, n_u, n_y))])
-    A = corner * np.kron(np.diag(np.ones(count - 1), -1) - np.eye(count), np.eye(n_y))
-    B = corner * np.kron(np.eye(count, 1), np.eye(n_y))
+    gains = np.concatenate([gains.reshape(order, n_u, n_y), np.zeros((1, n_u, n_y))])
+    A = corner * np.kron(np.diag(np.ones(order - 1), -1) - np.eye(order), np.eye(n_y))
+    B = corner * np.kron(np.eye(order, 1), np.eye(n_y))
     C = np.concatenate(list(gains[1:] - gains[:-1]), axis=1)
     return replace(slow, D=slow.D + fast.dcgain() + gains[0]) + StateSpace(A, B, C, np.zeros((n_u, n_y)))
 

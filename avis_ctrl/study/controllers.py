@@ -15,13 +15,7 @@ from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import DKIteration, dk_iteration
-from avis_ctrl.robust.reduction import (
-    LagSettings,
-    reduce_controller,
-    replace_fast_by_lags,
-    residualise_fast,
-    truncate_slow,
-)
+from avis_ctrl.robust.reduction import reduce_controller, replace_fast_by_lags, residualise_fast, truncate_slow
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
@@ -108,7 +102,7 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
     nyquist = np.pi * rig.sample_rate_Hz
     residual = residualise_fast(K, nyquist, also_unstable=True)
     first = lowest_order(residual if harmless(residual) else K)
-    lags = (replace_fast_by_lags(K, part * nyquist, LagSettings(order=order))
+    lags = (replace_fast_by_lags(K, part * nyquist, order)
             for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners)
     candidates = chain([first], map(lowest_order, filter(harmless, lags)))
     reduced = next((one for one in candidates if np.max(np.abs(one.poles()), initial=0.0) <= nyquist), first)
