@@ -15,7 +15,7 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     poles = system.poles()
     sizes = np.abs(poles[np.abs(poles) > 1e-9])
     low, high = (np.min(sizes) / 10, np.max(sizes) * 10) if sizes.size else (1e-2, 1e2)
-    wide = np.geomspace(low, high, max(20, int(4 * np.log10(high / low))))
+    wide = np.geomspace(low, high, max(20, round(4 * np.log10(high / low))))
     response = system.frequency_response(np.concatenate([[0.0], wide, [np.inf]]))
     level = np.max(np.linalg.norm(response, axis=(1, 2)))
     from_start, from_end = (np.linalg.norm(response[1:-1] - response[k], axis=(1, 2)) > change * level for k in (0, -1))
@@ -24,7 +24,7 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     first = max(int(np.argmax(from_start)) - 1, 0)
     last = min(wide.size - int(np.argmax(from_end[::-1])), wide.size - 1)
     low, high = wide[min(first, last - 1)], wide[max(last, first + 1)]
-    even = np.geomspace(low, high, max(30, int(POINTS_PER_DECADE * np.log10(high / low))))
+    even = np.geomspace(low, high, max(30, round(POINTS_PER_DECADE * np.log10(high / low))))
     # A decade more on either side shows scalings settle where the loop has settled already.
     ends = np.concatenate([low / np.array([10.0, 3.0]), high * np.array([3.0, 10.0])])
     return merged(np.concatenate([even, ends]), resonances(poles, low, high))

@@ -150,6 +150,17 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
                    limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
 
 
+def hinf_controller(P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None,
+                    tolerance: float = 1e-3) -> Synthesis:
+    """The controller of `hinfsyn` with the same parameters, without a lower bound of the optimum: for iterations."""
+    problem = _Problem.of(as_plant(P, nmeas, ncon), nmeas, ncon)
+    form, bracket, notes = problem.solve(tolerance, gamma_hint, proved=False)
+    result, raised = problem.realise(form, bracket.upper.gamma, backoff, False)
+    # With extra channels, and where the target was missed, only the measured gamma is known to be possible.
+    upper = result.gamma if notes or raised else min(bracket.upper.gamma, result.gamma)
+    return replace(result, gamma_optimal_bounds=(0.0, upper), status=Status.SUBOPTIMAL, notes=notes)
+
+
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
     """The central controller at a given gamma, without a search: for iterations that know what they want.
 
@@ -209,19 +220,20 @@ class _Problem:
         plant = regularised(self.plant, epsilon, of_D12, of_D21, of_states)
         return normal_form(plant), ("; ".join(said) + extra,)
 
-    def solve(self, tolerance: float, hint: float | None) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
+    def solve(self, tolerance: float, hint: float | None,
+              proved: bool = True) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
         """The bracket of the optimum; extra channels are shrunk until they cost less than a per cent."""
         if not any(self.singular):
             form, _ = self.form(False, False, 0.0)
             try:
-                return form, find_gamma(form.plant, tolerance, hint), ()
+                return form, find_gamma(form.plant, tolerance, hint, proved=proved), ()
             except ComputationError:
                 pass
         best: tuple[NormalForm, GammaBracket, tuple[str, ...]] | None = None
         failure: ComputationError | None = None
         for epsilon in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
             try:
-                form, bracket, notes = self._regularised(epsilon, tolerance, hint)
+                form, bracket, notes = self._regularised(epsilon, tolerance, hint, proved)
             except ComputationError as error:
                 failure = error
                 continue
@@ -236,13 +248,13 @@ class _Problem:
             raise failure or ComputationError("no controller was found")
         return best
 
-    def _regularised(self, epsilon: float, tolerance: float,
-                     hint: float | None) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
+    def _regularised(self, epsilon: float, tolerance: float, hint: float | None,
+                     proved: bool) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
         """The bracket with extra channels on u and y where they are missing, and on the states where those fail."""
         for of_states in (False, True) if any(self.singular) else (True,):
             form, notes = self.form(*self.singular, epsilon, of_states)
             try:
-                return form, find_gamma(form.plant, tolerance, hint), notes
+                return form, find_gamma(form.plant, tolerance, hint, proved=proved), notes
             except ComputationError as error:
                 failure = error
         raise failure

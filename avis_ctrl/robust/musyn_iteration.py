@@ -22,10 +22,10 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_steps
+from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, alike, band_of, cost_of, d_steps
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
-from avis_ctrl.robust.hinfsyn import Synthesis, hinfsyn
+from avis_ctrl.robust.hinfsyn import Synthesis, hinf_controller
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn_state import DONE, GIVEN, HINF, NOMINAL, Iteration, Loop, State, analysed
 from avis_ctrl.robust.scalings import Scalings
@@ -96,7 +96,7 @@ def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], opti
         if status := _no_further(state, options):
             return state, status
         began = time.monotonic()
-        step = _k_step(problem, state, _proposed(problem, state, options), options)
+        step = _k_step(problem, state, options)
         if step is None:
             state = _moved_on(problem, state)
             continue
@@ -153,7 +153,7 @@ def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
                 options: Options) -> list[tuple[str, Callable[[], StateSpace]]]:
     """Kinds of the controllers to start from, and what makes each."""
     def optimal(P: StateSpace) -> StateSpace:
-        return hinfsyn(P, problem.nmeas, problem.ncon, backoff=options.backoff).K
+        return hinf_controller(P, problem.nmeas, problem.ncon, options.backoff).K
     performance = problem.structure.blocks[-1]
     n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
     made: list[tuple[str, Callable[[], StateSpace]]] = [(HINF, lambda: optimal(problem.P))]
@@ -176,25 +176,37 @@ def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
     return Loop(K, Scalings.identity(problem.structure), hinf_norm(closed).gain, points.peak), points
 
 
-def _k_step(problem: Problem, state: State, proposals: Iterable[Proposal], options: Options
-            ) -> tuple[Proposal, Synthesis] | None:
-    """The scalings of least H-infinity optimum and their controller; None where scalings, not the plant, make all fail.
+def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal, Synthesis] | None:
+    """The scalings of least H-infinity optimum and their controller; None where none that is proposed has any.
 
-    The fit of scalings to the last loop does not tell what the next one will be; one test of gamma does.
+    The fit of scalings to the last loop does not tell what the next one will be; one test of gamma does. In a D-K step
+    scalings that are fitted quickly come first, and suffice if they allow a smaller gamma than the path has.
     """
+    assert state.path is not None
+    hint = state.path.gamma
+    if state.phase == "D-K" and (found := _best(problem, _alike(problem, state, options), options, hint,
+                                                (1 - SETTINGS.stall) * hint)):
+        return found
+    return _best(problem, _proposed(problem, state, options), options, hint)
+
+
+def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hint: float, below: float = np.inf
+          ) -> tuple[Proposal, Synthesis] | None:
+    """The proposal of least H-infinity optimum, at most `below`, and its controller; the first that reaches the target
+    ends the search."""
     best: tuple[Proposal, Synthesis] | None = None
-    hint = state.path.gamma if state.path else None
     for proposal in proposals:
         try:
-            if best and not problem.scaled.reaches(proposal.scalings,
-                                                   (1 - SETTINGS.stall) * best[1].gamma_optimal_bounds[1]):
+            if np.isfinite(below) and not problem.scaled.reaches(proposal.scalings, below):
                 continue
-            made = hinfsyn(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff,
-                           gamma_hint=best[1].gamma if best else hint)
+            made = hinf_controller(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, options.backoff,
+                                   best[1].gamma if best else hint)
         except ComputationError:
             continue
         if best is None or made.gamma < best[1].gamma:
-            best = proposal, made
+            best, below = (proposal, made), (1 - SETTINGS.stall) * made.gamma_optimal_bounds[1]
+            if options.target is not None and made.gamma <= options.target:
+                break
     return best
 
 
@@ -218,6 +230,16 @@ class Proposal(NamedTuple):
     scalings: Scalings
     cost: float
     kind: str
+
+
+def _alike(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
+    """Scalings of one order in all blocks, by how they fit the best ones at each frequency."""
+    assert state.points is not None
+    try:
+        for scalings in alike(state.points, options.max_added_states):
+            yield Proposal(scalings, max(0.0, cost_of(state.points, scalings)), "D-K")
+    except np.linalg.LinAlgError:
+        return
 
 
 def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
@@ -273,7 +295,7 @@ def _other_constants(problem: Problem, gamma: float, options: Options) -> Propos
         try:
             if not problem.scaled.reaches(scalings, (1 - SETTINGS.stall) * gamma):
                 continue
-            made = hinfsyn(scalings.scale(problem.P), problem.nmeas, problem.ncon, backoff=options.backoff)
+            made = hinf_controller(scalings.scale(problem.P), problem.nmeas, problem.ncon, options.backoff)
         except ComputationError:
             continue
         if made.gamma < (1 - SETTINGS.stall) * gamma:
