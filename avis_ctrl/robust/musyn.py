@@ -1,9 +1,9 @@
 """mu synthesis: a controller that makes the peak of the structured singular value small.
 
-D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order, followed,
-where it stalls, by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). If the first
-H-infinity controller is no better than no control, the iteration starts from other constant scalings. See
-`musyn_iteration`.
+D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order: of several
+fits to the best scalings at each frequency, the one that allows the smallest gamma is taken. Where it stalls, it is
+followed by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). If the first H-infinity
+controller is no better than no control, the iteration starts from other constant scalings. See `musyn_iteration`.
 
 Real uncertainty is synthesised for as if it were complex, which is conservative: every real perturbation is a
 complex one. What that costs is measured on the final loop, where mu is computed both ways.
@@ -95,7 +95,7 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
     max_iterations : largest number of K-steps, including the first H-infinity controller. There is no time limit, so
         the same call gives the same controller on the same machine; on another processor, rounding may lead D-K
         iteration along another path. A call with more iterations, or with a lower target, repeats the steps of one with
-        fewer and continues.
+        fewer and continues; only the step that reaches the target may differ.
     backoff : relative distance of each controller from the H-infinity optimum. It raises mu by about the same fraction;
         a smaller value gives faster controller poles.
     polish : where D-K iteration stalls, continue with descent on gamma (and scalings of higher order where they lower

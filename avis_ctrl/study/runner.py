@@ -136,7 +136,7 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
                 return True
             ends = enough()  # before the line: from when it is seen, Ctrl-C keeps this controller
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
-                     f"{row.order}, D-scalings fitted to {100 * row.d_fit_error:.2g} %, {row.seconds:.1f} s")
+                     f"{row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
             return not ends
         with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, others)

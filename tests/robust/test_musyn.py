@@ -11,6 +11,7 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, connect, gain, hinf_norm, lft_lower, summing_junction, tf
+from avis_ctrl.robust.dstep import PointwiseScalings, alike
 from avis_ctrl.robust.frequency_grid import MAX_POINTS, frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
@@ -92,6 +93,29 @@ def test_distillation_reaches_one_without_an_order_being_named(distilled):
     assert result.guaranteed
     assert result.mu_lower > 0.95 * result.mu_upper
     assert seconds < 60
+
+
+def test_d_k_iteration_alone_is_better_than_that_of_dkpy():
+    """dkpy 0.1.9 ends at 1.036 after three iterations with fits of order 4; AB13MD judges the controller of musyn."""
+    result = musyn(distillation(), DISTILLATION_BLOCKS, 2, 2, polish=False)
+    structure, omega = BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2), np.geomspace(1e-4, 1e4, 400)
+    N = lft_lower(distillation(), result.K)
+    assert N.is_stable()
+    assert max(mu_upper_slicot(M, structure) for M in N.frequency_response(omega)) < 1.036
+
+
+def test_scalings_of_one_order_keep_to_the_states_allowed():
+    """The first ones are those of order one; each bounds mu from above, by AB13MD, wherever it is evaluated."""
+    P, structure = distillation(), BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)
+    N = lft_lower(P, hinfsyn(P, 2, 2).K)
+    omega = frequency_grid(N)
+    M = N.frequency_response(omega)
+    found = list(alike(PointwiseScalings.of(omega, M, structure), max_states=12))
+    assert [one.orders for one in found] == [(n, n, 0) for n in (1, 2, 3) for _ in range(3)]
+    mu = np.array([mu_upper_slicot(one, structure) for one in M])
+    for one in found:
+        left, right = one.response(omega)
+        assert np.all(np.linalg.norm(left @ M @ right, 2, axis=(1, 2)) > mu * (1 - 5e-3))
 
 
 def test_upper_bound_is_the_norm_of_the_scaled_loop(distilled):
@@ -177,8 +201,7 @@ def test_callback_stops_and_resuming_equals_running_on():
 def long_run():
     """D-K iteration and descent on a small table, in a quiet process."""
     made = musyn(barely_known_table(0.5), UNCERTAIN_DRIVE, 1, 1, max_iterations=6)
-    # Whether growth or a second D-K iteration comes next hangs on the fifth digit of mu.
-    assert [row.kind for row in made.history[:6]] == ["H-infinity", "nominal", "D-K", "D-K", "descent", "descent"]
+    assert [row.kind for row in made.history[:5]] == ["H-infinity", "nominal", "D-K", "D-K", "descent"]
     return made
 
 
@@ -187,10 +210,11 @@ def test_a_tighter_request_goes_on_where_a_looser_one_ended(long_run):
     gammas = [row.gamma for row in long_run.history]
     target = 1.001 * gammas[3]
     loose = musyn(barely_known_table(0.5), UNCERTAIN_DRIVE, 1, 1, max_iterations=6, target=target)
-    assert loose.status == f"target {target:g} reached"
+    assert loose.status == f"target {target:g} reached" and loose.history[-1].gamma <= target
     short = musyn(barely_known_table(0.5), UNCERTAIN_DRIVE, 1, 1, max_iterations=2)
-    for run, length in ((loose, 4), (short, 3)):
-        assert [row.gamma for row in run.history] == gammas[:length]
+    # A step ends at the first scalings that reach the target, so that the last one may be another.
+    for run, length in ((loose, len(loose.history) - 1), (short, 3)):
+        assert [row.gamma for row in run.history][:length] == gammas[:length]
     assert long_run.mu_upper <= loose.mu_upper <= short.mu_upper
 
 
