@@ -48,9 +48,13 @@ def worst_transmissibility(axes: SampledAxes, found: Bounds) -> WorstPlant:
 
 
 def _near(peak: MuPeak, half_rate: float, count: int = 12) -> np.ndarray:
-    """(n,) the frequencies of the highest upper bounds, and where the lower one was reached."""
-    order = np.argsort(peak.upper_curve)[::-1][:count]
-    return np.unique([one for one in (*peak.frequencies[order], peak.omega) if 0 < one < half_rate])
+    """(n,) the frequencies of the highest upper bounds and of the highest local maxima of their curve, and where the
+    lower one was reached. The highest ones alone may all lie where the bound of the sampling errors is largest."""
+    upper = peak.upper_curve
+    beside = np.concatenate([[-np.inf], upper, [-np.inf]])
+    maxima = np.flatnonzero((upper >= beside[:-2]) & (upper >= beside[2:]))
+    chosen = [*np.argsort(upper)[::-1][:count], *maxima[np.argsort(upper[maxima])[::-1][:count]]]
+    return np.unique([one for one in (*peak.frequencies[chosen], peak.omega) if 0 < one < half_rate])
 
 
 def _closed(plant: GeneralizedPlant, axes: SampledAxes, omega: np.ndarray) -> np.ndarray:
