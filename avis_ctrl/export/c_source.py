@@ -46,6 +46,10 @@ void avis_controller_step(avis_controller_t *c, const real_t y[], real_t u[]);
 _SOURCE = """\
 {comment}
 #include "avis_controller.h"
+#include <float.h>
+
+/* The largest finite number. */
+#define LARGEST {largest}
 
 enum {{ NX = AVIS_CONTROLLER_STATES, NY = AVIS_CONTROLLER_INPUTS, NU = AVIS_CONTROLLER_OUTPUTS }};
 
@@ -63,7 +67,7 @@ void avis_controller_init(avis_controller_t *c)
     c->wait = WAIT;
 }}
 
-/* v = y within the converter's range, zero where y is not a number; returns whether all of y was inside it. */
+/* v = y within the converter's range, zero where y is not finite; returns whether all of y was inside it. */
 static int read_inputs(const real_t y[], real_t v[])
 {{
     int valid = 1;
@@ -72,7 +76,10 @@ static int read_inputs(const real_t y[], real_t v[])
             v[i] = y[i];
         }} else {{
             valid = 0;
-            v[i] = y[i] >= INPUT_LIMIT[i] ? INPUT_LIMIT[i] : (y[i] <= -INPUT_LIMIT[i] ? -INPUT_LIMIT[i] : {zero});
+            v[i] = {zero};
+            if (y[i] >= -LARGEST && y[i] <= LARGEST) {{
+                v[i] = y[i] > {zero} ? INPUT_LIMIT[i] : -INPUT_LIMIT[i];
+            }}
         }}
     }}
     return valid;
@@ -177,7 +184,8 @@ def c_files(controller: SampledController, guard: Protection, provenance: Proven
         f"static const real_t KEEP = {number(guard.anti_windup.keep)}, FEED = {number(guard.anti_windup.feed)};\n",
         f"static const uint32_t WAIT = {guard.wait}u;\n"])
     common = {"comment": provenance.comment(), "n_x": n_x, "n_y": n_y, "n_u": n_u, "room": max(n_x, 1),
-              "zero": number(0.0), "one": number(1.0), "real": "float" if single else "double",
+              "zero": number(0.0), "one": number(1.0), "largest": "FLT_MAX" if single else "DBL_MAX",
+              "real": "float" if single else "double",
               "period_s": K.dt, "start_s": K.dt * guard.wait + K.dt / guard.rise,
               "inputs": _harmless(", ".join(K.inputs)), "outputs": _harmless(", ".join(K.outputs))}
     return {HEADER: _HEADER.format(**common), SOURCE: _SOURCE.format(**common, constants=constants)}

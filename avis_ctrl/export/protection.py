@@ -56,9 +56,14 @@ def protection(controller: SampledController, rig: Rig, anti_windup: AntiWindup 
     rate, system, dtype = controller.sample_rate_Hz, controller.system, controller.dtype
     largest = np.inf if rig.converter is None else min(abs(volts) for volts in rig.converter.limits_V)
     return Protection(np.full(system.ninputs, dtype(largest), float), max(1, round(settings.wait_s * rate)),
-                      float(dtype(1 / max(1.0, settings.rise_s * rate))),
-                      float(dtype(1 / max(1.0, settings.fall_s * rate))),
+                      _exact_in_sums(1 / max(1.0, settings.rise_s * rate)),
+                      _exact_in_sums(1 / max(1.0, settings.fall_s * rate)),
                       AntiWindup(*(float(dtype(one)) for one in anti_windup)))
+
+
+def _exact_in_sums(change: float) -> float:
+    """The next multiple of 2^-23, of which float32 holds all up to 1: the gain has no rounding in either precision."""
+    return float(np.ceil(change * 2.0 ** 23) / 2.0 ** 23)
 
 
 class Processor:
@@ -84,7 +89,7 @@ class Processor:
         """Drive volts (n_u,) for sensor volts (n_y,)."""
         guard = self.guard
         valid = bool(np.all(np.abs(y) < guard.input_limit_V))
-        v = np.clip(np.where(np.isnan(y), 0.0, y), -guard.input_limit_V, guard.input_limit_V).astype(self.dtype)
+        v = np.clip(np.where(np.isfinite(y), y, 0.0), -guard.input_limit_V, guard.input_limit_V).astype(self.dtype)
         self.wait = guard.wait if not valid else max(self.wait - 1, 0)
         self.gain = max(self.gain - self.fall, self.dtype(0)) if self.wait else min(self.gain + self.rise,
                                                                                    self.dtype(1))
