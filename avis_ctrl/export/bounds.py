@@ -60,6 +60,8 @@ class CoverSettings:
         this gain should add little to it; at low frequencies, where a controller may have no gain, rounding leaves a
         little.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
+    first_points : frequencies from half the sample rate on at which the loop gain is computed
+        before the bounds of the table.
     points, few_points : frequencies of the upper bound of the worst-case gain, for its curve, and where
         only the largest gain is wanted.
     """
@@ -77,6 +79,7 @@ class CoverSettings:
     least: float = 0.1
     least_of_all: float = 1e-6
     most: int = 6
+    first_points: int = 6
     points: int = 40
     few_points: int = 4
 
@@ -165,11 +168,28 @@ class Bounds:
     gain_above: float
 
 
-def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Bounds:
-    """Bounds of the loop that runs the emitted numbers.
+class NotStableError(ComputationError):
+    """The proof of stability has failed. reason : why, in words."""
+
+    def __init__(self, reason: str):
+        super().__init__("the loop of the exported controller is not proved stable", measured=reason)
+        self.reason = reason
+
+
+def gain_above_in_words(gain: float) -> str:
+    return f"the loop gain from half the sample rate on is bounded by {gain:.3g} only"
+
+
+def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings = CoverSettings()) -> Bounds:
+    """Bounds of the loop that runs the emitted numbers; first what the proof of stability needs, the cheapest first.
+
+    Parameters
+    ----------
+    only_stable : end as soon as that proof cannot succeed.
 
     Raises
     ------
+    NotStableError : only with `only_stable`.
     ComputationError : the emitted controller is so far from the design's that no loop with it can be proved stable.
     """
     folder, design = axes.folder, axes.folder.design
@@ -180,10 +200,16 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     least = max(settings.least * float(gains[-1]), settings.least_of_all * float(np.max(gains)))
     W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
                  np.full(grid.centre.size, settings.harmless), settings)
+    # The table's bounds between frequencies take minutes where it has many blocks; at a few frequencies, seconds.
+    if only_stable and not (gain_above := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + SLACK:
+        raise NotStableError(gain_above_in_words(gain_above))
     table = plant.synthesis.P.select(plant.synthesis.y, plant.synthesis.u)
     W_E = _cover(grid, axes.folding(grid.centre, grid.half), settings.harmless_images * _gain(table, grid.centre),
                  settings)
     errors = Errors(K, least, W_a, W_E)
+    gain_above = _gain_above(axes, errors, settings)
+    if only_stable and not gain_above < 1:
+        raise NotStableError(gain_above_in_words(gain_above))
     below = (0.0, axes.half_rate)
     performance, blocks = errors.closed(plant.synthesis)
     motion, _ = errors.closed(plant.full.restricted(plant.floor_velocities, plant.velocities))
@@ -194,6 +220,8 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     # One proof of robust stability for all gains: the further channels do not change the loop of the blocks.
     robust = stability_bound(motion.select(range(blocks.n_z), range(blocks.n_w)), blocks)
+    if only_stable and robust.lower >= 1:
+        raise NotStableError("a perturbation of norm at most 1 makes the loop unstable")
 
     def worst(system: StateSpace, band: tuple[float, float] = below, points: int = settings.few_points) -> MuPeak:
         return worst_case_gain(system, blocks, band=band, slack=SLACK, robust=robust, points=points)
@@ -203,7 +231,7 @@ def bounds(axes: SampledAxes, settings: CoverSettings = CoverSettings()) -> Boun
         lambda: mu_peak(performance, whole, band=below, slack=SLACK), lambda: worst(motion, points=settings.points),
         lambda: worst(motion, in_band), lambda: worst(from_below), lambda: worst(from_above)])
     all_times, above = (one.upper if one.guaranteed else np.inf for one in between)
-    return Bounds(mu, peak, band, all_times, above + axes.passive_above(), _gain_above(axes, errors, settings))
+    return Bounds(mu, peak, band, all_times, above + axes.passive_above(), gain_above)
 
 
 def _controller_error(axes: SampledAxes, K: StateSpace, least: float, grid: Grid, settings: CoverSettings
@@ -223,11 +251,26 @@ def _controller_error(axes: SampledAxes, K: StateSpace, least: float, grid: Grid
 def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> float:
     """Bound of the loop gain from half the sample rate on, both errors included."""
     omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
-    size = _gain(errors.K, omega)
-    size += errors.W_a.magnitude(omega) * np.hypot(size, errors.least)
+    size = _emitted_gain(errors.K, errors.least, errors.W_a, omega)
     table = axes.force_to_seen(omega)
     table[0] += errors.W_E.magnitude(omega[:1])[0]  # the images belong to half the rate itself
     return float(np.max(size * table))
+
+
+def _gain_above_at_least(axes: SampledAxes, K: StateSpace, least: float, W_a: Rational, settings: CoverSettings
+                         ) -> float:
+    """What `_gain_above` is not below: at a few frequencies, and of all images only that of half the sample rate, which
+    falls onto half the rate itself."""
+    omega = np.geomspace(1.0, settings.beyond, settings.first_points) * axes.half_rate
+    table = axes.force_to_seen_at(omega)
+    table[0] *= 2
+    return float(np.max(_emitted_gain(K, least, W_a, omega) * table))
+
+
+def _emitted_gain(K: StateSpace, least: float, W_a: Rational, omega: np.ndarray) -> np.ndarray:
+    """(n_omega,) bound of the gain of the emitted controller."""
+    size = _gain(K, omega)
+    return size + W_a.magnitude(omega) * np.hypot(size, least)
 
 
 def _between_samples(axes: SampledAxes, errors: Errors, grid: Grid, settings: CoverSettings

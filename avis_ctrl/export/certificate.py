@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.export.bounds import bounds
+from avis_ctrl.export.bounds import bounds, gain_above_in_words
 from avis_ctrl.export.compiled import step_time_us
 from avis_ctrl.export.design_folder import DesignFolder
 from avis_ctrl.export.rounding import rounding_noise
@@ -65,15 +65,18 @@ def shipped_loop(folder: DesignFolder, controller: SampledController) -> Sampled
 
 
 def certify(folder: DesignFolder, controller: SampledController, files: Mapping[str, str] | None = None,
-            progress: Progress = lambda text: None, settings: StabilitySettings = StabilitySettings()) -> Certificate:
+            progress: Progress = lambda text: None, only_stable: bool = False,
+            settings: StabilitySettings = StabilitySettings()) -> Certificate:
     """Compute the certificate of a controller's numbers.
 
     Parameters
     ----------
-    files : C files whose step is timed; None for no time.
+    files : C files whose step is timed; None for no time. only_stable : end as soon as the loop cannot be proved
+        stable.
 
     Raises
     ------
+    NotStableError : only with `only_stable`.
     ComputationError : a loop for which no figure exists: unstable with the nominal plant.
     """
     axes = SampledAxes.of(folder, controller)
@@ -82,14 +85,14 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
         progress("stability of all axes and rounding noise")
         noise = rounding_noise(controller, loop)
         progress("bounds over the whole uncertainty set, from the exported numbers")
-        found = bounds(axes)
+        found = bounds(axes, only_stable)
         worst = worst_transmissibility(axes, found)
         lower = mu_lower(axes, found)
         unstable = _unstable(folder, loop, worst, settings)
     bounded = (found.mu, found.peak, found.band)
     unproved = tuple(one.covers for one in bounded if not (one.guaranteed and np.isfinite(one.upper)))
     if not found.gain_above < 1:
-        unproved += (f"the loop gain from half the sample rate on is bounded by {found.gain_above:.3g} only",)
+        unproved += (gain_above_in_words(found.gain_above),)
 
     content = {"format": "avis-certificate", "version": 1, "controller_sha256": controller.sha256,
                "mu_upper": found.mu.upper, "mu_lower": lower, "guaranteed": not unproved,

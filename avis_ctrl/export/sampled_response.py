@@ -257,6 +257,10 @@ class SampledAxes:
         """(n_omega,) bound of the table's gain above half the sample rate [m/(N s)]."""
         return self._high_gain("force", "seen", omega, np.zeros(omega.size))
 
+    def force_to_seen_at(self, omega: np.ndarray) -> np.ndarray:
+        """(n_omega,) what `force_to_seen` is at least, in seconds: bounds at these frequencies, not between them."""
+        return self._gains_at("force", "seen", omega) * self._low_pass(omega, np.zeros(omega.size))
+
     def passive_above(self) -> float:
         """Bound of payload over floor velocity above half the sample rate, where no controller acts."""
         return self._high_bounds["floor", "velocity"].gain
@@ -265,9 +269,12 @@ class SampledAxes:
         """(n,) bound of the gain over the uncertainty set and over intervals above half the rate."""
         bound = self._high_bounds[source, target]
         size = roots_jet(bound.zeros(), bound.poles(), bound.gain, centre, half).size
-        if target == "seen" and (lags := self.folder.rig.electronics.low_pass()):
-            size = size * roots_jet((), lags, float(np.prod(np.abs(lags))), centre, half).size
-        return size
+        return size * self._low_pass(centre, half) if target == "seen" else size
+
+    def _low_pass(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """(n,) magnitude of the anti-alias filter."""
+        lags = self.folder.rig.electronics.low_pass()
+        return roots_jet((), lags, float(np.prod(np.abs(lags))), centre, half).size if lags else np.ones(centre.size)
 
     @cached_property
     def _high_bounds(self) -> dict[tuple[str, str], Rational]:
@@ -288,13 +295,18 @@ class SampledAxes:
         raised to what `worst_case_gain` proves between them."""
         if (source, target) == ("floor", "velocity"):
             return Rational(self._proved(source, target, None))
+        gains = self._gains_at(source, target, self.high_grid)
+        fitted = covering_fit(self.high_grid, gains, gains, self.settings.order).function
+        return fitted.scaled(self._proved(source, target, fitted))
+
+    def _gains_at(self, source: str, target: str, omega: np.ndarray) -> np.ndarray:
+        """(n_omega,) bounds of the worst-case gain at these frequencies, above half the rate and without the filter."""
         part, whole = self._part(source, target)
-        gains = skewed_upper_bound(part.frequency_response(self.high_grid)[:, None], whole).beta
+        gains = skewed_upper_bound(part.frequency_response(omega)[:, None], whole).beta
         if not np.all(np.isfinite(gains)):
             raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
                                    next_step="design with smaller uncertainty")
-        fitted = covering_fit(self.high_grid, gains, gains, self.settings.order).function
-        return fitted.scaled(self._proved(source, target, fitted))
+        return gains
 
     def _proved(self, source: str, target: str, weight: Rational | None) -> float:
         """Proved bound of the worst-case gain over |weight| above half the sample rate."""
