@@ -15,47 +15,54 @@ ORDERS = "orders.png"  # with --order: the orders tried and their mu
 def export(
     design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
-    controller: Annotated[str, typer.Option("--controller", metavar="NAME", help="a controller of the design")] = "mu",
+    controller: Annotated[str | None, typer.Option("--controller", metavar="NAME", show_default="mu", help="a "
+                                                   "controller of the design; with --check, the one that DIR must "
+                                                   "have")] = None,
     order: Annotated[int | None, typer.Option("--order", metavar="N", help="export a new controller with at most "
                                               "N states for the axes of the design, found by descent on mu (two "
                                               "minutes or more)")] = None,
     mu_at_most: Annotated[float | None, typer.Option("--mu-at-most", metavar="MU", help="with --order: mu that the "
                                                      "new controller may have, instead of the design's requirement"
                                                      )] = None,
-    formats: Annotated[str, typer.Option("--format", metavar="LIST", help="some of c,mat,json; controller.json and "
-                                         "certificate.json are always written")] = "c,mat,json",
+    formats: Annotated[str | None, typer.Option("--format", metavar="LIST", show_default="c,mat,json", help="some of "
+                                                "c,mat,json; controller.json and certificate.json are always written"
+                                                )] = None,
     float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
     check: Annotated[bool, typer.Option("--check", help="write nothing: check that the files in DIR belong together "
                                         "and compute their certificate again")] = False,
 ) -> None:
     """Write a controller for the rig's processor: sensor volts to drive volts, all axes.
 
-    Writes controller.json, avis_controller.h and .c (C99), controller.mat, test_vectors.csv and certificate.json into
-    DIR. The certificate is computed from the numbers in controller.json (docs/export.md).
+    Writes controller.json, avis_controller.h and .c (C99), controller.mat, test_vectors.csv, restart_vectors.csv and
+    certificate.json into DIR. The certificate is computed from the numbers in controller.json (docs/export.md).
     """
     from rich.console import Console
 
     from avis_ctrl.errors import InputError
     from avis_ctrl.export.design_folder import open_design
     from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
-    from avis_ctrl.export.package import FILES, check_package, formats_of, make_package
+    from avis_ctrl.export.package import FILES, FORMATS, check_package, formats_of, make_package
     from avis_ctrl.files import write_together
     from avis_ctrl.study.files import output_folder
 
-    console, asked = Console(highlight=False), formats_of(formats)
-    if check and order is not None:
-        raise InputError("--check computes the certificate of the files in DIR again and makes no new controller; "
-                         "expected one of --check and --order", field="--order", value=order)
+    console, asked = Console(highlight=False), formats_of(formats or ",".join(FORMATS))
+    for option, value in (("--order", order), ("--format", formats), ("--float32", float32 or None)):
+        if check and value is not None:
+            raise InputError(f"--check computes the certificate of the files in DIR again and makes no new ones; "
+                             f"expected one of --check and {option}", field=option, value=value)
+    if order is not None and order < 1:
+        raise InputError("expected a whole number, 1 or more", field="--order", value=order)
     if mu_at_most is not None and not (order is not None and mu_at_most > 0):
         raise InputError("expected a positive number beside --order", field="--mu-at-most", value=mu_at_most)
     folder = open_design(design_dir)
     if check:
         with Progress(console) as progress:
-            wrong = check_package(folder, out, progress)
+            wrong = check_package(folder, out, progress, controller)
         if wrong:
             raise InputError("; ".join(wrong), file=out)
         console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
+    controller = controller or "mu"
     K = folder.controller(controller)  # a wrong name is said before anything is created
     with output_folder(out, (*FILES, ORDERS)) as path, Progress(console) as progress:
         pictures, most = dict[str, bytes](), float("inf")

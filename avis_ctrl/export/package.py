@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.io
@@ -15,22 +16,27 @@ import scipy.io
 import avis_ctrl
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.export.anti_windup import Choice, choose_anti_windup
+from avis_ctrl.export.bounds import NotStableError
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.certificate import Certificate, Progress, certify, shipped_loop
 from avis_ctrl.export.compiled import compiler
 from avis_ctrl.export.design_folder import Added, DesignFolder
-from avis_ctrl.export.protection import protection
+from avis_ctrl.export.protection import Protection, protection
 from avis_ctrl.export.replay import Replay, replay_worst_plant
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, parse_controller, read_controller
-from avis_ctrl.export.vectors import agreement_V, as_csv, vectors
+from avis_ctrl.export.vectors import agreement_V, as_csv, expected_V, read_csv, restarts, vectors
 from avis_ctrl.rigs.file_errors import read_json
+from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, AntiWindup
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.output import controller_form
 
-CONTROLLER, CERTIFICATE, MAT, VECTORS = "controller.json", "certificate.json", "controller.mat", "test_vectors.csv"
+CONTROLLER, CERTIFICATE, MAT = "controller.json", "certificate.json", "controller.mat"
+VECTORS, RESTARTS = "test_vectors.csv", "restart_vectors.csv"
+# Keys of the certificate that describe them.
+TESTS = {VECTORS: "test_vectors", RESTARTS: "restart_vectors"}
 # The controller of the logical axes from which the exported one was made, where the design's folder does not have it.
 CONTINUOUS = "continuous_controller.json"
-FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, CERTIFICATE)
+FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, RESTARTS, CERTIFICATE)
 FORMATS = ("c", "mat", "json")
 
 
@@ -65,25 +71,24 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     """
     text = folder.sampled(name, arithmetic).as_bytes()
     controller = parse_controller(text)  # the numbers as the file has them
-    progress("anti-windup: the table with its drives at their limits, with and without")
-    choice = choose_anti_windup(shipped_loop(folder, controller), tuple(folder.design.keep))
-    guard = protection(controller, folder.rig, choice.law)
-    plain = c_files(controller, guard, Provenance(()))
-    certificate = certify(folder, controller, plain, progress)
+    try:  # first, because it shows soonest that a controller cannot be exported
+        certificate = certify(folder, controller, c_files(controller, protection(controller, folder.rig),
+                                                          Provenance(())), progress, True)
+    except NotStableError as error:
+        raise _not_stable(folder, name, arithmetic, error.reason) from None
     if not certificate.content["stable"]:
-        precise = "double precision (without --float32), or " if arithmetic == "float32" else ""
-        further = "a larger --order" if name in folder.added else "another controller of the folder"
-        raise ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was "
-                               "written", measured="; ".join(dict.fromkeys(certificate.reasons)),
-                               next_step=f"try {precise}{further}")
+        raise _not_stable(folder, name, arithmetic, "; ".join(dict.fromkeys(certificate.reasons)))
     if not (mu := certificate.content["mu_upper"]) <= mu_at_most:
         raise ComputationError(f"mu of the exported controller {name!r} is not proved to be at most {mu_at_most:g}; "
                                "nothing was written", measured=f"upper bound of mu {mu:.4g}",
                                next_step=f"ask for a larger --order, or accept it with --mu-at-most {mu + 0.005:.2f}")
-    replay = None
+    progress("anti-windup: the table with its drives at their limits, with and without")
+    choice = choose_anti_windup(shipped_loop(folder, controller), tuple(folder.design.keep))
+    guard, replay = protection(controller, folder.rig, choice.law), None
     if compiler() is not None:
         progress("worst plant with the compiled code, on the nonlinear table")
-        replay = replay_worst_plant(folder, certificate, controller, plain)
+        replay = replay_worst_plant(folder, certificate, controller,
+                                    c_files(controller, guard, Provenance(())))
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
@@ -93,18 +98,30 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     if "c" in formats:
         files = c_files(controller, guard, _provenance(folder, controller, certificate))
         contents |= {key: value.encode() for key, value in files.items()}
-        y, u = vectors(controller, guard)
-        contents[VECTORS] = as_csv(controller, y, u).encode()
-        content["test_vectors"] = {"samples": len(y), "tolerance_V": agreement_V(controller, guard, y, u)}
+        for file, (y, u) in ((VECTORS, vectors(controller, guard)), (RESTARTS, restarts(controller, guard))):
+            contents[file] = as_csv(controller, y, u).encode()
+            content[TESTS[file]] = {"samples": len(y), "tolerance_V": agreement_V(controller, guard, y, u)}
     if "mat" in formats:
         contents[MAT] = _mat(controller)
     content["files"] = {name: _sha256(data) for name, data in contents.items()}
-    contents[CERTIFICATE] = as_json(content)
+    contents[CERTIFICATE] = as_json(content | {"content_sha256": _content_sha256(content)})
     return Package(controller, certificate, contents, choice, replay)
+
+
+def _not_stable(folder: DesignFolder, name: str, arithmetic: Arithmetic, reasons: str) -> ComputationError:
+    precise = "double precision (without --float32), or " if arithmetic == "float32" else ""
+    further = "a larger --order" if name in folder.added else "another controller of the folder"
+    return ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was written",
+                            measured=reasons, next_step=f"try {precise}{further}")
 
 
 def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
+
+
+def _content_sha256(content: Mapping[str, Any]) -> str:
+    """Hash of the certificate's keys and values but for itself: it shows what was changed by accident."""
+    return _sha256(as_json({key: value for key, value in content.items() if key != "content_sha256"}))
 
 
 def _provenance(folder: DesignFolder, controller: SampledController, certificate: Certificate) -> Provenance:
@@ -137,39 +154,55 @@ class CheckSettings:
 
     searched : of bounds that a search ends; its steps may fall differently with another numerical library.
     direct : of the rounding noise, a closed formula that every coefficient enters.
+    rounding : ratio of a tolerance to the one computed again: another processor may add in another order.
     """
 
     searched: float = 1e-4
     direct: float = 1e-7
+    rounding: float = 3.0
 
 
-def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda text: None,
+def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda text: None, name: str | None = None,
                   settings: CheckSettings = CheckSettings()) -> list[str]:
     """What does not agree in an exported folder, each as a line; empty if all does.
 
-    First the files: those that are missing, the hashes, the numbers in the C and .mat files; each finding goes to
-    `progress` at once. Then the certificate is computed again, unless controller.json is unchanged and another file is
-    not.
+    First the files: those that are missing or not listed, the hashes, the numbers in the C and .mat files, the test
+    vectors; each finding goes to `progress` at once. Then the certificate is computed again, unless controller.json is
+    unchanged and another file is not.
+
+    Parameters
+    ----------
+    name : of the controller that the folder should have.
 
     Raises
     ------
-    InputError : files that are missing or cannot be read.
+    InputError : no folder of an export, files that cannot be read, another controller.
     """
-    stored = read_json(out / CERTIFICATE, "avis-certificate")
-    controller = read_controller(out / CONTROLLER)
+    _require_export(out)
+    stored = read_json(out / CERTIFICATE, "avis-certificate", "the certificate of avis export")
+    found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
+             ] if stored.get("content_sha256") != _content_sha256(stored) else []
+    wrong = _wrong_files(out, stored)
+    try:
+        controller = read_controller(out / CONTROLLER)
+    except InputError as error:
+        if found or wrong:
+            return [*found, *wrong, str(error)]
+        raise
+    if name is not None and name != controller.name:
+        raise InputError(f"expected {controller.name!r}, the controller in {out}", field="--controller", value=name)
     if (out / CONTINUOUS).exists():
         folder = replace(folder, added={controller.name: Added(folder.controller_in(out / CONTINUOUS))})
-    found, changed = [], stored.get("controller_sha256") != controller.sha256
-    if changed:
-        found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")
-    found += _wrong_files(out, stored.get("files"))
     if (out / SOURCE).exists():
-        found += _differences(SOURCE, controller, _numbers_in_c(out / SOURCE, controller))
+        wrong += _differences(SOURCE, controller, _numbers_in_c(out / SOURCE, controller))
     if (out / MAT).exists():
-        found += _differences(MAT, controller, _numbers_in_mat(out / MAT))
+        wrong += _differences(MAT, controller, _numbers_in_mat(out / MAT))
+    if not any(line.startswith(tuple(TESTS)) for line in wrong):
+        wrong += _wrong_vectors(folder, controller, out, stored, settings)
+    found += wrong
     for line in found:
         progress(line)
-    if found and not changed:
+    if wrong and stored.get("controller_sha256") == controller.sha256:
         return found
     try:
         content = certify(folder, controller, None, progress).content
@@ -182,18 +215,68 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     return found
 
 
-def _wrong_files(out: Path, hashes: object) -> list[str]:
-    """Files that the certificate lists and that are missing, or are not the ones that were exported."""
-    found = []
-    for name, digest in (hashes.items() if isinstance(hashes, dict) else ()):
+def _require_export(out: Path) -> None:
+    """Raises InputError with what is missing where the folder is not one of `avis export`."""
+    if not (out / CERTIFICATE).exists():
+        lacks = f"{CERTIFICATE} is missing in it" if out.is_dir() else f"there is no such folder with {CERTIFICATE}"
+        if (out / "result.json").exists():
+            lacks += "; this is a folder of avis design: are DESIGN_DIR and --out exchanged?"
+        raise InputError(f"expected a folder that avis export wrote; {lacks}", field="--out", value=str(out))
+
+
+def _wrong_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
+    """Files that the certificate lists and that are missing, or are not the ones that were exported; and files of an
+    export that it does not list."""
+    hashes, found = stored.get("files"), []
+    hashes = hashes if isinstance(hashes, dict) else {}
+    for name, digest in ({CONTROLLER: stored.get("controller_sha256")} | hashes).items():
         try:
             data = (out / Path(name).name).read_bytes()
         except OSError as error:
             found.append(f"{name} is missing" if not (out / name).exists() else f"{name}: {error.strerror}")
             continue
-        if name != CONTROLLER and _sha256(data) != digest:
+        if name == CONTROLLER and _sha256(data) != stored.get("controller_sha256"):
+            found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")
+        elif _sha256(data) != digest:
             found.append(f"{name} is not the file that was exported: its hash differs")
+    return found + [f"{name} is not listed in {CERTIFICATE}" for name in FILES
+                    if name not in hashes and name != CERTIFICATE and (out / name).exists()]
+
+
+def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Path, stored: Mapping[str, Any],
+                   settings: CheckSettings) -> list[str]:
+    """Test vectors that controller.json does not give, with the anti-windup of the certificate; wrong tolerances."""
+    found = []
+    for file, key in TESTS.items():
+        if not (out / file).exists():
+            continue
+        try:
+            y, u = read_csv(out / file, controller)
+            guard = _guard(folder, controller, stored)
+            told = float(stored[key]["tolerance_V"])
+            samples = int(stored[key]["samples"])
+        except InputError as error:
+            found.append(str(error))
+            continue
+        except (KeyError, TypeError, ValueError):
+            found.append(f"{CERTIFICATE} has no samples and tolerance_V of {file}, or no anti_windup")
+            continue
+        if samples != len(y):
+            found.append(f"{key}.samples: {samples} in {CERTIFICATE}, {len(y)} rows in {file}")
+        if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= told:
+            found.append(f"u in {file} is not what {CONTROLLER} gives with y, limits and anti_windup of {CERTIFICATE}")
+        else:
+            tolerance = agreement_V(controller, guard, y, u)
+            if not 1 / settings.rounding <= told / tolerance <= settings.rounding:
+                found.append(f"{key}.tolerance_V: {told:g} in {CERTIFICATE}, {tolerance:g} computed from {CONTROLLER}")
     return found
+
+
+def _guard(folder: DesignFolder, controller: SampledController, stored: Mapping[str, Any]) -> Protection:
+    """With the anti-windup that the certificate names."""
+    corner, gain = stored["anti_windup"]["corner_Hz"], stored["anti_windup"]["gain"]
+    law = NO_ANTI_WINDUP if corner is None else AntiWindup.of(float(corner), float(gain), controller.system.dt)
+    return protection(controller, folder.rig, law)
 
 
 def _alike(stored: object, computed: object, tolerance: float) -> bool:

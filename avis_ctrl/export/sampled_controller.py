@@ -76,7 +76,7 @@ def read_controller(path: Path) -> SampledController:
     ------
     InputError : no such file, another format, numbers that make no controller or are no float32 where the file says so.
     """
-    content = read_json(path, FORMAT)
+    content = read_json(path, FORMAT, "a file of avis export")
     try:
         return controller_from(content)
     except InputError as error:

@@ -13,7 +13,7 @@ import scipy.signal
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.compiled import STRICT, CompiledController, step_time_us
 from avis_ctrl.export.protection import Processor, protection
-from avis_ctrl.export.vectors import agreement_V, vectors
+from avis_ctrl.export.vectors import agreement_V, expected_V, restarts, vectors
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import AntiWindup
 
@@ -41,17 +41,90 @@ def test_code_is_the_simulated_controller(skyhook, gcc, rng, arithmetic, toleran
     assert np.max(np.abs(u - expected)) < tolerance * largest
 
 
-@pytest.mark.parametrize(("arithmetic", "tolerance"), [("float64", 1e-11), ("float32", 5e-4)])
-def test_test_vectors_reach_limits_and_fall_back(skyhook, gcc, arithmetic, tolerance):
-    controller, guard, files = exported(skyhook, arithmetic)
+def reached(controller, guard) -> np.ndarray:
+    """(n_u,) largest demand over limit that inputs within their range cause in 20 samples, by the impulse response."""
+    K = controller.system
+    _, response = scipy.signal.dimpulse((K.A, K.B, K.C, K.D, K.dt), n=20)
+    return np.sum(np.abs(response), axis=(0, 1)) * min(guard.input_limit_V[0], 10.0) / controller.limits_V
+
+
+@pytest.mark.parametrize("arithmetic", ARITHMETIC)
+@pytest.mark.parametrize("converter", [True, False])
+def test_test_vectors_start_reach_the_limits_and_fall_back(skyhook, gcc, arithmetic, converter):
+    controller, guard, _ = exported(skyhook, arithmetic)
+    if not converter:
+        guard = replace(guard, input_limit_V=np.full(6, np.inf))
+    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
     y, u = vectors(controller, guard)
     assert len(y) == 2000
-    assert np.any(np.abs(u) == controller.limits_V)
-    assert np.any(np.abs(y) >= guard.input_limit_V)
-    code = CompiledController(files, controller)
+    assert np.all(u[:guard.wait - 1] == 0) and np.any(u[guard.wait] != 0)
+    able = reached(controller, guard) > 1.3
+    assert np.any(able)
+    for limit in (controller.limits_V, -controller.limits_V):
+        assert np.all(np.any(u == limit, axis=0)[able])
+    invalid = ~np.all(np.abs(y) < guard.input_limit_V, axis=1)
+    assert np.count_nonzero(invalid) == 1 and np.argmax(invalid) > 1900
     differ = np.max(np.abs(np.array([code.step(row) for row in y]) - u))
-    assert differ < tolerance
-    assert differ <= agreement_V(controller, guard, y, u) < 1e-3
+    assert differ <= agreement_V(controller, guard, y, u) < (1e-11 if arithmetic == "float64" else 5e-4)
+
+
+@pytest.mark.parametrize("arithmetic", ARITHMETIC)
+@pytest.mark.parametrize("converter", [True, False])
+def test_restart_vectors_fall_back_and_restart(skyhook, gcc, arithmetic, converter):
+    """After each invalid input the drives are at zero, and then move again; at last at full gain."""
+    controller, guard, _ = exported(skyhook, arithmetic)
+    if not converter:
+        guard = replace(guard, input_limit_V=np.full(6, np.inf))
+    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
+    y, u = restarts(controller, guard)
+    rows = np.flatnonzero(~np.all(np.abs(y) < guard.input_limit_V, axis=1))
+    assert [np.count_nonzero(test(y)) for test in (np.isnan, np.isinf)] == ([1, 1] if converter else [1, 2])
+    assert len(rows) == 3
+    for row, end in zip(rows, [*rows[1:], len(y)], strict=True):
+        assert np.any(u[row - 1] != 0) and np.all(u[row + 20:row + guard.wait] == 0) and np.any(u[end - 1] != 0)
+    assert np.max(np.abs(u) / controller.limits_V) < 1
+    got = []
+    for row in y:
+        got.append(code.step(row))
+    assert code.state.gain == 1.0
+    tolerance = agreement_V(controller, guard, y, u)
+    assert np.max(np.abs(got - u)) <= tolerance < (1e-12 if arithmetic == "float64" else 1e-4)
+
+
+def mutated(controller):
+    """Every coefficient in turn times 1.001, and by how much that changes the frequency response, relative to the
+    largest gain to the same drive at the same frequency."""
+    K = controller.system
+    z = np.exp(2j * np.pi * np.geomspace(0.01, 490, 100) * K.dt)
+    inverse = np.linalg.inv(z[:, None, None] * np.eye(K.nstates) - K.A)
+    right, left = np.abs(inverse @ K.B), np.abs(K.C @ inverse)
+    largest = np.max(np.abs(K.C @ inverse @ K.B + K.D), axis=2)
+    for name, matrix in controller.matrices().items():
+        for i, j in zip(*np.nonzero(matrix), strict=True):
+            if name == "A":
+                change = left[:, :, i] * np.max(right[:, j], axis=1)[:, None] / largest
+            elif name == "B":
+                change = left[:, :, i] / largest
+            else:
+                change = (np.max(right[:, j], axis=1) if name == "C" else 1.0) / largest[:, i]
+            changed = matrix.copy()
+            changed[i, j] *= 1.001
+            yield np.max(change) * 1e-3 * abs(matrix[i, j]), replace(controller, system=replace(K, **{name: changed}))
+
+
+@pytest.mark.parametrize(("arithmetic", "negligible", "found"), [("float64", 1e-10, 1.0), ("float32", 1e-4, 0.75)])
+def test_a_coefficient_that_is_off_by_a_thousandth_is_seen(skyhook, arithmetic, negligible, found):
+    """The arithmetic of the code with one coefficient changed, against both files; coefficients of which a thousandth
+    changes the response by less than `negligible` may pass. Rounding hides some in single precision."""
+    controller, guard, _ = exported(skyhook, arithmetic)
+    tests = [(y, u, agreement_V(controller, guard, y, u))
+             for y, u in (vectors(controller, guard), restarts(controller, guard))]
+    seen = []
+    for size, changed in mutated(controller):
+        if size > negligible:
+            seen.append(any(np.max(np.abs(expected_V(changed, guard, y) - u)) > allowed for y, u, allowed in tests))
+    assert len(seen) > 50
+    assert np.mean(seen) >= found
 
 
 def test_test_vectors_outlast_the_start_at_any_rate(skyhook):
@@ -172,6 +245,39 @@ def test_an_invalid_input_brings_the_drives_to_zero_and_back(skyhook, gcc, rng, 
     assert np.all(u[fall + 1:500 + guard.wait - 1] == 0)
     assert np.all(np.any(u[500 + guard.wait:1000 + guard.wait] != 0, axis=0))
     assert code.state.gain == 1.0
+
+
+@pytest.mark.parametrize("arithmetic", ARITHMETIC)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_an_infinite_input_does_not_stay_in_the_states(skyhook, gcc, rng, arithmetic, bad):
+    """Where the converter's range is not known, nothing else bounds it: the sample counts as zero."""
+    controller, _, _ = exported(skyhook, arithmetic)
+    guard = replace(protection(controller, skyhook.rig), input_limit_V=np.full(6, np.inf))
+    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
+    code.skip_start()
+    y = rng.normal(0, 0.02, (2500, 6)).astype(controller.dtype).astype(float)
+    y[200, 1] = bad
+    u = np.array([code.step(row) for row in y])
+    K, y[200, 1] = controller.system, 0.0
+    linear = scipy.signal.dlsim((K.A, K.B, K.C, K.D, K.dt), y)[1]
+    assert np.all(u[200 + round(1 / guard.fall):200 + guard.wait] == 0)
+    assert np.max(np.abs(u[1800:] - linear[1800:])) < (1e-12 if arithmetic == "float64" else 2e-5)
+
+
+@pytest.mark.parametrize("rate", [333.0, 1000.0, 4096.0])
+def test_the_gain_has_no_rounding_error(skyhook, gcc, rate):
+    """In single precision the sum of many steps of 0.001 would be off by 1e-5: multiples of 2^-23 add exactly."""
+    controller, _, _ = exported(skyhook, "float32")
+    controller = replace(controller, system=replace(controller.system, dt=1 / rate))
+    guard = protection(controller, skyhook.rig)
+    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
+    found = []
+    for _ in range(guard.wait + round(1.1 * rate)):
+        code.step(np.zeros(6))
+        found.append(code.state.gain)
+    rising = np.arange(1, len(found) - guard.wait + 2)
+    assert np.array_equal(found[guard.wait - 1:], np.minimum(rising * guard.rise, 1.0))
+    assert np.count_nonzero(np.array(found) < 1) - guard.wait + 2 == pytest.approx(rate, abs=1)
 
 
 @pytest.mark.parametrize("arithmetic", ARITHMETIC)

@@ -13,16 +13,18 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.export.bounds import NotStableError, bounds
 from avis_ctrl.export.c_source import Provenance, c_files
 from avis_ctrl.export.certificate import certify, shipped_loop
 from avis_ctrl.export.compiled import CompiledController
-from avis_ctrl.export.design_folder import open_design
+from avis_ctrl.export.design_folder import Added, open_design
 from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
 from avis_ctrl.export.package import CERTIFICATE, CONTINUOUS, CONTROLLER, check_package, make_package
 from avis_ctrl.export.protection import Processor, protection
 from avis_ctrl.export.replay import ReplaySettings, replay_worst_plant
 from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import parse_controller
+from avis_ctrl.export.sampled_response import SampledAxes
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_peak import mu_peak
@@ -227,8 +229,8 @@ def test_only_what_was_changed_is_named(shipped, package, tmp_path):
     altered = re.sub(rb'"mu_upper": 0\.\d', b'"mu_upper": 0.7', package.contents[CERTIFICATE])
     (tmp_path / CERTIFICATE).write_bytes(altered)
     found = check_package(shipped, tmp_path)
-    assert len(found) == 1
-    assert found[0].startswith("mu_upper: 0.7")
+    assert len(found) == 2
+    assert "content_sha256 differs" in found[0] and found[1].startswith("mu_upper: 0.7")
 
 
 def test_a_mu_above_the_requirement_is_refused(shipped, package, monkeypatch):
@@ -286,6 +288,24 @@ def test_an_unstable_controller_has_no_certificate(shipped, package):
     loud = replace(package.controller, system=replace(K, C=20 * K.C, D=20 * K.D))
     with pytest.raises(ComputationError, match="unstable"):
         certify(shipped, loud)
+
+
+def test_a_proof_that_cannot_succeed_ends_before_the_bounds_that_take_minutes(shipped, monkeypatch):
+    """A direct term, as descent on mu alone leaves it: above half the sample rate the table cannot be proved to bear
+    its gain. That is found before anything is bounded between frequencies, and said as it would be said later."""
+    monkeypatch.setattr("avis_ctrl.export.sampled_response.worst_case_gain", None)  # would be called otherwise
+    K, P = shipped.controller("mu"), shipped.plant.synthesis
+    half_rate = np.pi * shipped.rig.sample_rate_Hz
+    nominal = np.linalg.norm(P.P.select(P.y, P.u).frequency_response(np.array([half_rate]))[0], 2)
+    direct = replace(K, D=K.D + 0.15 / nominal * np.eye(2))
+    folder = replace(shipped, added={"direct": Added(direct)})
+    with pytest.raises(NotStableError, match="loop gain from half the sample rate on is bounded by 2"):
+        bounds(SampledAxes.of(folder, folder.sampled("direct")), True)
+    monkeypatch.setattr("avis_ctrl.export.certificate.rounding_noise", lambda *arguments: np.zeros(6))
+    monkeypatch.setattr("avis_ctrl.export.package.choose_anti_windup", None)
+    with pytest.raises(ComputationError, match=r"'direct' is not proved stable; nothing was written; measured: the "
+                                               r"loop gain .* only; next: try a larger --order"):
+        make_package(folder, "direct")
 
 
 def recoveries(folder, package, law, speeds, inside: bool = False) -> np.ndarray:

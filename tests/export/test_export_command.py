@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -16,8 +17,9 @@ import numpy as np
 import pytest
 import scipy.io
 
+from avis_ctrl.export import package
 from avis_ctrl.export.design_folder import open_design
-from avis_ctrl.export.package import CONTINUOUS, FILES
+from avis_ctrl.export.package import CONTINUOUS, FILES, check_package
 from avis_ctrl.export.sampled_controller import read_controller
 from avis_ctrl.simulation.discrete import digital_controller
 
@@ -25,7 +27,7 @@ ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"
 CERTIFICATE_KEYS = {"format", "version", "controller_sha256", "mu_upper", "mu_lower", "guaranteed", "stable",
                     "worst_case_peak_transmissibility_dB", "worst_case_band_transmissibility_dB",
                     "rounding_noise_m_per_s", "step_time_us", "between_samples", "at_rest", "anti_windup", "files",
-                    "test_vectors"}
+                    "test_vectors", "restart_vectors", "content_sha256"}
 CONTROLLER_KEYS = {"format", "version", "name", "sample_rate_Hz", "arithmetic", "A", "B", "C", "D", "inputs", "outputs",
                    "input_units", "output_units", "limits_V", "delay_samples"}
 
@@ -96,8 +98,6 @@ def test_exported_numbers_are_those_of_the_simulated_controller(skyhook, out):
     ("controller.mat", "controller.mat is missing"), ("avis_controller.h", "avis_controller.h is missing"),
     ("test_vectors.csv", "test_vectors.csv is missing")])
 def test_a_deleted_file_is_named_before_anything_is_computed(skyhook, out, tmp_path, file, words, monkeypatch):
-    from avis_ctrl.export import package
-
     monkeypatch.setattr(package, "certify", None)  # would be called otherwise
     folder = shutil.copytree(out, tmp_path / "out")
     (folder / file).unlink()
@@ -109,9 +109,68 @@ def test_a_changed_byte_of_a_file_is_named(skyhook, out, tmp_path):
     folder = shutil.copytree(out, tmp_path / "out")
     with (folder / "test_vectors.csv").open("a") as file:
         file.write("\n")
-    from avis_ctrl.export.package import check_package
-
     assert check_package(skyhook, folder) == ["test_vectors.csv is not the file that was exported: its hash differs"]
+
+
+def test_the_hash_comes_before_what_is_wrong_in_the_file(skyhook, out, tmp_path):
+    """A number edited by hand that is no float32 value."""
+    folder = shutil.copytree(out, tmp_path / "out")
+    text = json.loads((out / "controller.json").read_text())
+    text["D"][0][0] = 0.1
+    (folder / "controller.json").write_text(json.dumps(text))
+    first, second = check_package(skyhook, folder)
+    assert first == "controller.json is not the file that the certificate names: its hash differs"
+    assert "D: expected float32 values" in second
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda c: c["test_vectors"].update(tolerance_V=1.0), "test_vectors.tolerance_V: 1 in certificate.json"),
+    (lambda c: c["restart_vectors"].update(tolerance_V=1e-9), "restart_vectors.tolerance_V: 1e-09"),
+    (lambda c: c["test_vectors"].update(samples=1999), "test_vectors.samples: 1999"),
+    (lambda c: c["anti_windup"].update(corner_Hz=2.0, gain=0.5), "u in test_vectors.csv is not what"),
+    (lambda c: c.pop("test_vectors"), "no samples and tolerance_V of test_vectors.csv"),
+    (lambda c: c["files"].pop("controller.mat"), "controller.mat is not listed")])
+def test_a_field_of_the_certificate_that_was_edited_is_named(skyhook, out, tmp_path, change, words, monkeypatch):
+    """Within seconds, even if its own hash is made to fit."""
+    monkeypatch.setattr(package, "certify", None)  # would be called otherwise
+    folder = shutil.copytree(out, tmp_path / "out")
+    content = json.loads((out / "certificate.json").read_text())
+    change(content)
+    (folder / "certificate.json").write_text(json.dumps(content))
+    found = check_package(skyhook, folder)
+    assert "content_sha256 differs" in found[0] and any(words in one for one in found[1:])
+    plain = json.dumps({key: value for key, value in content.items() if key != "content_sha256"}, indent=1)
+    content["content_sha256"] = hashlib.sha256(plain.encode()).hexdigest()
+    (folder / "certificate.json").write_text(json.dumps(content))
+    again = check_package(skyhook, folder)
+    assert again == found[1:]
+
+
+def test_a_figure_that_is_not_computed_again_is_protected_by_the_hash(skyhook, out, tmp_path, monkeypatch):
+    stored = json.loads((out / "certificate.json").read_text())
+    same = type("Same", (), {"content": {key: stored[key] for key in ("mu_upper", "stable")}})
+    monkeypatch.setattr(package, "certify", lambda *arguments: same)
+    assert check_package(skyhook, out) == []
+    folder = shutil.copytree(out, tmp_path / "out")
+    (folder / "certificate.json").write_text(json.dumps({**stored, "step_time_us": 0.1}))
+    assert check_package(skyhook, folder) == ["certificate.json is not as it was written: its content_sha256 differs"]
+
+
+def test_the_check_is_of_the_controller_that_is_asked_for(skyhook_dir, out):
+    done = avis("export", skyhook_dir, "--out", out, "--check", "--controller", "mu")
+    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1
+    assert "--controller = 'mu': expected 'skyhook_classical'" in done.stderr
+
+
+def test_folders_that_are_no_export_or_exchanged(skyhook_dir, out, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for design, export, words in (
+            (skyhook_dir, tmp_path / "empty", "certificate.json is missing in it"),
+            (skyhook_dir, tmp_path / "none", "there is no such folder with certificate.json"),
+            (skyhook_dir, skyhook_dir, "certificate.json is missing in it; this is a folder of avis design"),
+            (out, skyhook_dir, "result.json is missing in it; this is a folder of avis export: are DESIGN_DIR and")):
+        done = avis("export", design, "--out", export, "--check")
+        assert done.returncode == 2 and words in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
 
 def test_header_says_where_it_comes_from(out):
@@ -129,6 +188,10 @@ def test_header_says_where_it_comes_from(out):
     (("DESIGN", "--controller", "skyhook_classical", "--out", "FILE"), "--out"),
     (("DESIGN", "--controller", "skyhook_classical", "--out", "/proc/nothing"), "--out"),
     (("DESIGN", "--controller", "skyhook_classical", "--order", "4", "--out", "OUT"), "expected 1 to 3"),
+    (("DESIGN", "--controller", "skyhook_classical", "--order", "999", "--out", "OUT"), "expected 1 to 3"),
+    (("MISSING", "--order", "0", "--out", "OUT"), "--order = 0: expected a whole number, 1 or more"),
+    (("MISSING", "--order", "-2", "--out", "OUT"), "--order = -2: expected a whole number, 1 or more"),
+    (("DESIGN", "--out", "OUT", "--check", "--float32"), "one of --check and --float32"),
     (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "beside --order"),
     (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "one of --check and --order"),
     (("EMPTY", "--out", "OUT"), "result.json"),
