@@ -38,7 +38,7 @@ class SignalSettings:
     low_Hz: float = 0.5
     high: float = 0.9
     fill: float = 0.9
-    overdrive: float = 1.5
+    overdrive: float = 2.0
     range_fraction: float = 0.95
     unlimited_V: float = 10.0
     restart: float = 0.1

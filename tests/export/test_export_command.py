@@ -173,6 +173,42 @@ def test_folders_that_are_no_export_or_exchanged(skyhook_dir, out, tmp_path):
         assert done.returncode == 2 and words in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
 
+def test_the_program_of_the_contract_compares_the_files(out, gcc, tmp_path):
+    """docs/contracts/export.md: compiled with every warning, it accepts the code and refuses another coefficient."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "contracts" / "export.md").read_text()
+    folder = shutil.copytree(out, tmp_path / "out")
+    (folder / "main.c").write_text(re.search(r"```c\n(.*?)```", page, re.DOTALL)[1])
+
+    def results() -> list[int]:
+        subprocess.run([gcc, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "main.c",
+                        "avis_controller.c", "-o", "compare"], cwd=folder, check=True)
+        return [subprocess.run(["./compare", f"{name}.csv", str(certificate[name]["tolerance_V"])], cwd=folder,
+                               check=False).returncode for name in ("test_vectors", "restart_vectors")]
+    certificate = json.loads((out / "certificate.json").read_text())
+    assert results() == [0, 0]
+    source = folder / "avis_controller.c"
+    first = re.search(r"D\[8\]\[6\] = \{\s*\{(\S+?)f,", source.read_text())
+    changed = source.read_text().replace(first[0], first[0].replace(first[1], str(1.01 * float(first[1]))))
+    source.write_text(changed)
+    assert results() == [1, 1]
+    source.write_text(re.sub(r"WAIT = \d+u", "WAIT = 499u", (out / "avis_controller.c").read_text()))
+    assert results() == [1, 1]
+    missing = subprocess.run(["./compare", "missing.csv", "1"], cwd=folder, check=False, capture_output=True)
+    assert missing.returncode == 2
+
+
+def test_every_field_is_in_the_contract(out):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "contracts" / "export.md").read_text()
+
+    def keys(value):
+        if isinstance(value, dict):
+            for key, one in value.items():
+                yield from [key, *keys(one)]
+    for name in ("controller.json", "certificate.json"):
+        for key in keys(json.loads((out / name).read_text())):
+            assert f"`{key}`" in page or key in ("format", "version"), key
+
+
 def test_header_says_where_it_comes_from(out):
     text = (out / "avis_controller.h").read_text()
     certificate = json.loads((out / "certificate.json").read_text())
