@@ -51,14 +51,14 @@ GROUPS = GroupSettings()
 
 
 @dataclass(frozen=True)
-class AlikeSettings:
+class EqualOrderSettings:
     """orders : of the scalings that have one order in all blocks. Fits of a higher order follow details of the best
     scalings at single frequencies, which are not unique."""
 
     orders: tuple[int, ...] = (1, 2, 3, 4, 5)
 
 
-ALIKE = AlikeSettings()
+EQUAL_ORDER = EqualOrderSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class DStep:
     cost: float
 
 
-def alike(points: PointwiseScalings, max_states: int) -> Iterator[Scalings]:
+def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[Scalings]:
     """Scalings fitted block by block, all of one order: the lowest orders first, each with three weights of a misfit.
 
     They take a hundredth of the time of `d_steps`, and what they cost in the last loop says little about the next one:
@@ -132,7 +132,7 @@ def alike(points: PointwiseScalings, max_states: int) -> Iterator[Scalings]:
     start = _constants(points)
     everywhere = np.ones((points.omega.size, len(start.parts)))
     weights = (everywhere, everywhere * _closeness(points)[:, None], _sensitivities(points, start))
-    for order in ALIKE.orders:
+    for order in EQUAL_ORDER.orders:
         for weight in weights:
             scalings = start
             for blocks in start.members:

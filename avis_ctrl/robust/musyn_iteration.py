@@ -22,7 +22,15 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, alike, band_of, cost_of, d_steps
+from avis_ctrl.robust.dstep import (
+    BROAD_FLOOR,
+    DETAILED_FLOOR,
+    PointwiseScalings,
+    band_of,
+    cost_of,
+    d_steps,
+    equal_order_fits,
+)
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
 from avis_ctrl.robust.hinfsyn import Synthesis, hinf_controller
@@ -184,7 +192,7 @@ def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal,
     """
     assert state.path is not None
     hint = state.path.gamma
-    if state.phase == "D-K" and (found := _best(problem, _alike(problem, state, options), options, hint,
+    if state.phase == "D-K" and (found := _best(problem, _equal_orders(problem, state, options), options, hint,
                                                 (1 - SETTINGS.stall) * hint)):
         return found
     return _best(problem, _proposed(problem, state, options), options, hint)
@@ -232,11 +240,11 @@ class Proposal(NamedTuple):
     kind: str
 
 
-def _alike(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
+def _equal_orders(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
     """Scalings of one order in all blocks, by how they fit the best ones at each frequency."""
     assert state.points is not None
     try:
-        for scalings in alike(state.points, options.max_added_states):
+        for scalings in equal_order_fits(state.points, options.max_added_states):
             yield Proposal(scalings, max(0.0, cost_of(state.points, scalings)), "D-K")
     except np.linalg.LinAlgError:
         return

@@ -11,7 +11,7 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, connect, gain, hinf_norm, lft_lower, summing_junction, tf
-from avis_ctrl.robust.dstep import PointwiseScalings, alike
+from avis_ctrl.robust.dstep import PointwiseScalings, equal_order_fits
 from avis_ctrl.robust.frequency_grid import MAX_POINTS, frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
@@ -110,7 +110,7 @@ def test_scalings_of_one_order_keep_to_the_states_allowed():
     N = lft_lower(P, hinfsyn(P, 2, 2).K)
     omega = frequency_grid(N)
     M = N.frequency_response(omega)
-    found = list(alike(PointwiseScalings.of(omega, M, structure), max_states=12))
+    found = list(equal_order_fits(PointwiseScalings.of(omega, M, structure), max_states=12))
     assert [one.orders for one in found] == [(n, n, 0) for n in (1, 2, 3) for _ in range(3)]
     mu = np.array([mu_upper_slicot(one, structure) for one in M])
     for one in found:
