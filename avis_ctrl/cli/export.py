@@ -45,11 +45,10 @@ def export(
     from avis_ctrl.files import write_together
     from avis_ctrl.study.files import output_folder
 
-    console, asked = Console(highlight=False), formats_of(formats or ",".join(FORMATS))
+    console, asked = Console(highlight=False), formats_of(",".join(FORMATS) if formats is None else formats)
     for option, value in (("--order", order), ("--format", formats), ("--float32", float32 or None)):
         if check and value is not None:
-            raise InputError(f"--check computes the certificate of the files in DIR again and makes no new ones; "
-                             f"expected one of --check and {option}", field=option, value=value)
+            raise InputError(f"--check writes no files; expected either --check or {option}", field=option, value=value)
     if order is not None and order < 1:
         raise InputError("expected a whole number, 1 or more", field="--order", value=order)
     if mu_at_most is not None and not (order is not None and mu_at_most > 0):

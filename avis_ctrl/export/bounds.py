@@ -60,8 +60,7 @@ class CoverSettings:
         this gain should add little to it; at low frequencies, where a controller may have no gain, rounding leaves a
         little.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
-    first_points : frequencies from half the sample rate on at which the loop gain is computed
-        before the bounds of the table.
+    first_points : number of frequencies, from half the sample rate on, at which the loop gain is computed first.
     points, few_points : frequencies of the upper bound of the worst-case gain, for its curve, and where
         only the largest gain is wanted.
     """
@@ -168,7 +167,7 @@ class Bounds:
     gain_above: float
 
 
-class NotStableError(ComputationError):
+class StabilityNotProvedError(ComputationError):
     """The proof of stability has failed. reason : why, in words."""
 
     def __init__(self, reason: str):
@@ -189,7 +188,7 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
 
     Raises
     ------
-    NotStableError : only with `only_stable`.
+    StabilityNotProvedError : only with `only_stable`.
     ComputationError : the emitted controller is so far from the design's that no loop with it can be proved stable.
     """
     folder, design = axes.folder, axes.folder.design
@@ -201,15 +200,16 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
     W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
                  np.full(grid.centre.size, settings.harmless), settings)
     # The table's bounds between frequencies take minutes where it has many blocks; at a few frequencies, seconds.
-    if only_stable and not (gain_above := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + SLACK:
-        raise NotStableError(gain_above_in_words(gain_above))
+    if only_stable and not (at_least := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + SLACK:
+        raise StabilityNotProvedError("the bound of the loop gain from half the sample rate on is at least "
+                                      f"{at_least:.3g}; the proof needs less than 1")
     table = plant.synthesis.P.select(plant.synthesis.y, plant.synthesis.u)
     W_E = _cover(grid, axes.folding(grid.centre, grid.half), settings.harmless_images * _gain(table, grid.centre),
                  settings)
     errors = Errors(K, least, W_a, W_E)
     gain_above = _gain_above(axes, errors, settings)
     if only_stable and not gain_above < 1:
-        raise NotStableError(gain_above_in_words(gain_above))
+        raise StabilityNotProvedError(gain_above_in_words(gain_above))
     below = (0.0, axes.half_rate)
     performance, blocks = errors.closed(plant.synthesis)
     motion, _ = errors.closed(plant.full.restricted(plant.floor_velocities, plant.velocities))
@@ -220,8 +220,10 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     # One proof of robust stability for all gains: the further channels do not change the loop of the blocks.
     robust = stability_bound(motion.select(range(blocks.n_z), range(blocks.n_w)), blocks)
-    if only_stable and robust.lower >= 1:
-        raise NotStableError("a perturbation of norm at most 1 makes the loop unstable")
+    if only_stable and (largest := float(np.max(robust.upper_curve, initial=robust.lower))) >= 1 + SLACK:
+        raise StabilityNotProvedError("mu of the uncertainty together with the sampling errors is at least "
+                                      f"{robust.lower:.4g} and bounded by {largest:.4g} only; the proof needs less "
+                                      "than 1")
 
     def worst(system: StateSpace, band: tuple[float, float] = below, points: int = settings.few_points) -> MuPeak:
         return worst_case_gain(system, blocks, band=band, slack=SLACK, robust=robust, points=points)
@@ -259,9 +261,10 @@ def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> f
 
 def _gain_above_at_least(axes: SampledAxes, K: StateSpace, least: float, W_a: Rational, settings: CoverSettings
                          ) -> float:
-    """What `_gain_above` is not below: at a few frequencies, and of all images only that of half the sample rate, which
-    falls onto half the rate itself."""
-    omega = np.geomspace(1.0, settings.beyond, settings.first_points) * axes.half_rate
+    """A lower bound of `_gain_above`, up to the accuracy SLACK of both: at some of its frequencies, with the nearest
+    image only, at half the rate."""
+    omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
+    omega = omega[::(settings.intervals - 1) // (settings.first_points - 1)]
     table = axes.force_to_seen_at(omega)
     table[0] *= 2
     return float(np.max(_emitted_gain(K, least, W_a, omega) * table))

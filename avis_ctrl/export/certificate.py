@@ -76,7 +76,7 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
 
     Raises
     ------
-    NotStableError : only with `only_stable`.
+    StabilityNotProvedError : only with `only_stable`.
     ComputationError : a loop for which no figure exists: unstable with the nominal plant.
     """
     axes = SampledAxes.of(folder, controller)

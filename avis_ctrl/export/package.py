@@ -16,10 +16,10 @@ import scipy.io
 import avis_ctrl
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 from avis_ctrl.export.anti_windup import Choice, choose_anti_windup
-from avis_ctrl.export.bounds import NotStableError
+from avis_ctrl.export.bounds import StabilityNotProvedError
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.certificate import Certificate, Progress, certify, shipped_loop
-from avis_ctrl.export.compiled import compiler
+from avis_ctrl.export.compiled import compiler, step_time_us
 from avis_ctrl.export.design_folder import Added, DesignFolder
 from avis_ctrl.export.protection import Protection, protection
 from avis_ctrl.export.replay import Replay, replay_worst_plant
@@ -72,12 +72,11 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     text = folder.sampled(name, arithmetic).as_bytes()
     controller = parse_controller(text)  # the numbers as the file has them
     try:  # first, because it shows soonest that a controller cannot be exported
-        certificate = certify(folder, controller, c_files(controller, protection(controller, folder.rig),
-                                                          Provenance(())), progress, True)
-    except NotStableError as error:
-        raise _not_stable(folder, name, arithmetic, error.reason) from None
+        certificate = certify(folder, controller, None, progress, True)
+    except StabilityNotProvedError as error:
+        raise _not_proved(folder, name, arithmetic, error.reason) from None
     if not certificate.content["stable"]:
-        raise _not_stable(folder, name, arithmetic, "; ".join(dict.fromkeys(certificate.reasons)))
+        raise _not_proved(folder, name, arithmetic, "; ".join(dict.fromkeys(certificate.reasons)))
     if not (mu := certificate.content["mu_upper"]) <= mu_at_most:
         raise ComputationError(f"mu of the exported controller {name!r} is not proved to be at most {mu_at_most:g}; "
                                "nothing was written", measured=f"upper bound of mu {mu:.4g}",
@@ -87,8 +86,10 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     guard, replay = protection(controller, folder.rig, choice.law), None
     if compiler() is not None:
         progress("worst plant with the compiled code, on the nonlinear table")
-        replay = replay_worst_plant(folder, certificate, controller,
-                                    c_files(controller, guard, Provenance(())))
+        plain = c_files(controller, guard, Provenance(()))
+        certificate = replace(certificate, content={**certificate.content,
+                                                    "step_time_us": step_time_us(plain, controller)})
+        replay = replay_worst_plant(folder, certificate, controller, plain)
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
@@ -108,7 +109,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     return Package(controller, certificate, contents, choice, replay)
 
 
-def _not_stable(folder: DesignFolder, name: str, arithmetic: Arithmetic, reasons: str) -> ComputationError:
+def _not_proved(folder: DesignFolder, name: str, arithmetic: Arithmetic, reasons: str) -> ComputationError:
     precise = "double precision (without --float32), or " if arithmetic == "float32" else ""
     further = "a larger --order" if name in folder.added else "another controller of the folder"
     return ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was written",
@@ -154,7 +155,8 @@ class CheckSettings:
 
     searched : of bounds that a search ends; its steps may fall differently with another numerical library.
     direct : of the rounding noise, a closed formula that every coefficient enters.
-    rounding : ratio of a tolerance to the one computed again: another processor may add in another order.
+    rounding : factor by which a tolerance may differ from the one computed again: another processor may add in another
+        order.
     """
 
     searched: float = 1e-4
@@ -172,7 +174,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
 
     Parameters
     ----------
-    name : of the controller that the folder should have.
+    name : controller that is expected in the folder; None accepts any.
 
     Raises
     ------
@@ -210,7 +212,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         return [*found, f"no certificate can be computed from {CONTROLLER}: {error}"]
     for key, value in json.loads(as_json(content)).items():
         tolerance = settings.direct if key == "rounding_noise_m_per_s" else settings.searched
-        if key not in ("controller_sha256", "step_time_us") and not _alike(stored.get(key), value, tolerance):
+        if key not in ("controller_sha256", "step_time_us") and not _nearly_equal(stored.get(key), value, tolerance):
             found.append(f"{key}: {stored.get(key)} in {CERTIFICATE}, {value} computed from {CONTROLLER}")
     return found
 
@@ -218,9 +220,9 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
 def _require_export(out: Path) -> None:
     """Raises InputError with what is missing where the folder is not one of `avis export`."""
     if not (out / CERTIFICATE).exists():
-        lacks = f"{CERTIFICATE} is missing in it" if out.is_dir() else f"there is no such folder with {CERTIFICATE}"
+        lacks = f"{CERTIFICATE} is missing in it" if out.is_dir() else "there is no such folder"
         if (out / "result.json").exists():
-            lacks += "; this is a folder of avis design: are DESIGN_DIR and --out exchanged?"
+            lacks += "; this is a folder of avis design: are DESIGN_DIR and --out swapped?"
         raise InputError(f"expected a folder that avis export wrote; {lacks}", field="--out", value=str(out))
 
 
@@ -264,10 +266,11 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
         if samples != len(y):
             found.append(f"{key}.samples: {samples} in {CERTIFICATE}, {len(y)} rows in {file}")
         if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= told:
-            found.append(f"u in {file} is not what {CONTROLLER} gives with y, limits and anti_windup of {CERTIFICATE}")
+            found.append(f"the outputs in {file} are not those that {CONTROLLER} gives for its inputs with the "
+                         f"anti-windup of {CERTIFICATE}")
         else:
             tolerance = agreement_V(controller, guard, y, u)
-            if not 1 / settings.rounding <= told / tolerance <= settings.rounding:
+            if not tolerance / settings.rounding <= told <= tolerance * settings.rounding:
                 found.append(f"{key}.tolerance_V: {told:g} in {CERTIFICATE}, {tolerance:g} computed from {CONTROLLER}")
     return found
 
@@ -279,9 +282,9 @@ def _guard(folder: DesignFolder, controller: SampledController, stored: Mapping[
     return protection(controller, folder.rig, law)
 
 
-def _alike(stored: object, computed: object, tolerance: float) -> bool:
+def _nearly_equal(stored: object, computed: object, tolerance: float) -> bool:
     if isinstance(stored, dict) and isinstance(computed, dict):
-        return stored.keys() == computed.keys() and all(_alike(stored[key], computed[key], tolerance)
+        return stored.keys() == computed.keys() and all(_nearly_equal(stored[key], computed[key], tolerance)
                                                         for key in stored)
     if isinstance(stored, float) and isinstance(computed, float):
         return abs(stored - computed) <= tolerance * max(abs(stored), abs(computed))

@@ -258,7 +258,8 @@ class SampledAxes:
         return self._high_gain("force", "seen", omega, np.zeros(omega.size))
 
     def force_to_seen_at(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) what `force_to_seen` is at least, in seconds: bounds at these frequencies, not between them."""
+        """(n_omega,) bound of the table's gain at these frequencies only [m/(N s)]; not above `force_to_seen`, and
+        computed in seconds instead of minutes."""
         return self._gains_at("force", "seen", omega) * self._low_pass(omega, np.zeros(omega.size))
 
     def passive_above(self) -> float:

@@ -1,7 +1,8 @@
 """Test vectors: inputs that take the code through its start, its limits and its fall-back, and the outputs expected.
 
-`vectors` has the start to the full gain, an excitation in the linear range in which a coefficient that is wrong by
-0.1 % shows, every drive at its upper and its lower limit, and the fall-back after an input out of range. `restarts` has
+`vectors` has the start to the full gain, an excitation in the linear range in which, in double precision, every
+coefficient that matters shows if it is wrong by 0.1 %, each drive up to its limits, as far as valid inputs can take it,
+and the fall-back after an input out of range. `restarts` has
 the fall-back to zero and the restart after inputs that are out of range, no number and infinite: a whole start and a
 restart take more rows than `vectors` has.
 """
@@ -22,7 +23,7 @@ from avis_ctrl.lti.statespace import StateSpace
 @dataclass(frozen=True)
 class SignalSettings:
     """start : part of the rows that the start takes, from drives at zero to the full gain. limits : part of the others
-    in which the drives are taken to their limits. falling : last rows, from the invalid input on.
+    in which the drives are taken to their limits. falling : part of the others at the end, from the invalid input on.
     low_Hz, high : band of the linear excitation: a period as long as the rows, and a part of half the sample rate.
     fill : of the drives' limits that the linear excitation demands at most. overdrive : demand over limit, where a
     limit is to be reached. range_fraction : of the converter's range that valid inputs use at most. unlimited_V : valid
@@ -34,7 +35,7 @@ class SignalSettings:
 
     start: float = 0.75
     limits: float = 0.6
-    falling: int = 50
+    falling: float = 0.1
     low_Hz: float = 0.5
     high: float = 0.9
     fill: float = 0.9
@@ -53,7 +54,7 @@ def vectors(controller: SampledController, guard: Protection, settings: SignalSe
     start = guard.wait + 1 / guard.rise
     samples = round(start / settings.start)
     y = _linear(controller, guard, samples, settings)
-    end = samples - settings.falling
+    end = samples - max(1, round(settings.falling * (samples - start)))
     extreme = _extreme(controller, guard, round(settings.limits * (samples - start)), settings)
     y[end - len(extreme):end] = extreme
     y[end, 0] = _invalid(guard)[0]
@@ -63,7 +64,8 @@ def vectors(controller: SampledController, guard: Protection, settings: SignalSe
 def restarts(controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
              ) -> tuple[np.ndarray, np.ndarray]:
     """Inputs (samples, n_y) and outputs (samples, n_u) from `init` on [V]: three times the beginning of a start and an
-    invalid input of one sample, then a whole restart. No limit is reached, so that the outputs agree more closely."""
+    invalid input of one sample, then a whole restart. The inputs reach no limit in the linear range: the outputs agree
+    more closely."""
     seen = guard.wait + round(settings.restart / guard.rise)
     invalid = _invalid(guard)[1:]
     last = guard.wait + round((1 + settings.linear) / guard.rise)
@@ -82,6 +84,8 @@ def agreement_V(controller: SampledController, guard: Protection, y: np.ndarray,
     other, margin = (np.longdouble, 2 * settings.margin) if controller.arithmetic == "float64" else (
         np.float32, settings.margin)
     differ = margin * float(np.max(np.abs(_run(Processor(controller, guard, other), y) - u)))
+    # Where long double is no wider than double, the difference is zero: then that of one rounding.
+    differ = max(differ, margin * float(np.finfo(controller.dtype).eps) * float(np.max(np.abs(u))))
     digit = 10.0 ** int(np.floor(np.log10(max(differ, np.finfo(float).tiny))) - 1)
     return float(f"{np.ceil(differ / digit) * digit:.1e}")
 
@@ -140,7 +144,7 @@ def _demand(controller: SampledController, guard: Protection, y: np.ndarray) -> 
     """Largest demand over limit with the inputs y, without any limits."""
     free = Processor(controller, replace(guard, input_limit_V=np.full(guard.input_limit_V.size, np.inf)))
     free.limits_V = np.full(free.limits_V.size, np.inf)
-    return float(np.max(np.abs(_run(free, y)) / controller.limits_V))
+    return max(float(np.max(np.abs(_run(free, y)) / controller.limits_V)), float(np.finfo(float).tiny))
 
 
 def _with_outputs(controller: SampledController, guard: Protection, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -126,8 +126,8 @@ class DStep:
 def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[Scalings]:
     """Scalings fitted block by block, all of one order: the lowest orders first, each with three weights of a misfit.
 
-    They take a hundredth of the time of `d_steps`, and what they cost in the last loop says little about the next one:
-    the caller compares the gamma that they allow.
+    They are much quicker than `d_steps`. Their misfit in the last loop says little about the next one, so the caller
+    compares the gamma that they allow.
     """
     start = _constants(points)
     everywhere = np.ones((points.omega.size, len(start.parts)))
@@ -349,7 +349,9 @@ def _sensitivities(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     U, _, Vh = np.linalg.svd(left @ points.M @ right)
     share = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
                       for _, w, z in points.structure.slices()], axis=1)
-    weight = _closeness(points)[:, None] * np.maximum(share / np.max(share, axis=0), 1e-2)
+    # A block that no loop goes through has no share.
+    relative = share / np.maximum(np.max(share, axis=0), np.finfo(float).tiny)
+    weight = _closeness(points)[:, None] * np.maximum(relative, 1e-2)
     return np.maximum(weight / np.max(weight, axis=0), 1e-3)
 
 

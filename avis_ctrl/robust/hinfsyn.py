@@ -53,6 +53,7 @@ class Status(Enum):
                   "means a badly scaled plant or a nearly singular D12 or D21")
     WIDE = ("the optimum lies between the bounds, which are further apart than requested: between them the Riccati "
             "test is undecided")
+    UNPROVED = "the optimum was found to the tolerance; no lower bound of it was computed"
     SUBOPTIMAL = "a controller at the requested gamma; the optimum was not computed"
 
 
@@ -158,7 +159,8 @@ def hinf_controller(P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: f
     result, raised = problem.realise(form, bracket.upper.gamma, backoff, False)
     # With extra channels, and where the target was missed, only the measured gamma is known to be possible.
     upper = result.gamma if notes or raised else min(bracket.upper.gamma, result.gamma)
-    return replace(result, gamma_optimal_bounds=(0.0, upper), status=Status.SUBOPTIMAL, notes=notes)
+    return replace(result, gamma_optimal_bounds=(0.0, upper), status=Status.UNPROVED,
+                   notes=(*notes, raised) if raised else notes)
 
 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:

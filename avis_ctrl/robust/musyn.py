@@ -1,7 +1,7 @@
 """mu synthesis: a controller that makes the peak of the structured singular value small.
 
 D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order: of several
-fits to the best scalings at each frequency, the one that allows the smallest gamma is taken. Where it stalls, it is
+fits to the best scalings at each frequency, one is taken whose gamma is the smallest to 0.5 %. Where it stalls, it is
 followed by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). If the first H-infinity
 controller is no better than no control, the iteration starts from other constant scalings. See `musyn_iteration`.
 

@@ -7,7 +7,7 @@ at the best constant scalings ("start"): first of all where the controllers to s
 step from them leads nowhere, else in the end. The best loop of all paths is kept.
 
 Only counts end the iteration, never a clock. The target and the number of iterations allowed decide only where it
-ends: a short run is the beginning of a long one.
+ends, and the target which scalings the last step takes: a short run is the beginning of a long one.
 """
 
 from __future__ import annotations
@@ -185,23 +185,24 @@ def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
 
 
 def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal, Synthesis] | None:
-    """The scalings of least H-infinity optimum and their controller; None where none that is proposed has any.
+    """The scalings of least H-infinity optimum and their controller; None if no proposal has a controller.
 
     The fit of scalings to the last loop does not tell what the next one will be; one test of gamma does. In a D-K step
-    scalings that are fitted quickly come first, and suffice if they allow a smaller gamma than the path has.
+    scalings that are fitted quickly come first, and suffice if their gamma makes mu fall by more than `stall`.
     """
     assert state.path is not None
     hint = state.path.gamma
-    if state.phase == "D-K" and (found := _best(problem, _equal_orders(problem, state, options), options, hint,
-                                                (1 - SETTINGS.stall) * hint)):
-        return found
+    if state.phase == "D-K":
+        enough = (1 - SETTINGS.stall) * state.path.mu / (1 + options.backoff)
+        if found := _best(problem, _equal_orders(state, options), options, hint, enough):
+            return found
     return _best(problem, _proposed(problem, state, options), options, hint)
 
 
 def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hint: float, below: float = np.inf
           ) -> tuple[Proposal, Synthesis] | None:
-    """The proposal of least H-infinity optimum, at most `below`, and its controller; the first that reaches the target
-    ends the search."""
+    """The proposal of least H-infinity optimum, at most `below`, and its controller: another one is preferred if its
+    optimum is smaller by more than `stall`. The first that reaches the target ends the search."""
     best: tuple[Proposal, Synthesis] | None = None
     for proposal in proposals:
         try:
@@ -240,8 +241,8 @@ class Proposal(NamedTuple):
     kind: str
 
 
-def _equal_orders(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
-    """Scalings of one order in all blocks, by how they fit the best ones at each frequency."""
+def _equal_orders(state: State, options: Options) -> Iterator[Proposal]:
+    """Scalings of one order in all blocks; their cost is measured on the grid only."""
     assert state.points is not None
     try:
         for scalings in equal_order_fits(state.points, options.max_added_states):

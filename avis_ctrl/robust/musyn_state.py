@@ -30,7 +30,8 @@ class Iteration:
     gamma : measured H-infinity norm of the loop scaled by D(s); an upper bound of complex mu at every frequency.
     mu_upper : largest upper bound of complex mu over the frequency grid.
     order : states of K; d_order : sum of the orders of the scalings that K was made with.
-    d_fit_error : what those realised scalings cost against the best ones at each frequency, relative.
+    d_fit_error : what those realised scalings cost against the best ones at each frequency, relative; of scalings with
+        one order in all blocks on the grid, of others between its frequencies, too.
     kind : how the scalings were made: "H-infinity" (identity), "start" (other constants, where the controllers to start
         from do nothing), "D-K", "descent" or "growth"; "nominal" is the H-infinity controller of the plant without its
         uncertainty, "given" one that the caller gave to start from.
