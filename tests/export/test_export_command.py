@@ -127,7 +127,7 @@ def test_the_hash_comes_before_what_is_wrong_in_the_file(skyhook, out, tmp_path)
     (lambda c: c["test_vectors"].update(tolerance_V=1.0), "test_vectors.tolerance_V: 1 in certificate.json"),
     (lambda c: c["restart_vectors"].update(tolerance_V=1e-9), "restart_vectors.tolerance_V: 1e-09"),
     (lambda c: c["test_vectors"].update(samples=1999), "test_vectors.samples: 1999"),
-    (lambda c: c["anti_windup"].update(corner_Hz=2.0, gain=0.5), "u in test_vectors.csv is not what"),
+    (lambda c: c["anti_windup"].update(corner_Hz=2.0, gain=0.5), "the outputs in test_vectors.csv are not those"),
     (lambda c: c.pop("test_vectors"), "no samples and tolerance_V of test_vectors.csv"),
     (lambda c: c["files"].pop("controller.mat"), "controller.mat is not listed")])
 def test_a_field_of_the_certificate_that_was_edited_is_named(skyhook, out, tmp_path, change, words, monkeypatch):
@@ -162,11 +162,11 @@ def test_the_check_is_of_the_controller_that_is_asked_for(skyhook_dir, out):
     assert "--controller = 'mu': expected 'skyhook_classical'" in done.stderr
 
 
-def test_folders_that_are_no_export_or_exchanged(skyhook_dir, out, tmp_path):
+def test_folders_that_are_no_export_or_swapped(skyhook_dir, out, tmp_path):
     (tmp_path / "empty").mkdir()
     for design, export, words in (
             (skyhook_dir, tmp_path / "empty", "certificate.json is missing in it"),
-            (skyhook_dir, tmp_path / "none", "there is no such folder with certificate.json"),
+            (skyhook_dir, tmp_path / "none", "there is no such folder"),
             (skyhook_dir, skyhook_dir, "certificate.json is missing in it; this is a folder of avis design"),
             (out, skyhook_dir, "result.json is missing in it; this is a folder of avis export: are DESIGN_DIR and")):
         done = avis("export", design, "--out", export, "--check")
@@ -227,11 +227,11 @@ def test_header_says_where_it_comes_from(out):
     (("DESIGN", "--controller", "skyhook_classical", "--order", "999", "--out", "OUT"), "expected 1 to 3"),
     (("MISSING", "--order", "0", "--out", "OUT"), "--order = 0: expected a whole number, 1 or more"),
     (("MISSING", "--order", "-2", "--out", "OUT"), "--order = -2: expected a whole number, 1 or more"),
-    (("DESIGN", "--out", "OUT", "--check", "--float32"), "one of --check and --float32"),
+    (("DESIGN", "--out", "OUT", "--check", "--float32"), "either --check or --float32"),
     (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "beside --order"),
-    (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "one of --check and --order"),
+    (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "either --check or --order"),
     (("EMPTY", "--out", "OUT"), "result.json"),
-    (("DESIGN", "--out", "OUT", "--check"), "certificate.json")])
+    (("DESIGN", "--out", "OUT", "--check"), "there is no such folder")])
 def test_wrong_input_is_one_line_and_writes_nothing(skyhook_dir, tmp_path, arguments, words):
     (tmp_path / "file").write_text("")
     (tmp_path / "empty").mkdir()
