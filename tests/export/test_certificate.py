@@ -304,7 +304,7 @@ def test_a_proof_that_cannot_succeed_ends_before_the_bounds_that_take_minutes(sh
     monkeypatch.setattr("avis_ctrl.export.certificate.rounding_noise", lambda *arguments: np.zeros(6))
     monkeypatch.setattr("avis_ctrl.export.package.choose_anti_windup", None)
     with pytest.raises(ComputationError, match=r"'direct' is not proved stable; nothing was written; measured: the "
-                                               r"loop gain .* only; next: try a larger --order"):
+                                               r"bound of the loop gain .* less than 1; next: try a larger --order"):
         make_package(folder, "direct")
 
 
