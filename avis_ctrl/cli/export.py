@@ -45,7 +45,7 @@ def export(
     from avis_ctrl.files import write_together
     from avis_ctrl.study.files import output_folder
 
-    console, asked = Console(highlight=False), formats_of(",".join(FORMATS) if formats is None else formats)
+    console, asked = Console(highlight=False), FORMATS if formats is None else formats_of(formats)
     for option, value in (("--order", order), ("--format", formats), ("--float32", float32 or None)):
         if check and value is not None:
             raise InputError(f"--check writes no files; expected either --check or {option}", field=option, value=value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.export.bounds import bounds, gain_above_in_words
-from avis_ctrl.export.compiled import step_time_us
 from avis_ctrl.export.design_folder import DesignFolder
 from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import SampledController
@@ -64,15 +63,13 @@ def shipped_loop(folder: DesignFolder, controller: SampledController) -> Sampled
     return replace(folder.loop(folder.controller(controller.name)), digital=controller.system)
 
 
-def certify(folder: DesignFolder, controller: SampledController, files: Mapping[str, str] | None = None,
-            progress: Progress = lambda text: None, only_stable: bool = False,
-            settings: StabilitySettings = StabilitySettings()) -> Certificate:
-    """Compute the certificate of a controller's numbers.
+def certify(folder: DesignFolder, controller: SampledController, progress: Progress = lambda text: None,
+            only_stable: bool = False, settings: StabilitySettings = StabilitySettings()) -> Certificate:
+    """Compute the certificate of a controller's numbers, without the time of a step.
 
     Parameters
     ----------
-    files : C files whose step is timed; None for no time. only_stable : end as soon as the loop cannot be proved
-        stable.
+    only_stable : end as soon as the loop cannot be proved stable.
 
     Raises
     ------
@@ -100,7 +97,7 @@ def certify(folder: DesignFolder, controller: SampledController, files: Mapping[
                "worst_case_peak_transmissibility_dB": decibels(found.peak.upper),
                "worst_case_band_transmissibility_dB": decibels(found.band.upper),
                "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
-               "step_time_us": None if files is None else step_time_us(files, controller),
+               "step_time_us": None,
                "at_rest": {**at_rest(loop).as_dict(), "gain_Ns_per_m": axes.gain_at_rest()},
                "between_samples": {"worst_case_gain_dB": decibels(found.all_times),
                                    "floor_above_half_rate_dB": decibels(found.above)}}

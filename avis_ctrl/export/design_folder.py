@@ -106,7 +106,7 @@ def open_design(path: Path) -> DesignFolder:
     if not path.is_dir():
         raise InputError("expected a folder that avis design wrote", field="DESIGN_DIR", value=str(path))
     if not (path / "result.json").exists():
-        other = "; this is a folder of avis export: are DESIGN_DIR and --out exchanged?"
+        other = "; this is a folder of avis export: are DESIGN_DIR and --out swapped?"
         raise InputError("expected a folder that avis design wrote; result.json is missing in it"
                          + other * (path / "certificate.json").exists(), field="DESIGN_DIR", value=str(path))
     result = read_json(path / "result.json", "avis-design")

@@ -72,7 +72,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     text = folder.sampled(name, arithmetic).as_bytes()
     controller = parse_controller(text)  # the numbers as the file has them
     try:  # first, because it shows soonest that a controller cannot be exported
-        certificate = certify(folder, controller, None, progress, True)
+        certificate = certify(folder, controller, progress, True)
     except StabilityNotProvedError as error:
         raise _not_proved(folder, name, arithmetic, error.reason) from None
     if not certificate.content["stable"]:
@@ -207,7 +207,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     if wrong and stored.get("controller_sha256") == controller.sha256:
         return found
     try:
-        content = certify(folder, controller, None, progress).content
+        content = certify(folder, controller, progress).content
     except AvisError as error:
         return [*found, f"no certificate can be computed from {CONTROLLER}: {error}"]
     for key, value in json.loads(as_json(content)).items():

@@ -2,9 +2,8 @@
 
 `vectors` has the start to the full gain, an excitation in the linear range in which, in double precision, every
 coefficient that matters shows if it is wrong by 0.1 %, each drive up to its limits, as far as valid inputs can take it,
-and the fall-back after an input out of range. `restarts` has
-the fall-back to zero and the restart after inputs that are out of range, no number and infinite: a whole start and a
-restart take more rows than `vectors` has.
+and the fall-back after an input out of range. `restarts` has the fall-back to zero and the restart after inputs that
+are out of range, not a number and infinite: a whole start and a restart take more rows than `vectors` has.
 """
 
 from __future__ import annotations

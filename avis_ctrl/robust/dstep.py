@@ -123,11 +123,11 @@ class DStep:
     cost: float
 
 
-def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[Scalings]:
+def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[DStep]:
     """Scalings fitted block by block, all of one order: the lowest orders first, each with three weights of a misfit.
 
-    They are much quicker than `d_steps`. Their misfit in the last loop says little about the next one, so the caller
-    compares the gamma that they allow.
+    They are much quicker than `d_steps`, and evaluated on the grid only. Their cost in the last loop says little about
+    the next one, so the caller compares the gamma that they allow.
     """
     start = _constants(points)
     everywhere = np.ones((points.omega.size, len(start.parts)))
@@ -140,7 +140,7 @@ def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[Sca
                     scalings = scalings.replace(k, part)
             if scalings.added_states > max_states:
                 return
-            yield scalings
+            yield _evaluated(points, scalings)
 
 
 def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors: Sequence[float] = (BROAD_FLOOR,),
@@ -254,13 +254,9 @@ def _sigma(omega: np.ndarray, M: np.ndarray, scalings: Scalings) -> np.ndarray:
     return np.linalg.norm(left @ M @ right, ord=2, axis=(1, 2))
 
 
-def cost_of(points: PointwiseScalings, scalings: Scalings) -> float:
-    """Largest excess over the yardstick at the points."""
-    return float(np.max(peak_of(points, scalings) / points.yardstick)) - 1
-
-
 def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
-    return DStep(scalings, float(np.max(peak_of(points, scalings))), cost_of(points, scalings))
+    sigma = peak_of(points, scalings)
+    return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / points.yardstick)) - 1)
 
 
 def _constants(points: PointwiseScalings) -> Scalings:
@@ -309,6 +305,7 @@ def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_stat
             order = part.scalar.order + by
             if order > MAX_ORDER:
                 return None
+            # Of the scalings with the groups that are refitted already.
             weights = _sensitivities(points, scalings)
             for k, part in zip(blocks, _fitted(points, step.scalings, blocks, order, weights), strict=True):
                 scalings = scalings.replace(k, part)

@@ -22,15 +22,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import (
-    BROAD_FLOOR,
-    DETAILED_FLOOR,
-    PointwiseScalings,
-    band_of,
-    cost_of,
-    d_steps,
-    equal_order_fits,
-)
+from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_steps, equal_order_fits
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
 from avis_ctrl.robust.hinfsyn import Synthesis, hinf_controller
@@ -245,8 +237,8 @@ def _equal_orders(state: State, options: Options) -> Iterator[Proposal]:
     """Scalings of one order in all blocks; their cost is measured on the grid only."""
     assert state.points is not None
     try:
-        for scalings in equal_order_fits(state.points, options.max_added_states):
-            yield Proposal(scalings, max(0.0, cost_of(state.points, scalings)), "D-K")
+        for step in equal_order_fits(state.points, options.max_added_states):
+            yield Proposal(step.scalings, max(0.0, step.cost), "D-K")
     except np.linalg.LinAlgError:
         return
 

@@ -20,9 +20,12 @@ from avis_ctrl.simulation.sampled_loop import AntiWindup
 ARITHMETIC = ("float64", "float32")
 
 
-def exported(folder, arithmetic, title="a design"):
+def exported(folder, arithmetic, title="a design", converter=True):
+    """Controller, protection and C files; with the converter's range of the rig or without."""
     controller = folder.sampled("skyhook_classical", arithmetic)
     guard = protection(controller, folder.rig)
+    if not converter:
+        guard = replace(guard, input_limit_V=np.full(6, np.inf))
     return controller, guard, c_files(controller, guard, Provenance((title,)))
 
 
@@ -51,10 +54,8 @@ def reached(controller, guard) -> np.ndarray:
 @pytest.mark.parametrize("arithmetic", ARITHMETIC)
 @pytest.mark.parametrize("converter", [True, False])
 def test_test_vectors_start_reach_the_limits_and_fall_back(skyhook, gcc, arithmetic, converter):
-    controller, guard, _ = exported(skyhook, arithmetic)
-    if not converter:
-        guard = replace(guard, input_limit_V=np.full(6, np.inf))
-    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
+    controller, guard, files = exported(skyhook, arithmetic, converter=converter)
+    code = CompiledController(files, controller)
     y, u = vectors(controller, guard)
     assert len(y) == 2000
     assert np.all(u[:guard.wait - 1] == 0) and np.any(u[guard.wait] != 0)
@@ -72,10 +73,8 @@ def test_test_vectors_start_reach_the_limits_and_fall_back(skyhook, gcc, arithme
 @pytest.mark.parametrize("converter", [True, False])
 def test_restart_vectors_fall_back_and_restart(skyhook, gcc, arithmetic, converter):
     """After each invalid input the drives are at zero, and then move again; at last at full gain."""
-    controller, guard, _ = exported(skyhook, arithmetic)
-    if not converter:
-        guard = replace(guard, input_limit_V=np.full(6, np.inf))
-    code = CompiledController(c_files(controller, guard, Provenance(())), controller)
+    controller, guard, files = exported(skyhook, arithmetic, converter=converter)
+    code = CompiledController(files, controller)
     y, u = restarts(controller, guard)
     rows = np.flatnonzero(~np.all(np.abs(y) < guard.input_limit_V, axis=1))
     assert [np.count_nonzero(test(y)) for test in (np.isnan, np.isinf)] == ([1, 1] if converter else [1, 2])

@@ -292,7 +292,7 @@ def test_an_unstable_controller_has_no_certificate(shipped, package):
 
 def test_a_proof_that_cannot_succeed_ends_before_the_bounds_that_take_minutes(shipped, monkeypatch):
     """A direct term, as descent on mu alone leaves it: above half the sample rate the table cannot be proved to bear
-    its gain. That is found before anything is bounded between frequencies, and said as it would be said later."""
+    its gain. That is found before anything is bounded between frequencies."""
     monkeypatch.setattr("avis_ctrl.export.sampled_response.worst_case_gain", None)  # would be called otherwise
     K, P = shipped.controller("mu"), shipped.plant.synthesis
     half_rate = np.pi * shipped.rig.sample_rate_Hz

@@ -110,7 +110,7 @@ def test_scalings_of_one_order_keep_to_the_states_allowed():
     N = lft_lower(P, hinfsyn(P, 2, 2).K)
     omega = frequency_grid(N)
     M = N.frequency_response(omega)
-    found = list(equal_order_fits(PointwiseScalings.of(omega, M, structure), max_states=12))
+    found = [step.scalings for step in equal_order_fits(PointwiseScalings.of(omega, M, structure), max_states=12)]
     assert [one.orders for one in found] == [(n, n, 0) for n in (1, 2, 3) for _ in range(3)]
     mu = np.array([mu_upper_slicot(one, structure) for one in M])
     scaled = []
@@ -217,20 +217,22 @@ def test_callback_stops_and_resuming_equals_running_on():
 def long_run():
     """D-K iteration and descent on a small table, in a quiet process."""
     made = musyn(barely_known_table(0.5), UNCERTAIN_DRIVE, 1, 1, max_iterations=6)
-    assert [row.kind for row in made.history[:5]] == ["H-infinity", "nominal", "D-K", "D-K", "descent"]
+    # Whether growth or a second descent comes next hangs on the fifth digit of mu.
+    assert [row.kind for row in made.history[:6]] == ["H-infinity", "nominal", "D-K", "D-K", "descent", "growth"]
     return made
 
 
 def test_a_tighter_request_goes_on_where_a_looser_one_ended(long_run):
     """Fewer iterations, or a target, end the same iteration earlier: mu never rises with what is asked."""
     gammas = [row.gamma for row in long_run.history]
-    target = 1.001 * gammas[3]
+    target = (gammas[2] * gammas[3]) ** 0.5  # reached by the fourth controller, not by the third
+    assert gammas[3] < target < gammas[2]
     loose = musyn(barely_known_table(0.5), UNCERTAIN_DRIVE, 1, 1, max_iterations=6, target=target)
     assert loose.status == f"target {target:g} reached" and loose.history[-1].gamma <= target
     short = musyn(barely_known_table(0.5), UNCERTAIN_DRIVE, 1, 1, max_iterations=2)
+    assert [row.gamma for row in short.history] == gammas[:3]
     # A step ends at the first scalings that reach the target, so that the last one may be another.
-    for run, length in ((loose, len(loose.history) - 1), (short, 3)):
-        assert [row.gamma for row in run.history][:length] == gammas[:length]
+    assert len(loose.history) == 4 and [row.gamma for row in loose.history[:3]] == gammas[:3]
     assert long_run.mu_upper <= loose.mu_upper <= short.mu_upper
 
 
