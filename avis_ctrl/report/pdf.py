@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from avis_ctrl.report.pieces import (
     Table,
 )
 from avis_ctrl.report.words import typeset
+from avis_ctrl.study.workers import each
 
 # Of the text: a drawing leaves room for what it explains on the same page.
 DRAWING_WIDTH = 0.72
@@ -39,8 +41,11 @@ def render(document: Document) -> bytes:
     ------
     ComputationError : the typesetter refuses, with what it says.
     """
+    figures = [one for one in document.figures() if isinstance(one, Figure)]
+    drawn = dict(zip(map(id, figures), each(matplotlib_backend.svg, figures), strict=True))
     content = {"title": document.title, "subtitle": document.subtitle, "stamp": document.stamp, "sections": [
-        {"title": s.title, "alone": s.alone, "pieces": [_piece(p) for p in s.pieces]} for s in document.sections]}
+        {"title": s.title, "alone": s.alone, "pieces": [_piece(p, drawn) for p in s.pieces]}
+        for s in document.sections]}
     template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
     # The drawings' sans-serif text is set in the font that matplotlib brings, the same on every machine.
     folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
@@ -55,7 +60,8 @@ def render(document: Document) -> bytes:
     return made
 
 
-def _piece(piece: Piece) -> dict[str, Any]:
+def _piece(piece: Piece, drawn: Mapping[int, str]) -> dict[str, Any]:
+    """drawn : SVG of each figure by its id."""
     match piece:
         case Heading(text):
             return {"kind": "heading", "text": typeset(text)}
@@ -72,9 +78,9 @@ def _piece(piece: Piece) -> dict[str, Any]:
         case Drawing(_, caption, image, alternative):
             return _image(DRAWING_WIDTH, caption, image, alternative)
         case Figure():
-            return _image(1.0, piece.caption, matplotlib_backend.svg(piece), piece.caption)
+            return _image(1.0, piece.caption, drawn[id(piece)], piece.caption)
         case Fold(title, pieces):
-            return {"kind": "fold", "title": typeset(title), "pieces": [_piece(p) for p in pieces]}
+            return {"kind": "fold", "title": typeset(title), "pieces": [_piece(p, drawn) for p in pieces]}
     raise TypeError(f"no piece of a report: {type(piece).__name__}")
 
 

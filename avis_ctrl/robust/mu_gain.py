@@ -10,6 +10,7 @@ The performance block absorbs every phase, hence nothing has to be kept real her
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,20 @@ import numpy as np
 from avis_ctrl.robust.mu_lmi import Array, dagger
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-STEPS = (1.0, 0.5, 0.2, 0.05)
+
+@dataclass(frozen=True)
+class GainSettings:
+    """steps : lengths of a step towards the steepest Delta, tried in this order.
+    accuracy : relative rise of the gain in a step that is worth another one.
+    dyad_loss : relative loss of gain for which a full block becomes a dyad.
+    """
+
+    steps: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
+    accuracy: float = 1e-6
+    dyad_loss: float = 1e-4
+
+
+SETTINGS = GainSettings()
 
 
 class WorstGain(NamedTuple):
@@ -66,32 +80,41 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
                seed: int = 0) -> WorstGain:
     """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step."""
     rng = np.random.default_rng(seed)
-    batch = M.shape[0]
-    best = WorstGain(_gain(M, np.zeros((batch, structure.n_w, structure.n_z), complex)),
-                     np.zeros((batch, structure.n_w, structure.n_z), complex))
-    for start in range(count):
-        delta = np.zeros_like(best.delta) if start == 0 else np.stack([structure.random(rng) for _ in range(batch)])
-        gain = _gain(M, delta)
-        for _ in range(iterations):
-            direction = _steepest(M, delta, structure) - delta
-            trials = np.stack([delta + t * direction for t in STEPS])
-            gains = _gain(M[None], trials)
-            chosen = np.argmax(gains, axis=0)
-            value = np.take_along_axis(gains, chosen[None], axis=0)[0]
-            better = value > gain * (1 + 1e-9)
-            if not np.any(better):
-                break
-            delta = np.where(better[:, None, None], trials[chosen, np.arange(batch)], delta)
-            gain = np.where(better, value, gain)
-        # At a maximum a full block is the dyad of the gradient; only that form is realised with constant norm.
-        dyads = _steepest(M, delta, structure)
-        delta_dyads = delta.copy()
-        for block, w, z in structure.slices():
-            if block.kind == "full":
-                delta_dyads[:, w, z] = dyads[:, w, z]
-        value = _gain(M, delta_dyads)
-        take = value >= gain * (1 - 1e-4)
-        delta, gain = np.where(take[:, None, None], delta_dyads, delta), np.where(take, value, gain)
-        raised = gain > best.gain
-        best.gain[raised], best.delta[raised] = gain[raised], delta[raised]
-    return best
+    batch, size = M.shape[0], (structure.n_w, structure.n_z)
+    drawn = [structure.random(rng) for _ in range((count - 1) * batch)]
+    delta = np.concatenate([np.zeros((batch, *size), complex), np.reshape(drawn, (-1, *size))])
+    repeated = np.concatenate([M] * count)
+    gain = _gain(repeated, delta)
+    climbing = np.arange(gain.size)
+    for _ in range(iterations):
+        gained = gain[climbing]
+        _climb(repeated, delta, gain, climbing, structure)
+        climbing = climbing[gain[climbing] > gained * (1 + SETTINGS.accuracy)]
+        if not climbing.size:
+            break
+    _take_dyads(repeated, delta, gain, structure)
+    best = np.argmax(gain.reshape(count, batch), axis=0) * batch + np.arange(batch)
+    return WorstGain(gain[best], delta[best])
+
+
+def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockStructure) -> None:
+    """One step of those numbered `which`, in place: the first of the step lengths that raises the gain."""
+    direction = _steepest(M[which], delta[which], structure) - delta[which]
+    for step in SETTINGS.steps:
+        trial = delta[which] + step * direction
+        value = _gain(M[which], trial)
+        better = value > gain[which]
+        delta[which[better]], gain[which[better]] = trial[better], value[better]
+        which, direction = which[~better], direction[~better]
+
+
+def _take_dyads(M: Array, delta: Array, gain: Array, structure: BlockStructure) -> None:
+    """Full blocks as dyads of the gradient, which they are at a maximum: only that form is realised with constant
+    norm. In place, where the gain stays the same."""
+    steepest, dyads = _steepest(M, delta, structure), delta.copy()
+    for block, w, z in structure.slices():
+        if block.kind == "full":
+            dyads[:, w, z] = steepest[:, w, z]
+    value = _gain(M, dyads)
+    take = value >= gain * (1 - SETTINGS.dyad_loss)
+    delta[take], gain[take] = dyads[take], value[take]

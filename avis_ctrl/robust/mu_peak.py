@@ -32,6 +32,8 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
 KNOWN_SLACK = 5e-3
+# Frequencies of a curve whose bounds take long, beside those of the highest values.
+CURVE_POINTS = 40
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
 
@@ -117,7 +119,7 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
 
 def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
                     band: Interval = ALL_FREQUENCIES, slack: float = SLACK, robust: Stability | None = None,
-                    points: int = 40) -> MuPeak:
+                    points: int = CURVE_POINTS) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
     Parameters
@@ -222,6 +224,13 @@ class _Scan:
         order = np.argsort(omega)
         return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
 
+    def shown(self, structure: BlockStructure) -> _Scan:
+        """Those of the curves: of many blocks, whose lower bound takes long, a part with the highest values."""
+        if not structure.many:
+            return self
+        kept = _thinned(self.bound.beta, CURVE_POINTS)
+        return _Scan(self.omega[kept], self.bound.at(kept), self.slack)
+
     @property
     def peak(self) -> Array:
         """The frequency of the highest value, the first place to split the band, as an array."""
@@ -248,6 +257,12 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
     return np.concatenate([omega for omega, _ in seen]), [found for _, found in seen]
 
 
+def _thinned(values: Array, most: int, highest: int = 4) -> Array:
+    """Numbers of at most so many values, evenly chosen, and of the highest ones."""
+    even = np.linspace(0, values.size - 1, min(most, values.size)).round().astype(int)
+    return np.union1d(even, np.argsort(values)[-highest:])
+
+
 def _level(bounds: Array, slack: float) -> float:
     """The level to prove, above the highest bound found."""
     # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
@@ -258,7 +273,7 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
              known_upper: float | None = None, dt: float = 0.0) -> MuPeak:
     """mu_peak of a continuous system, or of the image of one sampled at dt."""
     accuracy = accuracy_of(slack)
-    scan = _Scan.of(N, structure, band, slack)
+    scan = _Scan.of(N, structure, band, slack).shown(structure)
     # One stage draws the curve; the search goes on at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
@@ -349,10 +364,9 @@ class _Reached:
         gain, delta = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
         return _Reached(omega[order], gain, delta)
 
-    def thinned(self, most: int, highest: int = 4) -> _Reached:
+    def thinned(self, most: int) -> _Reached:
         """At most so many frequencies, evenly chosen, and those of the highest gains."""
-        even = np.linspace(0, self.omega.size - 1, min(most, self.omega.size)).round().astype(int)
-        kept = np.union1d(even, np.argsort(self.gain)[-highest:])
+        kept = _thinned(self.gain, most)
         return _Reached(self.omega[kept], self.gain[kept], self.delta[kept])
 
 

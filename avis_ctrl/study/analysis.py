@@ -30,13 +30,16 @@ SLACK = 5e-3
 
 @dataclass(frozen=True)
 class AnalysisSettings:
-    """passive_slack : as `SLACK`, of the table without control if there are many blocks: no decision depends on its
-        bounds, and its narrow peaks need many intervals.
+    """loose_slack : as `SLACK`, with many blocks, where no decision depends on the bounds: of the table without
+        control, whose narrow peaks need many intervals, and of a controller that a plant of the set makes unstable.
+    passive_stability_slack : the same of the robust stability of the table without control, which is flat over
+        frequency.
     few_points : frequencies of the upper bound where only the largest gain is wanted, not its curve.
     axis_points : frequencies of the lower bound of an axis, in a band of two or three octaves.
     """
 
-    passive_slack: float = 2e-2
+    loose_slack: float = 2e-2
+    passive_stability_slack: float = 5e-2
     few_points: int = 4
     axis_points: int = 24
 
@@ -74,8 +77,10 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     low, high = design.transmissibility.band_Hz
     nominal = performance.select(slice(n_z, None), slice(n_w, None))
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
-    slack = SETTINGS.passive_slack if K is None and blocks.many else SLACK
-    robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=slack)
+    many, passive = blocks.many, K is None
+    robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks,
+                     slack=SETTINGS.passive_stability_slack if many and passive else SLACK)
+    slack = SETTINGS.loose_slack if many and (passive or robust.lower >= 1.0) else SLACK
     worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
     worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high),
                                                       slack=slack, robust=robust))
