@@ -61,8 +61,8 @@ class CoverSettings:
         little.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     first_points : number of frequencies, from half the sample rate on, at which the loop gain is computed first.
-    points, few_points : frequencies of the upper bound of the worst-case gain, for its curve, and where
-        only the largest gain is wanted.
+    points, few_points : frequencies of the upper bound of the worst-case gain, beside those of the highest gains, for
+        its curve and where none is wanted.
     """
 
     lowest: float = 1e-7
@@ -80,7 +80,7 @@ class CoverSettings:
     most: int = 6
     first_points: int = 6
     points: int = 40
-    few_points: int = 4
+    few_points: int = 0
 
 
 @dataclass(frozen=True, eq=False)

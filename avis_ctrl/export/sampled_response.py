@@ -36,7 +36,6 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import Filter, conditioning
 from avis_ctrl.robust.mu_peak import MuPeak, stability_bound, worst_case_gain
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
-from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.workers import each
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -48,13 +47,16 @@ class ResponseSettings:
     as k^-2. points, order : of the function that bounds the table's gain above half the sample rate, where it falls
     smoothly: the frequencies it is fitted to and its order. lowest : where it begins, as a fraction of half the rate:
     the intervals of the grid reach a little beyond theirs. rest : a frequency far below every pole, as a fraction of
-    half the rate, at which the gain at rest is taken: position sensors have none at zero itself."""
+    half the rate, at which the gain at rest is taken: position sensors have none at zero itself. slack : fraction by
+    which the function's bound may lie above the largest ratio found: the ratio is almost flat over frequency, where a
+    small one needs many intervals, and the images that it bounds are small."""
 
     images: int = 8
     points: int = 12
     order: int = 3
     lowest: float = 0.99
     rest: float = 1e-9
+    slack: float = 3e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,8 +317,9 @@ class SampledAxes:
         n_z, blocks = part.noutputs - whole.blocks[-1].cols, BlockStructure(whole.blocks[:-1])
         if weight is not None:
             part = append(gain(np.eye(n_z)), *[weight.inverse().system()] * (part.noutputs - n_z)) @ part
-        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=SLACK, robust=self._stability,
-                                points=self.settings.points)
+        # No curve of the gain is wanted: points 0.
+        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=self.settings.slack,
+                                robust=self._stability, points=0)
         if not (found.guaranteed and np.isfinite(found.upper)):
             raise ComputationError("the table's gain above half the sample rate is not proved", measured=found.covers)
         return found.upper

@@ -34,13 +34,13 @@ class AnalysisSettings:
         control, whose narrow peaks need many intervals, and of a controller that a plant of the set makes unstable.
     passive_stability_slack : the same of the robust stability of the table without control, which is flat over
         frequency.
-    few_points : frequencies of the upper bound where only the largest gain is wanted, not its curve.
+    few_points : frequencies of the upper bound, beside those of the highest gains, where no curve is wanted.
     axis_points : frequencies of the lower bound of an axis, in a band of two or three octaves.
     """
 
     loose_slack: float = 2e-2
     passive_stability_slack: float = 5e-2
-    few_points: int = 4
+    few_points: int = 0
     axis_points: int = 24
 
 
@@ -83,7 +83,7 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     slack = SETTINGS.loose_slack if many and (passive or robust.lower >= 1.0) else SLACK
     worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
     worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high),
-                                                      slack=slack, robust=robust))
+                                                      slack=slack, robust=robust, points=SETTINGS.few_points))
     omega = 2 * np.pi * PLOT_HZ
     return ControllerResult(
         name, title, kind, K, full.is_stable(), hinf_norm(nominal).gain,
@@ -95,22 +95,23 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         _by_slicot(nominal))
 
 
-def worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, stability: Bound | None = None
-                  ) -> np.ndarray:
-    """(n_axes,) bounds of each axis' worst-case velocity in the band, for a floor of unit velocity in any direction.
+def worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
+                  ) -> float:
+    """Bound of the worst-case velocity of an axis in the band, for a floor of unit velocity in any direction.
 
-    stability : robust stability of the loop with K; with it the bounds are upper ones, over the whole set and between
-        frequencies; without it they are lower ones, each reached by a plant.
+    axis : its number among those of the design.
+    stability : robust stability of the loop with K; with it the bound is an upper one, over the whole set and between
+        frequencies; without it a lower one, reached by a plant.
     """
     part = plant.full.restricted([*plant.floor_velocities], [*plant.velocities])
-    motion, blocks = part.closed(K), plant.synthesis.blocks
+    blocks = plant.synthesis.blocks
+    motion = part.closed(K).select([*range(blocks.n_z), blocks.n_z + axis], None)
     band = design.transmissibility.band_Hz[0] * 2 * np.pi, design.transmissibility.band_Hz[1] * 2 * np.pi
-    rows = [[*range(blocks.n_z), blocks.n_z + k] for k in range(len(plant.axes))]
     if stability is not None:
-        return np.array([worst_case_gain(motion.select(row, None), blocks, band=band, slack=SLACK, robust=stability,
-                                         points=SETTINGS.few_points).upper for row in rows])
-    M = motion.frequency_response(np.geomspace(*band, SETTINGS.axis_points))
-    return np.array([np.max(worst_gain(M[:, row], blocks).gain) for row in rows])
+        return worst_case_gain(motion, blocks, band=band, slack=SLACK, robust=stability,
+                               points=SETTINGS.few_points).upper
+    omega = np.geomspace(*band, SETTINGS.axis_points)
+    return float(np.max(worst_gain(motion.frequency_response(omega), blocks).gain))
 
 
 def _by_slicot(system: StateSpace) -> float | None:

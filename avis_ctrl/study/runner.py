@@ -19,7 +19,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import DKIteration
 from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
-from avis_ctrl.study.analysis import analyse, worst_by_axis
+from avis_ctrl.study.analysis import analyse, worst_of_axis
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design
@@ -206,7 +206,8 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
-        by_axis = workers.submit(_worst_by_axis, design, plant, mu.K, mu.stability)
+        axes = range(len(plant.axes))
+        by_axis = [workers.submit(_worst_of_axis, design, plant, k, mu.K, mu.stability) for k in axes]
         jobs = {}
         if "skyhook" in design.compare_with:
             limit = skyhook_limit(design, mu)
@@ -214,16 +215,17 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
                     workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples): "skyhook"}
         gather()
         loop = simulation.result()
-        proved = by_axis.result()
+        proved = [one.result() for one in by_axis]
         progress(f"  done: {design.simulation.random_plants + 2} nonlinear plants")
         found["mu"] = mu
         if isinstance(skyhook := found.get("skyhook"), ControllerResult) and best_of(mu, [skyhook]) is not mu:
             found["mu"] = mu = best_of(mu, [skyhook])
-            loop, proved = simulate_study(design, rig, plant, mu), _worst_by_axis(design, plant, mu.K, mu.stability)
-        rival = np.full(len(plant.axes), np.nan)
+            loop = simulate_study(design, rig, plant, mu)
+            proved = [_worst_of_axis(design, plant, k, mu.K, mu.stability) for k in axes]
+        rival = [np.nan for _ in axes]
         if isinstance(skyhook, ControllerResult):
             stable = np.isfinite(skyhook.worst_peak.upper)
-            rival = _worst_by_axis(design, plant, skyhook.K) if stable else np.full(len(plant.axes), np.inf)
+            rival = [_worst_of_axis(design, plant, k, skyhook.K) if stable else np.inf for k in axes]
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
@@ -231,14 +233,14 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
                 for name, one in found.items() if isinstance(one, ControllerResult)}
     return Compared(tuple(measured[name] for name in ORDER if name in measured),
                     tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop,
-                    tuple(AxisGain(axis, float(mine), float(its)) for axis, mine, its in
+                    tuple(AxisGain(axis, mine, its) for axis, mine, its in
                           zip(plant.axes, proved, rival, strict=True)))
 
 
-def _worst_by_axis(design: Design, plant: DesignPlant, K: StateSpace | None, stability: Bound | None = None
-                   ) -> np.ndarray:
+def _worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
+                   ) -> float:
     with threadpool_limits(1):
-        return worst_by_axis(design, plant, K, stability)
+        return worst_of_axis(design, plant, axis, K, stability)
 
 
 def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray
