@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.export.bounds import bounds, gain_above_in_words
+from avis_ctrl.export.bounds import StabilityNotProvedError, bounds, gain_above_in_words
 from avis_ctrl.export.design_folder import DesignFolder
 from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import SampledController
@@ -81,11 +81,16 @@ def certify(folder: DesignFolder, controller: SampledController, progress: Progr
         loop = shipped_loop(folder, controller)
         progress("stability of all axes and rounding noise")
         noise = rounding_noise(controller, loop)
+        # Eigenvalues take seconds, bounds minutes.
+        unstable = _unstable(_sampled_plants(folder, loop, settings))
+        if only_stable and unstable:
+            raise StabilityNotProvedError("; ".join(unstable))
         progress("bounds over the whole uncertainty set, from the exported numbers")
         found = bounds(axes, only_stable)
         worst = worst_transmissibility(axes, found)
         lower = mu_lower(axes, found)
-        unstable = _unstable(folder, loop, worst, settings)
+        unstable += _unstable([("worst case", with_delta(folder.rig, folder.plant, loop, "worst case", worst.delta,
+                                                         worst.omega))])
     bounded = (found.mu, found.peak, found.band)
     unproved = tuple(one.covers for one in bounded if not (one.guaranteed and np.isfinite(one.upper)))
     if not found.gain_above < 1:
@@ -104,18 +109,21 @@ def certify(folder: DesignFolder, controller: SampledController, progress: Progr
     return Certificate(content, loop, worst, (*unstable, *unproved))
 
 
-def _unstable(folder: DesignFolder, nominal: SampledLoop, worst: WorstPlant, settings: StabilitySettings
-              ) -> tuple[str, ...]:
-    """The plants of all axes whose sampled linear loop with the emitted numbers is not stable, in words."""
+def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: StabilitySettings
+                    ) -> list[tuple[str, SampledLoop]]:
+    """Loops of all axes with the emitted numbers, by name: the nominal one at several gains, and random plants."""
     K = nominal.digital
     assert K is not None
     rng = np.random.default_rng((folder.design.simulation.seed, 3))
-    deltas = [("worst case", worst.delta, worst.omega)]
-    deltas += [(f"random plant {k}", delta, 2 * np.pi * 10 ** rng.uniform(0.0, 2.0)) for k, delta in enumerate(
-        random_perturbations(folder.plant, settings.plants, folder.design.simulation.seed), 1)]
-    loops = [(f"nominal, gain {g:.0%}", replace(nominal, digital=_scaled(K, g))) for g in settings.gains]
-    loops += [(name, with_delta(folder.rig, folder.plant, nominal, name, delta, omega))
-              for name, delta, omega in deltas]
+    deltas = random_perturbations(folder.plant, settings.plants, folder.design.simulation.seed)
+    return [*((f"nominal, gain {g:.0%}", replace(nominal, digital=_scaled(K, g))) for g in settings.gains),
+            *((name := f"random plant {k}", with_delta(folder.rig, folder.plant, nominal, name, delta,
+                                                       2 * np.pi * 10 ** rng.uniform(0.0, 2.0)))
+              for k, delta in enumerate(deltas, 1))]
+
+
+def _unstable(loops: Sequence[tuple[str, SampledLoop]]) -> tuple[str, ...]:
+    """Those of the sampled linear loops that are not stable, in words."""
     radii = [(name, spectral_radius(loop)) for name, loop in loops]
     return tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii if not radius < 1)
 
