@@ -112,20 +112,21 @@ def certify(folder: DesignFolder, controller: SampledController, progress: Progr
 def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: StabilitySettings
                     ) -> list[tuple[str, SampledLoop]]:
     """Loops of all axes with the emitted numbers, by name: the nominal one at several gains, and random plants."""
-    K = nominal.digital
+    K, rng = nominal.digital, np.random.default_rng((folder.design.simulation.seed, 3))
     assert K is not None
-    rng = np.random.default_rng((folder.design.simulation.seed, 3))
+    loops = [(f"nominal, gain {g:.0%}", replace(nominal, digital=_scaled(K, g))) for g in settings.gains]
     deltas = random_perturbations(folder.plant, settings.plants, folder.design.simulation.seed)
-    return [*((f"nominal, gain {g:.0%}", replace(nominal, digital=_scaled(K, g))) for g in settings.gains),
-            *((name := f"random plant {k}", with_delta(folder.rig, folder.plant, nominal, name, delta,
-                                                       2 * np.pi * 10 ** rng.uniform(0.0, 2.0)))
-              for k, delta in enumerate(deltas, 1))]
+    for name, delta in zip((f"random plant {k}" for k in range(1, len(deltas) + 1)), deltas, strict=True):
+        omega = 2 * np.pi * 10 ** rng.uniform(0.0, 2.0)
+        loops.append((name, with_delta(folder.rig, folder.plant, nominal, name, delta, omega)))
+    return loops
 
 
-def _unstable(loops: Sequence[tuple[str, SampledLoop]]) -> tuple[str, ...]:
-    """Those of the sampled linear loops that are not stable, in words."""
-    radii = [(name, spectral_radius(loop)) for name, loop in loops]
-    return tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii if not radius < 1)
+def _unstable(loops: Sequence[tuple[str, SampledLoop]], most: int = 3) -> tuple[str, ...]:
+    """Those of the sampled linear loops that are not stable, in words: so many of them, and the number of the others."""
+    radii = [(name, radius) for name, loop in loops if not (radius := spectral_radius(loop)) < 1]
+    found = tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii[:most])
+    return (*found, f"{len(radii) - most} more of {len(loops)} loops unstable") if len(radii) > most else found
 
 
 def _scaled(K: StateSpace, gain: float) -> StateSpace:

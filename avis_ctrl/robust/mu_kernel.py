@@ -6,6 +6,7 @@ For V = [I  M^H], K(theta) = sum_k theta_k K_k given by its entries, F = V K V^H
     d2(-log det F) = tr(T K_k T K_l) = sum over the entries of v_i v_j T[c_i, r_j] T[c_j, r_i].
 
 Matrices are small and each problem needs its own number of steps: plain loops are several times faster than stacks.
+Only the Newton step itself, with up to hundreds of parameters, is left to LAPACK.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ class PathSettings(NamedTuple):
 
 
 SETTINGS = PathSettings()
-
 
 class Entries(NamedTuple):
     """Non-zero entries of the matrices K_k: place, value, parameter k, and 1.0 where lambda multiplies the entry."""
@@ -106,19 +106,27 @@ def _residual(M, K):
 
 @njit(cache=True)
 def _add_derivatives(T, entries, lam, gradient, hessian):
-    """Subtract tr(T K_k) from the gradient and add tr(T K_k T K_l) to the Hessian."""
+    """Subtract tr(T K_k) from the gradient and add tr(T K_k T K_l), l <= k, to the Hessian's lower triangle.
+
+    The entries are in the order of their parameters. All matrices are Hermitian: an entry of K_k below the diagonal
+    adds the conjugate of what the one above adds.
+    """
     n = entries.row.size
     v = np.empty(n, np.complex128)
     for i in range(n):
         v[i] = entries.value[i] * (lam if entries.on_level[i] else 1.0)
     for i in range(n):
         p, r, c = entries.parameter[i], entries.row[i], entries.col[i]
-        gradient[p] -= (v[i] * T[c, r]).real
-        for j in range(i + 1):
-            both = v[i] * v[j] * T[c, entries.row[j]] * T[entries.col[j], r]
-            hessian[p, entries.parameter[j]] += both.real
-            if j < i:
-                hessian[entries.parameter[j], p] += both.real
+        if r > c:
+            continue
+        twice = v[i] if r == c else 2.0 * v[i]
+        gradient[p] -= (twice * T[c, r]).real
+        of_c, of_r = twice * T[c], np.conj(T[r])
+        for j in range(n):
+            q = entries.parameter[j]
+            if q > p:
+                break
+            hessian[p, q] += (v[j] * of_c[entries.row[j]] * of_r[entries.col[j]]).real
 
 
 @njit(cache=True)
@@ -154,36 +162,9 @@ def _add_slope(T, K, entries, lam, slope):
 
 
 @njit(cache=True)
-def _solve(A, b):
-    """Solution of A x = b by elimination with pivots, in place of b; NaN where A is singular."""
-    n = b.size
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(A[i, k]) > abs(A[pivot, k]):
-                pivot = i
-        if not abs(A[pivot, k]) > 0.0:
-            for i in range(n):
-                b[i] = np.nan
-            return
-        if pivot != k:
-            for j in range(n):
-                A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
-            b[k], b[pivot] = b[pivot], b[k]
-        for i in range(k + 1, n):
-            factor = A[i, k] / A[k, k]
-            for j in range(k + 1, n):
-                A[i, j] -= factor * A[k, j]
-            b[i] -= factor * b[k]
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            b[k] -= A[k, j] * b[j]
-        b[k] /= A[k, k]
-
-
-@njit(cache=True)
 def _newton(hessian, right, is_g):
-    """-inv(hessian) right with unit-diagonal scaling; ridges of round-off size where it is singular.
+    """-inv(hessian) right, of the hessian's lower triangle, with unit-diagonal scaling; ridges of round-off size where
+    it is singular.
 
     A G that multiplies a real entry of M has no effect and no curvature: its ridge is measured against the
     largest curvature, so that round-off does not drive it away.
@@ -197,13 +178,12 @@ def _newton(hessian, right, is_g):
         d[i] = 1.0 / np.sqrt(max(hessian[i, i] + (1e-11 * top if is_g[i] else 0.0), 1e-300))
     for i in range(n):
         b[i] = -d[i] * right[i]
-        for j in range(n):
-            A[i, j] = hessian[i, j] * d[i] * d[j]
-        A[i, i] += 1e-13 + (1e-11 * top * d[i] ** 2 if is_g[i] else 0.0)
-    _solve(A, b)
-    for i in range(n):
-        b[i] *= d[i]
-    return b
+        for j in range(i):
+            A[i, j] = A[j, i] = hessian[i, j] * d[i] * d[j]
+        A[i, i] = hessian[i, i] * d[i] ** 2 + 1e-13 + (1e-11 * top * d[i] ** 2 if is_g[i] else 0.0)
+    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
+        return np.full(n, np.nan)
+    return d * np.linalg.solve(A, b)
 
 
 @njit(cache=True)

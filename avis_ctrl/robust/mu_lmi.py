@@ -58,8 +58,11 @@ class LinearForm:
         return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
 
     def entries(self, on_level: Array) -> Entries:
-        """The entries as the compiled code takes them; `on_level` marks those that lambda multiplies."""
-        return Entries(self.row, self.col, self.value, self.parameter, on_level, self.size)
+        """The entries as the compiled code takes them, in the order of their parameters; `on_level` marks those that
+        lambda multiplies."""
+        order = np.argsort(self.parameter, kind="stable")
+        return Entries(self.row[order], self.col[order], self.value[order], self.parameter[order], on_level[order],
+                       self.size)
 
 
 @dataclass(frozen=True)
