@@ -123,7 +123,7 @@ def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: Stabil
 
 
 def _unstable(loops: Sequence[tuple[str, SampledLoop]], most: int = 3) -> tuple[str, ...]:
-    """Those of the sampled linear loops that are not stable, in words: so many of them, and the number of the others."""
+    """Sampled linear loops that are not stable, in words: at most so many, and the number of the others."""
     radii = [(name, radius) for name, loop in loops if not (radius := spectral_radius(loop)) < 1]
     found = tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii[:most])
     return (*found, f"{len(radii) - most} more of {len(loops)} loops unstable") if len(radii) > most else found

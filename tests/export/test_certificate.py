@@ -304,9 +304,9 @@ def test_a_proof_that_cannot_succeed_ends_before_the_bounds_that_take_minutes(sh
         bounds(SampledAxes.of(folder, folder.sampled("direct")), True)
     monkeypatch.setattr("avis_ctrl.export.certificate.rounding_noise", lambda *arguments: np.zeros(6))
     monkeypatch.setattr("avis_ctrl.export.package.choose_anti_windup", None)
-    with pytest.raises(ComputationError, match=r"'direct' is not proved stable; nothing was written; measured: nominal, "
-                                               r"gain 10%: spectral radius 1\.0.*; 27 more of 30 loops unstable; next: try "
-                                               r"a larger --order"):
+    with pytest.raises(ComputationError, match=r"'direct' is not proved stable; nothing was written; measured: "
+                                               r"nominal, gain 10%: spectral radius 1\.0.*; 27 more of 30 loops "
+                                               r"unstable; next: try a larger --order"):
         make_package(folder, "direct")
 
 
