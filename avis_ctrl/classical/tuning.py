@@ -17,6 +17,7 @@ import numpy as np
 import scipy.optimize as so
 
 from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.lti.norms import largest_singular_value
 from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 
@@ -274,16 +275,6 @@ def _minimax_step(values: np.ndarray, slopes: np.ndarray, in_band: np.ndarray, l
                          b_ub=np.r_[log_limit - values, -values[in_band]],
                          bounds=[*zip(low, high, strict=True), (0, None), (None, None)], method="highs-ds")
     return program.x[:n] if program.status == 0 else np.zeros(n)
-
-
-def largest_singular_value(T: np.ndarray) -> np.ndarray:
-    """sigma_max of each matrix, quicker than by a singular value decomposition of each; in closed form for 2 x 2."""
-    if T.shape[-2:] != (2, 2):
-        # The largest eigenvalue of T^H T is accurate to round-off, unlike the small ones.
-        return np.sqrt(np.maximum(np.linalg.eigvalsh(np.conj(np.swapaxes(T, -1, -2)) @ T)[..., -1], 0.0))
-    square = np.sum(np.abs(T) ** 2, axis=(-2, -1))
-    product = np.abs(T[..., 0, 0] * T[..., 1, 1] - T[..., 0, 1] * T[..., 1, 0])
-    return np.sqrt((square + np.sqrt(np.maximum(square ** 2 - 4 * product ** 2, 0.0))) / 2)
 
 
 def encirclements(return_difference: np.ndarray) -> float:

@@ -61,8 +61,8 @@ class CoverSettings:
         little.
     most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
     first_points : number of frequencies, from half the sample rate on, at which the loop gain is computed first.
-    points, few_points : frequencies of the upper bound of the worst-case gain, beside those of the highest gains, for
-        its curve and where none is wanted.
+    points, few_points : number of frequencies at which the worst-case gain is bounded from above, in addition to those
+        of the highest gains: `points` for its curve, `few_points` where none is wanted.
     """
 
     lowest: float = 1e-7
@@ -261,8 +261,8 @@ def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> f
 
 def _gain_above_at_least(axes: SampledAxes, K: StateSpace, least: float, W_a: Rational, settings: CoverSettings
                          ) -> float:
-    """A lower bound of `_gain_above`, up to the accuracy SLACK of both: at some of its frequencies, with the nearest
-    image only, at half the rate."""
+    """A lower bound of `_gain_above`, up to the accuracy of the optimised bounds: at some of its frequencies, with the
+    nearest image only, at half the rate."""
     omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
     omega = omega[::(settings.intervals - 1) // (settings.first_points - 1)]
     table = axes.force_to_seen_at(omega)

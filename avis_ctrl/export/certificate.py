@@ -81,7 +81,7 @@ def certify(folder: DesignFolder, controller: SampledController, progress: Progr
         loop = shipped_loop(folder, controller)
         progress("stability of all axes and rounding noise")
         noise = rounding_noise(controller, loop)
-        # Eigenvalues take seconds, bounds minutes.
+        # Eigenvalues take seconds, the bounds minutes: first the eigenvalues.
         unstable = _unstable(_sampled_plants(folder, loop, settings))
         if only_stable and unstable:
             raise StabilityNotProvedError("; ".join(unstable))
@@ -123,10 +123,10 @@ def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: Stabil
 
 
 def _unstable(loops: Sequence[tuple[str, SampledLoop]], most: int = 3) -> tuple[str, ...]:
-    """Sampled linear loops that are not stable, in words: at most so many, and the number of the others."""
+    """At most `most` of the unstable loops in words, and how many more there are."""
     radii = [(name, radius) for name, loop in loops if not (radius := spectral_radius(loop)) < 1]
     found = tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii[:most])
-    return (*found, f"{len(radii) - most} more of {len(loops)} loops unstable") if len(radii) > most else found
+    return (*found, f"and {len(radii) - most} more of the {len(loops)} loops") if len(radii) > most else found
 
 
 def _scaled(K: StateSpace, gain: float) -> StateSpace:

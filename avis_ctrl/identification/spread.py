@@ -22,6 +22,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.lti.norms import largest_singular_value
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.response import SPANNED
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
@@ -132,17 +133,6 @@ def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence
     noise = _noise_quantile(_covariance(measured, rows, columns, left, A), len(keep), measured.dof, confidences,
                             seed)
     return FrfSpread(tuple(keep), measured.frequency_Hz, largest_singular_value(L), noise, tuple(confidences))
-
-
-def largest_singular_value(L: np.ndarray) -> np.ndarray:
-    """Of matrices (..., k, k); for k up to 2 in closed form."""
-    if L.shape[-1] == 1:
-        return np.abs(L[..., 0, 0])
-    if L.shape[-1] == 2:
-        total = np.sum(np.abs(L) ** 2, axis=(-2, -1))
-        determinant = np.abs(L[..., 0, 0] * L[..., 1, 1] - L[..., 0, 1] * L[..., 1, 0])
-        return np.sqrt((total + np.sqrt(np.maximum(total ** 2 - 4 * determinant ** 2, 0.0))) / 2)
-    return np.linalg.norm(L, ord=2, axis=(-2, -1))
 
 
 def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, keep: Sequence[str]

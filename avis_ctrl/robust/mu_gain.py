@@ -22,8 +22,8 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 @dataclass(frozen=True)
 class GainSettings:
     """steps : lengths of a step towards the steepest Delta, tried in this order.
-    accuracy : relative rise of the gain in a step that is worth another one.
-    dyad_loss : relative loss of gain for which a full block becomes a dyad.
+    accuracy : an ascent ends when a step raises the gain by less than this fraction.
+    dyad_loss : relative loss of gain that is accepted for a dyad in place of a full block.
     """
 
     steps: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
@@ -82,7 +82,8 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
     rng = np.random.default_rng(seed)
     batch, size = M.shape[0], (structure.n_w, structure.n_z)
     drawn = [structure.random(rng) for _ in range((count - 1) * batch)]
-    delta = np.concatenate([np.zeros((batch, *size), complex), np.reshape(drawn, (-1, *size))])
+    delta = np.concatenate([np.zeros((batch, *size), complex),
+                            np.array(drawn, complex).reshape((count - 1) * batch, *size)])
     repeated = np.concatenate([M] * count)
     gain = _gain(repeated, delta)
     climbing = np.arange(gain.size)
@@ -98,7 +99,7 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
 
 
 def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockStructure) -> None:
-    """One step of those numbered `which`, in place: the first of the step lengths that raises the gain."""
+    """One step of the problems `which`, in place: the first of the step lengths that raises the gain."""
     direction = _steepest(M[which], delta[which], structure) - delta[which]
     for step in SETTINGS.steps:
         trial = delta[which] + step * direction
@@ -110,7 +111,7 @@ def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockSt
 
 def _take_dyads(M: Array, delta: Array, gain: Array, structure: BlockStructure) -> None:
     """Full blocks as dyads of the gradient, which they are at a maximum: only that form is realised with constant
-    norm. In place, where the gain stays the same."""
+    norm. In place, where the gain falls by at most `dyad_loss`."""
     steepest, dyads = _steepest(M, delta, structure), delta.copy()
     for block, w, z in structure.slices():
         if block.kind == "full":

@@ -37,6 +37,7 @@ class PathSettings(NamedTuple):
 
 SETTINGS = PathSettings()
 
+
 class Entries(NamedTuple):
     """Non-zero entries of the matrices K_k: place, value, parameter k, and 1.0 where lambda multiplies the entry."""
 
@@ -108,8 +109,8 @@ def _residual(M, K):
 def _add_derivatives(T, entries, lam, gradient, hessian):
     """Subtract tr(T K_k) from the gradient and add tr(T K_k T K_l), l <= k, to the Hessian's lower triangle.
 
-    The entries are in the order of their parameters. All matrices are Hermitian: an entry of K_k below the diagonal
-    adds the conjugate of what the one above adds.
+    The entries are in the order of their parameters. All matrices are Hermitian, so that only entries on and above the
+    diagonal of K_k are visited; those below add the conjugate.
     """
     n = entries.row.size
     v = np.empty(n, np.complex128)
@@ -163,8 +164,8 @@ def _add_slope(T, K, entries, lam, slope):
 
 @njit(cache=True)
 def _newton(hessian, right, is_g):
-    """-inv(hessian) right, of the hessian's lower triangle, with unit-diagonal scaling; ridges of round-off size where
-    it is singular.
+    """-inv(hessian) right, with unit-diagonal scaling; ridges of round-off size where it is singular. Only the lower
+    triangle of the hessian is read. NaN where it is not finite.
 
     A G that multiplies a real entry of M has no effect and no curvature: its ridge is measured against the
     largest curvature, so that round-off does not drive it away.
@@ -181,9 +182,10 @@ def _newton(hessian, right, is_g):
         for j in range(i):
             A[i, j] = A[j, i] = hessian[i, j] * d[i] * d[j]
         A[i, i] = hessian[i, i] * d[i] ** 2 + 1e-13 + (1e-11 * top * d[i] ** 2 if is_g[i] else 0.0)
-    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
+    try:
+        return d * np.linalg.solve(A, b)
+    except Exception:  # singular to machine precision, or not finite
         return np.full(n, np.nan)
-    return d * np.linalg.solve(A, b)
 
 
 @njit(cache=True)

@@ -37,7 +37,7 @@ class LinearForm:
     """A Hermitian matrix linear in real parameters, K(theta) = sum_k theta_k K_k, by its non-zero entries."""
 
     def __init__(self, size: int, parameters: int, entries: list[tuple[int, int, complex, int]]):
-        order = sorted(entries, key=lambda entry: entry[3])
+        order = sorted(entries, key=lambda entry: entry[3])  # the compiled code relies on it
         self.size, self.parameters = size, parameters
         self.row = np.array([e[0] for e in order], int)
         self.col = np.array([e[1] for e in order], int)
@@ -58,11 +58,8 @@ class LinearForm:
         return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
 
     def entries(self, on_level: Array) -> Entries:
-        """The entries as the compiled code takes them, in the order of their parameters; `on_level` marks those that
-        lambda multiplies."""
-        order = np.argsort(self.parameter, kind="stable")
-        return Entries(self.row[order], self.col[order], self.value[order], self.parameter[order], on_level[order],
-                       self.size)
+        """The entries as the compiled code takes them; `on_level` marks those that lambda multiplies."""
+        return Entries(self.row, self.col, self.value, self.parameter, on_level, self.size)
 
 
 @dataclass(frozen=True)

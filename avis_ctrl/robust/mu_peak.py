@@ -32,7 +32,7 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
 KNOWN_SLACK = 5e-3
-# Frequencies of a curve whose bounds take long, beside those of the highest values.
+# Frequencies of a curve whose bounds take long, in addition to those of the highest values.
 CURVE_POINTS = 40
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
@@ -46,7 +46,8 @@ class MuPeak(Shown):
     delta : (n_w, n_z). For mu_peak ||delta|| = 1/lower and I - N(j omega) delta is singular; for worst_case_gain
         (first blocks only) ||delta|| <= 1. None where there is none (lower 0).
     covers : in words, what the upper bound covers.
-    frequencies, upper_curve, lower_curve : (n,) [rad/s] and both bounds there, for plotting.
+    frequencies, upper_curve, lower_curve : (n,) [rad/s] and both bounds there, for plotting; about 40 frequencies with
+        many blocks.
     """
 
     upper: float
@@ -225,7 +226,8 @@ class _Scan:
         return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
 
     def shown(self, structure: BlockStructure) -> _Scan:
-        """Those of the curves: of many blocks, whose lower bound takes long, a part with the highest values."""
+        """What the curves show: with many blocks, whose lower bounds take long, only some frequencies, those of the
+        highest values among them."""
         if not structure.many:
             return self
         kept = _thinned(self.bound.beta, CURVE_POINTS)
@@ -258,7 +260,7 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
 
 
 def _thinned(values: Array, most: int, highest: int = 4) -> Array:
-    """Numbers of at most so many values, evenly chosen, and of the highest ones."""
+    """Indices of at most `most` values, evenly spaced, and of the `highest` largest ones."""
     even = np.linspace(0, values.size - 1, min(most, values.size)).round().astype(int)
     return np.union1d(even, np.argsort(values)[-highest:])
 

@@ -186,7 +186,20 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
     r_w, r_z = robust.n_w, robust.n_z
     if not r_w:
         return upper_bound(M, structure, tolerance)
-    batch = M.shape[0]
+    # In units of its own size, so that the search does not depend on those of the performance channel.
+    unit = np.max(np.linalg.norm(M[:, :, r_z:], axis=(2, 3)), axis=1)
+    unit = np.where(unit > 0, unit, 1.0)
+    scale = np.ones((M.shape[0], structure.n_z))
+    scale[:, r_z:] /= unit[:, None]
+    beta, (X_z, X_w, G) = _skewed(M * scale[:, None, :, None], structure, robust, tolerance)
+    X_z[:, r_z:, r_z:] /= unit[:, None, None] ** 2
+    X_w[:, r_w:, r_w:] /= unit[:, None, None] ** 2
+    return UpperBound(unit * beta, Scalings(X_z, X_w, G))
+
+
+def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, tolerance: float) -> UpperBound:
+    """`skewed_upper_bound` of a performance channel near one in size."""
+    batch, r_w, r_z = M.shape[0], robust.n_w, robust.n_z
     beta = np.full(batch, np.inf)
     found = Scalings(*(np.zeros((batch, *shape), complex) for shape in
                        ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))))

@@ -30,15 +30,15 @@ SLACK = 5e-3
 
 @dataclass(frozen=True)
 class AnalysisSettings:
-    """loose_slack : as `SLACK`, with many blocks, where no decision depends on the bounds: of the table without
-        control, whose narrow peaks need many intervals, and of a controller that a plant of the set makes unstable.
-    passive_stability_slack : the same of the robust stability of the table without control, which is flat over
-        frequency.
-    few_points : frequencies of the upper bound, beside those of the highest gains, where no curve is wanted.
+    """passive_slack : replaces `SLACK` for the worst-case gains of the table without control if there are many blocks:
+        its narrow peaks need many intervals. passive_stability_slack : the same for its robust stability, where mu is
+        flat over frequency.
+    few_points : number of frequencies at which the worst-case gain is bounded from above, in addition to those of the
+        highest gains, where no curve is drawn.
     axis_points : frequencies of the lower bound of an axis, in a band of two or three octaves.
     """
 
-    loose_slack: float = 2e-2
+    passive_slack: float = 2e-2
     passive_stability_slack: float = 5e-2
     few_points: int = 0
     axis_points: int = 24
@@ -77,17 +77,17 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     low, high = design.transmissibility.band_Hz
     nominal = performance.select(slice(n_z, None), slice(n_w, None))
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
-    many, passive = blocks.many, K is None
+    loose = K is None and blocks.many
     robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks,
-                     slack=SETTINGS.passive_stability_slack if many and passive else SLACK)
-    slack = SETTINGS.loose_slack if many and (passive or robust.lower >= 1.0) else SLACK
+                     slack=SETTINGS.passive_stability_slack if loose else SLACK)
+    slack = SETTINGS.passive_slack if loose else SLACK
     worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
     worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high),
                                                       slack=slack, robust=robust, points=SETTINGS.few_points))
     omega = 2 * np.pi * PLOT_HZ
     return ControllerResult(
         name, title, kind, K, full.is_stable(), hinf_norm(nominal).gain,
-        bound(plant, blocks, mu_peak(performance, all_blocks, slack=slack)),
+        bound(plant, blocks, mu_peak(performance, all_blocks, slack=SLACK)),
         bound(plant, blocks, robust),
         worst_peak, worst_band, transmissibility(motion, blocks, samples, omega),
         _compliance(plant, full, omega), site_response(plant, full, K is not None, design.floor.band_Hz),

@@ -15,7 +15,6 @@ from avis_ctrl.classical.tuning import (
     Search,
     TuningRange,
     encirclements,
-    largest_singular_value,
 )
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rig_file import load_rig
@@ -93,15 +92,6 @@ def test_samples_lie_on_the_boundary_of_the_set(plant, scenarios):
             else:
                 sizes = [np.linalg.norm(np.atleast_2d(value), 2) for value in over_frequency]
                 np.testing.assert_allclose(sizes, 1.0, rtol=1e-12)
-
-
-def test_largest_singular_value_in_closed_form(rng):
-    T = rng.standard_normal((50, 3, 2, 2)) + 1j * rng.standard_normal((50, 3, 2, 2))
-    T[0] = 0.0
-    T[1, :, 1] = T[1, :, 0]  # rank one
-    np.testing.assert_allclose(largest_singular_value(T), np.linalg.svd(T, compute_uv=False)[..., 0], rtol=1e-7)
-    other = rng.standard_normal((5, 3, 3))
-    np.testing.assert_allclose(largest_singular_value(other), np.linalg.svd(other, compute_uv=False)[:, 0], rtol=1e-12)
 
 
 def test_encirclements_tell_stable_from_unstable(plant, scenarios, critical, rng):

@@ -11,7 +11,7 @@ from exact import floor_velocity, record
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.model_error import measured_response, unexplained
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spread import FrfSpread, frf_spread, kept_axes, largest_singular_value
+from avis_ctrl.identification.spread import FrfSpread, frf_spread, kept_axes
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
@@ -45,12 +45,6 @@ def noisy(model, frequency_Hz, level, rng, error=None) -> FrequencyResponse:
     value = G + root @ Z @ np.linalg.inv(W)
     spread = [np.broadcast_to(X.astype(complex), (n, *X.shape)) for X in (C, S)]
     return FrequencyResponse(frequency_Hz, value, spread[0], spread[1], model.actuators, model.sensors.names)
-
-
-def test_the_largest_singular_value_in_closed_form(rng):
-    for k in (1, 2, 3):
-        L = rng.normal(size=(50, k, k)) + 1j * rng.normal(size=(50, k, k))
-        assert np.allclose(largest_singular_value(L), np.linalg.svd(L, compute_uv=False)[:, 0], rtol=1e-12)
 
 
 @pytest.mark.parametrize("played", ["axes", "without a drive"])

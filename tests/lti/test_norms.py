@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, discretise, gain, h2_norm, hinf_norm, tf
-from avis_ctrl.lti.norms import norm_is_below
+from avis_ctrl.lti.norms import largest_singular_value, norm_is_below
 
 
 def random_stable(rng, n, n_y, n_u, direct=1.0, margin=None):
@@ -104,3 +104,18 @@ def test_a_response_beyond_all_numbers_is_said():
     """1e20 / 1e-300 at rest."""
     with np.errstate(all="ignore"), pytest.raises(ComputationError, match="overflows"):
         hinf_norm(StateSpace([[-1e-300]], [[1e10]], [[1e10]], [[0.0]]))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 2), (3, 3), (2, 5), (7, 4)])
+@pytest.mark.parametrize("size", [1.0, 1e-200, 1e200])
+def test_largest_singular_value_is_that_of_the_decomposition(rng, shape, size):
+    M = size * (rng.standard_normal((20, 3, *shape)) + 1j * rng.standard_normal((20, 3, *shape)))
+    M[0] = 0.0
+    M[1, :, -1] = M[1, :, 0]
+    np.testing.assert_allclose(largest_singular_value(M), np.linalg.svd(M, compute_uv=False)[..., 0], rtol=1e-7)
+    np.testing.assert_allclose(largest_singular_value(M[2:]), np.linalg.svd(M[2:], compute_uv=False)[..., 0],
+                               rtol=1e-13)
+
+
+def test_a_matrix_without_entries_has_no_gain():
+    assert np.array_equal(largest_singular_value(np.zeros((4, 3, 0))), np.zeros(4))

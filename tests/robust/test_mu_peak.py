@@ -19,9 +19,10 @@ from avis_ctrl.lti import (
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_cover import cover
+from avis_ctrl.robust.mu_lmi import residual
 from avis_ctrl.robust.mu_peak import mu_peak, stability_bound, worst_case_gain
 from avis_ctrl.robust.mu_realise import realise_delta
-from avis_ctrl.robust.mu_upper import upper_bound
+from avis_ctrl.robust.mu_upper import skewed_upper_bound, upper_bound
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
 
 C, R, F = ComplexScalar, RealScalar, ComplexFull
@@ -444,3 +445,26 @@ def test_a_known_robust_stability_changes_no_bound(rng):
     assert quick.guaranteed and robust.lower <= quick.upper < 1
     assert worst_case_gain(N, blocks, robust=quick).upper == pytest.approx(worst_case_gain(N, blocks).upper, rel=2e-3)
     assert failing.lower == pytest.approx(unstable.lower, rel=1e-3) and failing.lower > 1
+
+
+def test_worst_case_gain_without_uncertainty_is_the_norm():
+    found = worst_case_gain(tf([2.0], [1.0, 1.0]), [])
+    assert 2.0 <= found.upper <= 2.002 and found.lower == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("units", [1e-6, 1.0, 1e6])
+def test_the_worst_case_gain_does_not_depend_on_the_units_of_its_output(units):
+    """m/(N s) of a table is 1e-6 in size; mm/(N s) is not."""
+    rng = np.random.default_rng(3)
+    M = rng.standard_normal((6, 1, 7, 7)) + 1j * rng.standard_normal((6, 1, 7, 7))
+    M[:, :, :4, :4] *= 0.15
+    blocks = BlockStructure.of([RealScalar(2), RealScalar(), ComplexScalar()])
+    whole = blocks.with_performance(3, 3)
+    scaled = M.copy()
+    scaled[:, :, 4:] *= units
+    beta, scalings = skewed_upper_bound(scaled, whole)
+    np.testing.assert_allclose(beta / units, skewed_upper_bound(M, whole).beta, rtol=1e-4)
+    # The scalings prove the bound in the units of the caller.
+    level = np.arange(7) >= 4
+    least = np.linalg.eigvalsh(residual(scaled, scalings, (beta * (1 + 1e-6)) ** 2, level)[:, 0])[:, 0]
+    assert np.all(least > -1e-9 * np.linalg.norm(scalings.X_w, axis=(1, 2)))
