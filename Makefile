@@ -5,7 +5,7 @@ BIN = .venv/bin
 export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
-.PHONY: test test-slow demo docs gallery lint bench clean
+.PHONY: install test test-slow demo docs gallery lint bench clean
 
 $(BIN)/.installed: pyproject.toml constraints.txt
 	@echo "Installing into .venv: a minute or two"
@@ -14,6 +14,8 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 	@echo "Compiling the numerical kernels once, and checking that all works here"
 	$(BIN)/avis doctor
 	touch $@
+
+install: $(BIN)/.installed
 
 lint: $(BIN)/.installed
 	$(BIN)/ruff check .

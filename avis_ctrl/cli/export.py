@@ -52,13 +52,16 @@ def export(
     if order is not None and order < 1:
         raise InputError("expected a whole number, 1 or more", field="--order", value=order)
     if mu_at_most is not None and not (order is not None and mu_at_most > 0):
-        raise InputError("expected a positive number beside --order", field="--mu-at-most", value=mu_at_most)
+        raise InputError("expected a positive number, and only together with --order", field="--mu-at-most",
+                         value=mu_at_most)
     folder = open_design(design_dir)
     if check:
         with Progress(console) as progress:
             wrong = check_package(folder, out, progress, controller)
         if wrong:
-            raise InputError("; ".join(wrong), file=out)
+            raise InputError(f"{len(wrong)} {'difference' if len(wrong) == 1 else 'differences'}: "
+                             f"{'; '.join(wrong[:2])}{'; and others, listed above' if len(wrong) > 2 else ''}. Export "
+                             "the controller again", file=out)
         console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
     controller = controller or "mu"

@@ -55,11 +55,11 @@ def sweep(
             def progress(done: int, total: int, text: str) -> None:
                 bar.update(shown, completed=done, total=total)
                 if text or not console.is_terminal:
-                    console.print(f"[dim]{done} of {total}[/]", *([text] if text else []), soft_wrap=True)
+                    console.print(f"[dim]{done} of {total}[/]" + (f": {text}" if text else ""), soft_wrap=True)
             try:
                 found = run_sweep(plan, backend, progress)
             except KeyboardInterrupt:
-                console.print("Finished points are kept; the same command goes on where it was.")
+                console.print("Finished points are kept: the same command computes the others.")
                 raise
         files = write_sweep(found, folder)
     rows, front = found.rows, front_of(found)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.export.certificate import Progress
 from avis_ctrl.export.design_folder import Added, DesignFolder
 from avis_ctrl.lti.statespace import StateSpace
@@ -45,10 +45,16 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
     with threadpool_limits(1):
         task = Task(P.P, P.all_blocks.complexified(), limit=gain_limit(folder.plant, folder.rig.sample_rate_Hz))
         tried = [_order_and_mu(P, K)]
-        for step in fixed_order(task, K, order, [folder.controller(one) for one in folder.names if one != name]):
-            found = step.K
-            tried.append(_order_and_mu(P, found))
-            progress(f"{found.nstates} states: mu at most {tried[-1][1]:.4g} with the design's model")
+        try:
+            for step in fixed_order(task, K, order, [folder.controller(one) for one in folder.names if one != name]):
+                found = step.K
+                tried.append(_order_and_mu(P, found))
+                progress(f"{found.nstates} states: mu at most {tried[-1][1]:.4g} with the design's model")
+        except ComputationError as error:
+            found_so_far = ", ".join(f"{states} states {mu:.4g}" for states, mu in tried)
+            raise ComputationError(f"there is no controller with {order} states that stabilises the loop, as far as "
+                                   f"was searched", measured=f"mu at most: {found_so_far}", cause=str(error),
+                                   next_step="use --order with one of these numbers") from error
     made = f"{name}_{order}"
     return replace(folder, added={made: Added(found.renamed(K.inputs, K.outputs), tuple(tried))}), made
 

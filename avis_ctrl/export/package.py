@@ -94,6 +94,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
     content["anti_windup"] = choice.as_dict()
+    content["design_inputs_sha256"] = _inputs_sha256(folder)
     if name in folder.added:
         contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name].K))
     if "c" in formats:
@@ -132,7 +133,7 @@ def _provenance(folder: DesignFolder, controller: SampledController, certificate
         f"{controller.sample_rate_Hz:g} Hz, {controller.arithmetic}; {controller.system.nstates} states.",
         f"Written by avis_ctrl {avis_ctrl.__version__}; the design was made by {made.get('avis_ctrl')}, "
         f"{made.get('date')}.",
-        f"Inputs of the design, SHA-256: {made.get('inputs_sha256')}",
+        f"Inputs of the design, SHA-256: {_inputs_sha256(folder)}",
         f"controller.json, SHA-256: {controller.sha256}",
         f"Certificate: {certificate.one_line()}.",
         "Do not edit: a changed number is no longer what the certificate is for."))
@@ -170,7 +171,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
 
     First the files: those that are missing or not listed, the hashes, the numbers in the C and .mat files, the test
     vectors; each finding goes to `progress` at once. Then the certificate is computed again, unless controller.json is
-    unchanged and another file is not.
+    unchanged and another file is not, or the design is another one.
 
     Parameters
     ----------
@@ -182,6 +183,8 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     """
     _require_export(out)
     stored = read_json(out / CERTIFICATE, "avis-certificate", "the certificate of avis export")
+    if (inputs := stored.get("design_inputs_sha256")) not in (None, (own := _inputs_sha256(folder))):
+        return [f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in {folder.path}"]
     found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
              ] if stored.get("content_sha256") != _content_sha256(stored) else []
     wrong = _wrong_files(out, stored)
@@ -213,8 +216,24 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     for key, value in json.loads(as_json(content)).items():
         tolerance = settings.direct if key == "rounding_noise_m_per_s" else settings.searched
         if key not in ("controller_sha256", "step_time_us") and not _nearly_equal(stored.get(key), value, tolerance):
-            found.append(f"{key}: {stored.get(key)} in {CERTIFICATE}, {value} computed from {CONTROLLER}")
+            for line in _unlike(key, stored.get(key), value, tolerance):
+                progress(line)
+                found.append(line)
     return found
+
+
+def _unlike(key: str, stored: object, computed: object, tolerance: float) -> list[str]:
+    """A line for each figure that differs; a figure within a table by its path."""
+    if isinstance(stored, dict) and isinstance(computed, dict) and stored.keys() == computed.keys():
+        return [line for name in stored if not _nearly_equal(stored[name], computed[name], tolerance)
+                for line in _unlike(f"{key}.{name}", stored[name], computed[name], tolerance)]
+    before, now = (f"{one:.6g}" if isinstance(one, float) else str(one) for one in (stored, computed))
+    return [f"{key}: {before} in {CERTIFICATE}, {now} computed from {CONTROLLER}"]
+
+
+def _inputs_sha256(folder: DesignFolder) -> str | None:
+    """Hash of the inputs of the design, as avis design wrote it."""
+    return folder.result.get("provenance", {}).get("inputs_sha256")
 
 
 def _require_export(out: Path) -> None:

@@ -234,6 +234,16 @@ def test_only_what_was_changed_is_named(shipped, package, tmp_path):
     assert "content_sha256 differs" in found[0] and found[1].startswith("mu_upper: 0.7")
 
 
+def test_the_code_of_another_design_is_named_as_such(shipped, package, tmp_path):
+    """Its bounds, computed with this design's controller, would say that a sound code is unstable."""
+    for name, data in package.contents.items():
+        (tmp_path / name).write_bytes(data)
+    made = shipped.result["provenance"] | {"inputs_sha256": "0" * 64}
+    other = replace(shipped, result=shipped.result | {"provenance": made})
+    (line,) = check_package(other, tmp_path)
+    assert line.startswith("this code was exported from another design: SHA-256 of its inputs")
+
+
 def test_a_mu_above_the_requirement_is_refused(shipped, package, monkeypatch):
     monkeypatch.setattr("avis_ctrl.export.package.certify", lambda *arguments: package.certificate)
     asked = mu_asked(shipped.design)

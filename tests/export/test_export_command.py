@@ -27,7 +27,7 @@ ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"
 CERTIFICATE_KEYS = {"format", "version", "controller_sha256", "mu_upper", "mu_lower", "guaranteed", "stable",
                     "worst_case_peak_transmissibility_dB", "worst_case_band_transmissibility_dB",
                     "rounding_noise_m_per_s", "step_time_us", "between_samples", "at_rest", "anti_windup", "files",
-                    "test_vectors", "restart_vectors", "content_sha256"}
+                    "test_vectors", "restart_vectors", "design_inputs_sha256", "content_sha256"}
 CONTROLLER_KEYS = {"format", "version", "name", "sample_rate_Hz", "arithmetic", "A", "B", "C", "D", "inputs", "outputs",
                    "input_units", "output_units", "limits_V", "delay_samples"}
 
@@ -228,7 +228,7 @@ def test_header_says_where_it_comes_from(out):
     (("MISSING", "--order", "0", "--out", "OUT"), "--order = 0: expected a whole number, 1 or more"),
     (("MISSING", "--order", "-2", "--out", "OUT"), "--order = -2: expected a whole number, 1 or more"),
     (("DESIGN", "--out", "OUT", "--check", "--float32"), "either --check or --float32"),
-    (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "beside --order"),
+    (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "together with --order"),
     (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "either --check or --order"),
     (("EMPTY", "--out", "OUT"), "result.json"),
     (("DESIGN", "--out", "OUT", "--check"), "there is no such folder")])
