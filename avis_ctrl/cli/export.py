@@ -124,7 +124,8 @@ def _summary(console, made) -> None:
     from rich.table import Table
 
     found = made.certificate.content
-    table = Table("computed from the exported numbers", "", title="certificate")
+    table = Table("computed from the exported numbers", "", title="certificate",
+                  caption="Bounds: the axes of the design, with the others locked. Simulation: all six axes.")
     rows = (("mu, upper bound", found["mu_upper"], ""), ("mu, lower bound", found["mu_lower"], ""),
             ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
             ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
