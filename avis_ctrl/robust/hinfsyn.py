@@ -385,6 +385,7 @@ def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ..
     if not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
         raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
     ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
-    verdict = "slow enough" if ratio < 0.5 else "too fast: raise backoff or the sample rate, or reduce the controller"
-    return (f"fastest controller pole {result.fastest_pole:.4g} rad/s is {ratio:.3g} times half the sample rate: "
-            f"{verdict}",)
+    verdict = "slow enough" if ratio < 0.5 else ("too fast; a higher sample rate, a larger backoff from the optimum or "
+                                                 "fewer states help")
+    return (f"the fastest controller pole, {result.fastest_pole / (2 * np.pi):.4g} Hz, is {ratio:.3g} times half the "
+            f"sample rate: {verdict}",)

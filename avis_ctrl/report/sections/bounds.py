@@ -38,7 +38,7 @@ def certificate(result: DesignResult) -> Paragraph:
                      f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
                      + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
                      + f". Below 1, every weighted requirement holds for every plant of the uncertainty set. {between} "
-                     "The lower bound is a perturbation that makes the loop singular.")
+                     "The lower bound is reached: a perturbation of size 1/mu makes the loop singular.")
 
 
 def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, meaning: str) -> Figure:
