@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
+import slycot
+from slycot.exceptions import SlycotArithmeticError
 
-from avis_ctrl.lti import gain, hinf_norm
+from avis_ctrl.lti import balance, gain, hinf_norm
 from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_gain import perturbed
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.analysis import analyse, bound, worst_of_axis
 from avis_ctrl.study.controllers import passive, reduction_grid
-from avis_ctrl.study.design_file import Design, RequirementSection, read_study
+from avis_ctrl.study.design_file import Design, RequirementSection, design_from_table, read_study, study_of
 from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.plant import DesignPlant, build_plant
@@ -207,3 +211,19 @@ def test_reduction_is_compared_where_the_table_at_rest_peaks(shipped):
     seen = np.max(np.linalg.norm(nominal.frequency_response(omega), 2, axis=(1, 2)))
     assert seen > 0.99 * hinf_norm(nominal).gain
     assert 1.0 in omega
+
+
+def test_no_controller_of_x_and_phi_y_meets_the_bounds_of_the_z_phix_design():
+    """docs/design_file.md: not even for the nominal AVIS table, by the certified bound of the H-infinity optimum and by
+    SLICOT."""
+    table, other = (tomllib.loads((DESIGNS / name).read_text()) for name in ("avis_six_axes.toml", "avis_z_phix.toml"))
+    table |= {"transmissibility": other["transmissibility"], "keep": ["x", "phi_y"], "requirement": []}
+    design, rig = study_of(design_from_table(table), DESIGNS / "avis_six_axes.toml")
+    nominal = build_plant(design, rig).synthesis.nominal()
+    low, high = hinfsyn(nominal.P, nominal.nmeas, nominal.ncon).gamma_optimal_bounds
+    assert 1.015 < low < high < 1.03
+    P = balance(nominal.P)
+    sizes = P.nstates, P.ninputs, P.noutputs, nominal.ncon, nominal.nmeas
+    slycot.sb10ad(*sizes, 1.03, P.A, P.B, P.C, P.D, job=4)
+    with pytest.raises(SlycotArithmeticError):
+        slycot.sb10ad(*sizes, 1.015, P.A, P.B, P.C, P.D, job=4)
