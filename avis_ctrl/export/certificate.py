@@ -116,8 +116,8 @@ def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: Stabil
     assert K is not None
     loops = [(f"nominal, gain {g:.0%}", replace(nominal, digital=_scaled(K, g))) for g in settings.gains]
     deltas = random_perturbations(folder.plant, settings.plants, folder.design.simulation.seed)
-    for name, delta in zip((f"random plant {k}" for k in range(1, len(deltas) + 1)), deltas, strict=True):
-        omega = 2 * np.pi * 10 ** rng.uniform(0.0, 2.0)
+    for k, delta in enumerate(deltas, 1):
+        name, omega = f"random plant {k}", 2 * np.pi * 10 ** rng.uniform(0.0, 2.0)
         loops.append((name, with_delta(folder.rig, folder.plant, nominal, name, delta, omega)))
     return loops
 

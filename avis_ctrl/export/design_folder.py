@@ -56,6 +56,11 @@ class DesignFolder:
         """The controllers that have a file."""
         return [row["name"] for row in self.result["controllers"] if row.get("file")]
 
+    @property
+    def inputs_sha256(self) -> str | None:
+        """Hash of the design's inputs, as avis design wrote it."""
+        return self.result.get("provenance", {}).get("inputs_sha256")
+
     def controller(self, name: str) -> StateSpace:
         """The continuous controller of the logical axes. Raises InputError with the names that there are."""
         if name in self.added:

@@ -51,10 +51,12 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
                 tried.append(_order_and_mu(P, found))
                 progress(f"{found.nstates} states: mu at most {tried[-1][1]:.4g} with the design's model")
         except ComputationError as error:
-            found_so_far = ", ".join(f"{states} states {mu:.4g}" for states, mu in tried)
-            raise ComputationError(f"there is no controller with {order} states that stabilises the loop, as far as "
-                                   f"was searched", measured=f"mu at most: {found_so_far}", cause=str(error),
-                                   next_step="use --order with one of these numbers") from error
+            # The first is the controller that the folder has.
+            on_the_way = ", ".join(f"{mu:.4g} with {states} states" for states, mu in tried[1:])
+            if not on_the_way:
+                raise
+            raise ComputationError(error.failed, measured=f"{error.measured}; mu at most {on_the_way}",
+                                   cause=error.cause, next_step="--order with one of these numbers") from error
     made = f"{name}_{order}"
     return replace(folder, added={made: Added(found.renamed(K.inputs, K.outputs), tuple(tried))}), made
 

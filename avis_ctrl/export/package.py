@@ -94,7 +94,7 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)
     content["anti_windup"] = choice.as_dict()
-    content["design_inputs_sha256"] = _inputs_sha256(folder)
+    content["design_inputs_sha256"] = folder.inputs_sha256
     if name in folder.added:
         contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name].K))
     if "c" in formats:
@@ -133,7 +133,7 @@ def _provenance(folder: DesignFolder, controller: SampledController, certificate
         f"{controller.sample_rate_Hz:g} Hz, {controller.arithmetic}; {controller.system.nstates} states.",
         f"Written by avis_ctrl {avis_ctrl.__version__}; the design was made by {made.get('avis_ctrl')}, "
         f"{made.get('date')}.",
-        f"Inputs of the design, SHA-256: {_inputs_sha256(folder)}",
+        f"Inputs of the design, SHA-256: {folder.inputs_sha256}",
         f"controller.json, SHA-256: {controller.sha256}",
         f"Certificate: {certificate.one_line()}.",
         "Do not edit: a changed number is no longer what the certificate is for."))
@@ -181,10 +181,15 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     ------
     InputError : no folder of an export, files that cannot be read, another controller.
     """
+    def told(lines: list[str]) -> list[str]:
+        for line in lines:
+            progress(line)
+        return lines
     _require_export(out)
     stored = read_json(out / CERTIFICATE, "avis-certificate", "the certificate of avis export")
-    if (inputs := stored.get("design_inputs_sha256")) not in (None, (own := _inputs_sha256(folder))):
-        return [f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in {folder.path}"]
+    if (inputs := stored.get("design_inputs_sha256")) not in (None, (own := folder.inputs_sha256)):
+        return told([f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in "
+                     f"{folder.path}"])
     found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
              ] if stored.get("content_sha256") != _content_sha256(stored) else []
     wrong = _wrong_files(out, stored)
@@ -192,7 +197,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         controller = read_controller(out / CONTROLLER)
     except InputError as error:
         if found or wrong:
-            return [*found, *wrong, str(error)]
+            return told([*found, *wrong, str(error)])
         raise
     if name is not None and name != controller.name:
         raise InputError(f"expected {controller.name!r}, the controller in {out}", field="--controller", value=name)
@@ -204,36 +209,30 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         wrong += _differences(MAT, controller, _numbers_in_mat(out / MAT))
     if not any(line.startswith(tuple(TESTS)) for line in wrong):
         wrong += _wrong_vectors(folder, controller, out, stored, settings)
-    found += wrong
-    for line in found:
-        progress(line)
+    found = told([*found, *wrong])
     if wrong and stored.get("controller_sha256") == controller.sha256:
         return found
     try:
         content = certify(folder, controller, progress).content
     except AvisError as error:
-        return [*found, f"no certificate can be computed from {CONTROLLER}: {error}"]
+        return [*found, *told([f"no certificate can be computed from {CONTROLLER}: {error}"])]
     for key, value in json.loads(as_json(content)).items():
         tolerance = settings.direct if key == "rounding_noise_m_per_s" else settings.searched
-        if key not in ("controller_sha256", "step_time_us") and not _nearly_equal(stored.get(key), value, tolerance):
-            for line in _unlike(key, stored.get(key), value, tolerance):
-                progress(line)
-                found.append(line)
+        if key not in ("controller_sha256", "step_time_us"):
+            found += told(_unlike(key, stored.get(key), value, tolerance))
     return found
 
 
 def _unlike(key: str, stored: object, computed: object, tolerance: float) -> list[str]:
     """A line for each figure that differs; a figure within a table by its path."""
     if isinstance(stored, dict) and isinstance(computed, dict) and stored.keys() == computed.keys():
-        return [line for name in stored if not _nearly_equal(stored[name], computed[name], tolerance)
-                for line in _unlike(f"{key}.{name}", stored[name], computed[name], tolerance)]
+        return [line for name in stored for line in _unlike(f"{key}.{name}", stored[name], computed[name], tolerance)]
+    if isinstance(stored, float) and isinstance(computed, float):
+        alike = abs(stored - computed) <= tolerance * max(abs(stored), abs(computed))
+    else:
+        alike = stored == computed
     before, now = (f"{one:.6g}" if isinstance(one, float) else str(one) for one in (stored, computed))
-    return [f"{key}: {before} in {CERTIFICATE}, {now} computed from {CONTROLLER}"]
-
-
-def _inputs_sha256(folder: DesignFolder) -> str | None:
-    """Hash of the inputs of the design, as avis design wrote it."""
-    return folder.result.get("provenance", {}).get("inputs_sha256")
+    return [] if alike else [f"{key}: {before} in {CERTIFICATE}, {now} computed from {CONTROLLER}"]
 
 
 def _require_export(out: Path) -> None:
@@ -299,15 +298,6 @@ def _guard(folder: DesignFolder, controller: SampledController, stored: Mapping[
     corner, gain = stored["anti_windup"]["corner_Hz"], stored["anti_windup"]["gain"]
     law = NO_ANTI_WINDUP if corner is None else AntiWindup.of(float(corner), float(gain), controller.system.dt)
     return protection(controller, folder.rig, law)
-
-
-def _nearly_equal(stored: object, computed: object, tolerance: float) -> bool:
-    if isinstance(stored, dict) and isinstance(computed, dict):
-        return stored.keys() == computed.keys() and all(_nearly_equal(stored[key], computed[key], tolerance)
-                                                        for key in stored)
-    if isinstance(stored, float) and isinstance(computed, float):
-        return abs(stored - computed) <= tolerance * max(abs(stored), abs(computed))
-    return stored == computed
 
 
 def _numbers_in_c(path: Path, controller: SampledController) -> dict[str, np.ndarray]:

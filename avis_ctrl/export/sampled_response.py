@@ -292,7 +292,8 @@ class SampledAxes:
     @cached_property
     def _stability(self) -> MuPeak:
         """Robust stability of the table without control."""
-        part, blocks = self._part("force", "seen")[0], self._unfiltered.full.blocks
+        part, whole = self._part("force", "seen")
+        blocks = BlockStructure(whole.blocks[:-1])
         return stability_bound(part.select(range(blocks.n_z), range(blocks.n_w)), blocks)
 
     def _high_bound(self, source: str, target: str) -> Rational:
@@ -301,7 +302,8 @@ class SampledAxes:
         if (source, target) == ("floor", "velocity"):
             return Rational(self._proved(source, target, None))
         near, far = np.split(self.high_grid, [self.settings.near])
-        gains = np.concatenate([self._gains_at(source, target, near), self._gains_at(source, target, far, True)])
+        gains = np.concatenate([self._gains_at(source, target, near),
+                                self._gains_at(source, target, far, simplified=True)])
         fitted = covering_fit(self.high_grid, gains, gains, self.settings.order).function
         return fitted.scaled(self._proved(source, target, fitted))
 

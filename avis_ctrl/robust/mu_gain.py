@@ -80,10 +80,10 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
                seed: int = 0) -> WorstGain:
     """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step."""
     rng = np.random.default_rng(seed)
-    batch, size = M.shape[0], (structure.n_w, structure.n_z)
-    drawn = [structure.random(rng) for _ in range((count - 1) * batch)]
-    delta = np.concatenate([np.zeros((batch, *size), complex),
-                            np.array(drawn, complex).reshape((count - 1) * batch, *size)])
+    batch = M.shape[0]
+    delta = np.zeros((count * batch, structure.n_w, structure.n_z), complex)
+    for k in range(batch, count * batch):
+        delta[k] = structure.random(rng)
     repeated = np.concatenate([M] * count)
     gain = _gain(repeated, delta)
     climbing = np.arange(gain.size)

@@ -165,7 +165,7 @@ def _add_slope(T, K, entries, lam, slope):
 @njit(cache=True)
 def _newton(hessian, right, is_g):
     """-inv(hessian) right, with unit-diagonal scaling; ridges of round-off size where it is singular. Only the lower
-    triangle of the hessian is read. NaN where it is not finite.
+    triangle of the hessian is read. NaN where it is not finite or no inverse exists.
 
     A G that multiplies a real entry of M has no effect and no curvature: its ridge is measured against the
     largest curvature, so that round-off does not drive it away.

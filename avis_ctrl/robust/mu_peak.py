@@ -32,9 +32,20 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 SLACK = 5e-4
 KNOWN_SLACK = 5e-3
-# Frequencies of a curve whose bounds take long, in addition to those of the highest values.
-CURVE_POINTS = 40
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class CurveSettings:
+    """points : frequencies of a curve whose bounds take long, evenly chosen: enough for a plot.
+    highest : in addition those of so many highest values, from which the peak is refined.
+    """
+
+    points: int = 40
+    highest: int = 4
+
+
+CURVES = CurveSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,7 +131,7 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
 
 def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
                     band: Interval = ALL_FREQUENCIES, slack: float = SLACK, robust: Stability | None = None,
-                    points: int = CURVE_POINTS) -> MuPeak:
+                    points: int = CURVES.points) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
     Parameters
@@ -230,7 +241,7 @@ class _Scan:
         highest values among them."""
         if not structure.many:
             return self
-        kept = _thinned(self.bound.beta, CURVE_POINTS)
+        kept = _thinned(self.bound.beta, CURVES.points)
         return _Scan(self.omega[kept], self.bound.at(kept), self.slack)
 
     @property
@@ -259,10 +270,10 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
     return np.concatenate([omega for omega, _ in seen]), [found for _, found in seen]
 
 
-def _thinned(values: Array, most: int, highest: int = 4) -> Array:
-    """Indices of at most `most` values, evenly spaced, and of the `highest` largest ones."""
+def _thinned(values: Array, most: int) -> Array:
+    """Indices of at most `most` values, evenly spaced, and of the largest ones."""
     even = np.linspace(0, values.size - 1, min(most, values.size)).round().astype(int)
-    return np.union1d(even, np.argsort(values)[-highest:])
+    return np.union1d(even, np.argsort(values)[-CURVES.highest:])
 
 
 def _level(bounds: Array, slack: float) -> float:

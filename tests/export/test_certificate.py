@@ -321,7 +321,7 @@ def test_a_proof_that_cannot_succeed_ends_before_the_bounds_that_take_minutes(sh
 
 
 def test_no_plant_exceeds_the_bound_of_the_gain_above_half_the_sample_rate(shipped, package):
-    """It is also close: within 3 % of what an ascent reaches near half the rate, where the loop gain is largest."""
+    """Near half the rate, where the loop gain is largest, the bound is within 3 % of what an ascent reaches."""
     axes, plant = SampledAxes.of(shipped, package.controller), shipped.plant.full
     P, blocks = plant.P, plant.blocks
     part = P.select([*P.outputs[:blocks.n_z], *plant.y], [*P.inputs[:blocks.n_w], *plant.u])
