@@ -1,4 +1,4 @@
-"""The two ways in which a command of avis_ctrl can refuse, with the exit codes of the contract.
+"""The ways in which a command of avis_ctrl can end early, with the exit codes of the contract.
 
 A message says what failed, the measured number, the likely cause and the next step.
 """
@@ -57,3 +57,9 @@ class ComputationError(AvisError, ArithmeticError):
                  next_step and f"next: {next_step}"]
         super().__init__("; ".join(part for part in parts if part))
         self.failed, self.measured, self.cause, self.next_step = failed, measured, cause, next_step
+
+
+class UserInterruptError(AvisError):
+    """The user ended a command (exit code 130, as shells report it): what is kept."""
+
+    exit_code = 130

@@ -21,12 +21,12 @@ from avis_ctrl.cli.identify import identify, predict, single_axis
 from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.cli.new import app as new
 from avis_ctrl.cli.sweep import sweep
-from avis_ctrl.errors import AvisError, ComputationError, InputError
+from avis_ctrl.errors import AvisError, ComputationError, InputError, UserInterruptError
 from avis_ctrl.measurement.layouts import FORMATS
 
 # A line a paragraph: the terminal breaks them.
 LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
-INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+INTERRUPTED = UserInterruptError.exit_code
 AGAIN_S = 3.0  # time to clean up after an interrupt that was heard
 
 # Markdown: paragraphs of the help are wrapped to the terminal.
@@ -83,6 +83,11 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _no_more_alarms() -> None:
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
 def _silence_lost_interrupts() -> None:
     """Keep Python from printing the traceback of an interrupt lost in a callback: the alarm interrupts again."""
     usual = sys.unraisablehook
@@ -125,6 +130,7 @@ def main() -> None:
         code = app(standalone_mode=False)
         sys.stdout.flush()  # if the output goes to a file, the disk may be full
     except AvisError as error:
+        _no_more_alarms()
         print(f"avis: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except OSError as error:
@@ -153,8 +159,7 @@ def main() -> None:
         if message := error.format_message():  # without a command the help has said it
             print(f"avis: {message}", file=sys.stderr)
         sys.exit(error.exit_code)
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, 0)
+    _no_more_alarms()
     if code == INTERRUPTED:
         print("avis: interrupted; no partial results were written", file=sys.stderr)
     sys.exit(code)

@@ -29,7 +29,7 @@ def sweep(
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from avis_ctrl.errors import ComputationError, InputError
+    from avis_ctrl.errors import ComputationError, InputError, UserInterruptError
     from avis_ctrl.study.files import open_folder, output_folder
     from avis_ctrl.sweep.cluster import on_cluster, require_distributed
     from avis_ctrl.sweep.local import available, on_this_machine
@@ -59,8 +59,8 @@ def sweep(
             try:
                 found = run_sweep(plan, backend, progress)
             except KeyboardInterrupt:
-                console.print("Finished points are kept: the same command computes the others.")
-                raise
+                raise UserInterruptError("interrupted; finished points are kept: the same command computes the "
+                                         "others") from None
         files = write_sweep(found, folder)
     rows, front = found.rows, front_of(found)
     count = {status: sum(row.status == status for row in rows) for status in ("done", "failed", "lost")}

@@ -98,15 +98,25 @@ def _dict(sweep: Sweep, front: list[int]) -> dict[str, Any]:
 def _page(sweep: Sweep, front: list[int], png: bytes | None) -> str:
     picture = f'<p><img alt="Pareto front" src="data:image/png;base64,{base64.b64encode(png).decode()}" ' \
               'style="max-width:100%"></p>' if png else ""
+    keys, figures = columns(sweep)
+    # A space of no width behind dots and underscores: long keys may be broken there.
+    head = ["point", *(key.replace(".", ".\u200b").replace("_", "_\u200b") for key in keys),
+            *(sweep.quantities.get(name, name) for name in figures), "time [s]", "status", "message"]
     rows = [[f"{k + 1}{' *' if k in front else ''}", *("" if cell is None else _short(cell)
                                                        for cell in _cells(sweep, row)[:-1])]
             for k, row in enumerate(sweep.rows)]
+    told = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    table = html_table([[row[k] for k in told] for row in rows], [head[k] for k in told])
     said = "<p>* on the Pareto front</p>" if front else ""
-    return ("<!doctype html><meta charset=utf-8>"
-            "<style>body{font:14px sans-serif;margin:2em}td,th{padding:2px 8px;border-bottom:1px solid #ddd}</style>"
+    return ('<!doctype html><html lang="en"><meta charset=utf-8>'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            "<style>body{font:14px sans-serif;margin:1.5em}table{border-collapse:collapse}"
+            "td,th{padding:2px 8px;border-bottom:1px solid #ddd;vertical-align:top}</style>"
             f"<title>{escape(sweep.file.title)}</title><h1>{escape(sweep.file.title)}</h1>{picture}"
-            f"{html_table(rows, ['point', *_head(sweep)[:-1]])}{said}")
+            f'<div style="overflow-x:auto">{table}</div>{said}')
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -70,7 +70,12 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
     InputError : a file, a base or a key that is wrong; values with which no point at all can be made.
     """
     file = read_points_file(path)
-    base = open_base(file, path.parent)
+    try:
+        base = open_base(file, path.parent)
+    except InputError as error:
+        if error.file is None:
+            raise error.in_file(path) from None
+        raise InputError(str(error), file=path, field="base", value=file.base) from None
     try:
         points = points_of(file, base.expand, settings or SweepSettings())
     except InputError as error:
