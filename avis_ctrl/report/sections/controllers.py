@@ -8,6 +8,7 @@ from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import (
+    STYLES,
     Axis,
     Curve,
     Figure,
@@ -22,6 +23,7 @@ from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 HZ = np.geomspace(0.01, 500.0, 500)
 MOST_POLES = 60
+MOST_ENTRIES = 9  # of a controller whose entries can be told apart in one diagram
 
 
 def controllers(result: DesignResult) -> Section:
@@ -71,18 +73,25 @@ def _gains(made: list[ControllerResult]) -> Figure:
 
 
 def _bode(result: DesignResult) -> Figure:
+    """Every entry of a small controller; of a large one the diagonal, and the largest gain beside it."""
     K = _system(result.controller("mu"))
     response = K.frequency_response(2 * np.pi * HZ)
+    axes = [words.axis(name) for name in result.plant.axes]
+    every = response[0].size <= MOST_ENTRIES
     sizes, phases = [], []
-    for i in range(K.noutputs):
-        for j in range(K.ninputs):
-            style = numbered(i * K.ninputs + j)
-            label = f"{words.axis(result.plant.axes[j])} to {words.axis(result.plant.axes[i])}"
+    for i, j in np.ndindex(response.shape[1:]):
+        if every or i == j:
+            style = numbered(i * K.ninputs + j if every else i)
+            label = f"{axes[j]} to {axes[i]}"
             sizes.append(Curve(HZ, np.abs(response[:, i, j]), label, style))
             phases.append(Curve(HZ, (np.degrees(np.angle(response[:, i, j])) + 180) % 360 - 180, label, style))
+    what = "each measurement to each command"
+    if not every:
+        coupling = np.where(np.eye(K.noutputs, dtype=bool), 0.0, np.abs(response)).max(axis=(1, 2))
+        sizes.append(Curve(HZ, coupling, "largest gain between two axes", STYLES["faint"]))
+        what = "the measurement of each axis to the command of the same axis, and the largest gain between two axes"
     x = hertz(0.01, 500.0)
-    return Figure("controller_bode", "Bode plot of the mu controller, each measurement to each command; the phase is "
-                  "wrapped into ±180 degrees.",
+    return Figure("controller_bode", f"Bode plot of the mu controller: {what}; the phase is wrapped into ±180 degrees.",
                   (Panel(x, Axis("gain [N s/m]", "log"), tuple(sizes)),
                    Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases))), 2)
 
@@ -104,8 +113,14 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
     x = hertz(0.01, 500.0)
     return Figure("loops", "Largest singular value of the open loop G K at the measurement (left) and of the "
                   f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
-                  (Panel(x, Axis("open loop [dB]", "linear", (-80.0, 50.0)), tuple(loops)),
-                   Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, 20.0)), tuple(sensitivities))), 2)
+                  (Panel(x, Axis("open loop [dB]", "linear", (-80.0, _above(loops, 50.0))), tuple(loops)),
+                   Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, _above(sensitivities, 20.0))),
+                         tuple(sensitivities))), 2)
+
+
+def _above(curves: list[Curve], least: float) -> float:
+    """End of an axis in dB that no curve exceeds, at least a given one."""
+    return max(least, 10.0 * float(np.ceil(max(np.max(one.y) for one in curves) / 10)))
 
 
 def _poles(mu: ControllerResult) -> Table:

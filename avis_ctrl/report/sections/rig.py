@@ -140,21 +140,24 @@ def _electronics(result: DesignResult) -> Table:
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
     n = len(error.keep)
+    if not error.left_out.size:
+        return [Heading("Design model"), Paragraph("The controller is designed on a model with all six degrees of "
+                                                   "freedom; no coordinate is locked.")]
     rows = [(words.axis(out), name, words.quantity(error.max_dB[out, name], "dB"),
              words.quantity(error.rms_dB[out, name], "dB")) for out, name in error.max_dB]
     kept = words.joined(list(error.keep))
     text = (f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
             "the figure show the difference from the model with six degrees of freedom, relative to the largest gain "
-            "at the same frequency. Floor motion along the other axes, which the small model does not contain, is "
+            "at the same frequency. Floor motion along the other axes, which the design model does not contain, is "
             f"transmitted to {kept} with at most "
             f"{words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. " + _largest(error))
-    return [Heading("Error of the small model"), Paragraph(text),
-            table("Difference between the small model and six degrees of freedom, relative to the largest gain, over "
+    return [Heading("Error of the design model"), Paragraph(text),
+            table("Difference between the design model and six degrees of freedom, relative to the largest gain, over "
                   "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(result, n)]
 
 
 def _largest(error: ReductionError) -> str:
-    """Where the small model is worst, and whether that is at an entry that matters."""
+    """Where the design model is worst, and whether that is at an entry that matters."""
     out, name = max(error.max_dB, key=lambda channel: error.max_dB[channel])
     k, j = error.keep.index(out), error.inputs.index(name)
     place = int(np.argmax(error.relative[:, k, j]))
@@ -170,7 +173,7 @@ def _compared(result: DesignResult, n: int) -> Figure:
         colour = numbered(k).colour
         curves += [Curve(f, in_dB(error.full[:, k, k]), f"{name}, six degrees of freedom",
                          Style(colour, "solid", 2.2)),
-                   Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, small model", Style("#111111", "dot", 1.6))]
+                   Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, design model", Style("#111111", "dot", 1.6))]
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
     curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
     panel = Panel(hertz(), Axis("gain [dB]", "linear", (-80.0, 40.0)), tuple(curves),
@@ -180,5 +183,5 @@ def _compared(result: DesignResult, n: int) -> Figure:
     lower = Panel(hertz(), Axis("difference [dB]", "linear", (-140.0, 20.0)), tuple(apart),
                   title="difference, relative to the largest gain")
     return Figure("reduction", "Transmissibility without control, floor to payload along each kept axis: six degrees "
-                  "of freedom (coloured) and the small model on top of it (black, dotted), with the contribution of "
+                  "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
                   "the floor's other axes. Beside it, their difference.", (panel, lower), 2)

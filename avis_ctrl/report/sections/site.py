@@ -48,15 +48,14 @@ def _third_octaves(result: DesignResult) -> Figure:
 
 
 def _motion(result: DesignResult) -> Table:
-    axes = result.plant.axes
-    rows = [(c.title, *(words.number(1e6 * c.site.velocity_rms[a]) for a in axes),
-             *(words.number(1e6 * c.site.noise_rms[a]) for a in axes), c.site.rating or "none")
-            for c in _settled(result)]
-    header = ("controller", *(words.axis(a) for a in axes), *(f"noise in {words.axis(a)}" for a in axes), "criterion")
+    axes, shown = result.plant.axes, _settled(result)
+    rows = [(words.axis(a), *(words.number(1e6 * c.site.velocity_rms[a]) for c in shown)) for a in axes]
+    rows += [(f"{words.axis(a)}, from sensor noise", *(words.number(1e6 * c.site.noise_rms[a]) for c in shown))
+             for a in axes]
+    rows.append(("criterion", *(c.site.rating or "none" for c in shown)))
     low, high = result.design.floor.band_Hz
     return table(f"Payload velocity r.m.s. [µm/s] from {low:g} to {high:g} Hz, from floor and sensor noise together "
-                 "and from the noise alone.",
-                 header, rows, "l" + "r" * 2 * len(axes) + "c")
+                 "and from the noise alone.", ("axis", *(c.title for c in shown)), rows)
 
 
 def _volts(result: DesignResult) -> Table:
