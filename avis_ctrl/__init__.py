@@ -1,46 +1,46 @@
-"""avis_ctrl: a workbench for active vibration isolation tables, and robust control of any plant.
+"""avis_ctrl: a workbench for active vibration isolation tables and for robust control of any plant.
 
     import avis_ctrl as ac
 
 From measurements to a controller; results have .summary(), .plot_...() and .save(folder):
 
 rig                 a table: "avis", "halcyonics", "halcyonics_loaded" or a rig file
-campaign            measured records or responses from a file (HDF5, .mat, UFF 58, CSV)
+campaign            measured records or frequency responses from a file (HDF5, .mat, UFF 58, CSV)
 simulate_campaign   records of the simulated nonlinear table
-identify            the table's parameters and their uncertainty from a campaign
-gap                 the physical effects that a table's model misses
-design              certified controllers of a table, compared, simulated, with a report
+identify            parameters of a table and their uncertainty, from a campaign
+gap                 the physical effects that the model of a table lacks
+design              certified controllers for a table, with comparison, simulation and report
 single_axis         a small model of one axis: seismometer, decay, drive, oscillator
 
 Linear systems and robust control of any plant:
 
-StateSpace          a linear system with named signals
+StateSpace          a linear system with named inputs and outputs
 tf                  a system from the coefficients of a transfer function
 ss                  a system from A, B, C, D, whose entries may be uncertain
-connect             systems connected through signals of the same name
+connect             interconnection of systems by signal names
 real                an uncertain real parameter
 complex_disk        an uncertain complex number
-dynamics            unknown stable dynamics of bounded size
+dynamics            norm-bounded unknown stable dynamics
 matrix              a matrix with uncertain entries
-RealScalar          block of a real parameter, repeated or not
-ComplexScalar       block of a complex number, repeated or not
+RealScalar          block of a (repeated) real parameter
+ComplexScalar       block of a (repeated) complex number
 ComplexFull         block of a full complex matrix
 BlockStructure      the blocks of a structured perturbation
-uncertainty_weight  a filter that covers the differences between responses
+uncertainty_weight  a weighting filter that covers the differences between responses
 hinfsyn             H-infinity controller
 mixed_sensitivity   H-infinity controller for weights on S, KS and T
 musyn               mu controller (D-K iteration)
 mu                  bounds of the structured singular value of matrices
-mu_peak             its peak over frequency, proved between the points
+mu_peak             peak of mu over frequency, with bounds that are also valid between grid points
 worst_case_gain     the largest gain over all perturbations
-robust_stability    the size of the uncertainty up to which a loop is stable
-robust_performance  the same with a bound on its gain
-disk_margin         gain and phase margins of all channels at the same time
+robust_stability    robust stability margin: the largest uncertainty for which a loop is stable
+robust_performance  robust performance margin: the same with a bound on the gain
+disk_margin         simultaneous gain and phase margins in all channels
 plot                bode, sigma, mu, transmissibility, dk_history, order, vc_curves
-InputError          what a wrong input raises: one line
-ComputationError    what a computation that fails raises: one line
+InputError          raised for invalid input, with a one-line message
+ComputationError    raised if a computation fails, with a one-line message
 
-Names are loaded on first use, so that `import avis_ctrl` and `avis --help` take little time.
+Names are loaded on first use to keep `import avis_ctrl` and `avis --help` fast.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _PLACES = {
     "mixed_sensitivity": "avis_ctrl.robust.mixed_sensitivity",
     "uncertainty_weight": "avis_ctrl.uncertainty.uncertainty_weight",
 }
-# Packages that are names of the interface, too; `gap` can be called.
+# Subpackages that are public names as well; `gap` is callable.
 _PACKAGES = ("gap", "plot")
 
 __all__ = ["__version__", *_PACKAGES, *_PLACES]

@@ -1,6 +1,6 @@
-"""The ways in which a command of avis_ctrl can end early, with the exit codes of the contract.
+"""The errors that avis_ctrl raises on purpose, with the exit codes of the command line.
 
-A message says what failed, the measured number, the likely cause and the next step.
+A message states what failed, the measured value, the likely cause and the next step.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ class AvisError(Exception):
 
 
 class InputError(AvisError, ValueError):
-    """The input is wrong (exit code 2): one line naming file, field, value and what was expected.
+    """Invalid input (exit code 2): one line naming file, field, value and what was expected.
 
     Examples
     --------
@@ -34,12 +34,12 @@ class InputError(AvisError, ValueError):
         self.file, self.field, self.value, self.expected = file, field, value, expected
 
     def in_file(self, file: object) -> InputError:
-        """The same complaint, with the file named."""
+        """The same error with the file named."""
         return InputError(self.expected, file=file, field=self.field, value=self.value)
 
 
 class ComputationError(AvisError, ArithmeticError):
-    """A computation failed (exit code 3): what failed, the measured number, the likely cause, the next step.
+    """A failed computation (exit code 3). The message has what failed, the measured value, the cause and the next step.
 
     Examples
     --------

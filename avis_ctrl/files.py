@@ -1,4 +1,4 @@
-"""All files are written here: each is whole or absent, even if the disk fills or the process is killed."""
+"""Atomic file output: a file is complete or absent, even if the disk is full or the process is killed."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import BinaryIO
 
 from avis_ctrl.errors import AvisError, ComputationError, InputError
 
-# The disk is full, or fails: exit code 3.
+# Errors of a full or failing disk: exit code 3.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write (and read) that takes its name only when all of it is on the disk.
+    """A file for writing (and reading) that gets its name only after all of it is on the disk.
 
-    Until then it has no name, if the system allows that (it vanishes with the process), otherwise a hidden name beside
-    the target. An older file stays as it was until the end, or for good if an error is raised.
+    Until then it has no name if the system allows this (it then vanishes with the process); otherwise it has a hidden
+    name in the same folder. An older file is unchanged until the end. It remains if an error is raised.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
             name = name or _named(file, path)
-        os.chmod(name, 0o666 & ~_mask())  # a temporary file is its owner's alone
+        os.chmod(name, 0o666 & ~_mask())  # temporary files are readable by their owner only
         os.replace(name, path)
     except OSError as error:
         raise _refused(path, error) from None
@@ -52,26 +52,26 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that nobody ever sees half of it. Raises as `whole_file` does."""
+    """Write a file atomically. Raises as `whole_file`."""
     with whole_file(path) as file:
         file.write(content)
 
 
 def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Path] = ()) -> list[Path]:
-    """Write several files of a folder, all of them or none; in their order, so that the last one says it is complete.
+    """Write several files of a folder, all or none, in the given order: the last file marks the set as complete.
 
-    All are on the disk under hidden names before the first takes its place and `old` ones are removed, so that a full
-    disk leaves the earlier results. Only where a file on the disk cannot be removed or renamed after that, the folder
-    is incomplete; the error then says which files are missing and which are new.
+    All contents are written under hidden names first. Only then are the `old` files removed and the new files renamed,
+    so that earlier results survive a full disk. The folder is left incomplete only if a file cannot be removed or
+    renamed after that; the error then lists the missing and the new files.
 
     Parameters
     ----------
-    contents : by name, which may hold folders: "controllers/mu.json".
-    old : files to remove if they exist and are not written again, so that no old report stands beside new results.
+    contents : by name, which may contain folders: "controllers/mu.json".
+    old : files to remove if they exist and are not written again, so that no old report remains beside new results.
 
     Raises
     ------
-    ComputationError : the disk refuses.
+    ComputationError : the disk is full or fails.
     """
     removed: list[Path] = []
     placed: list[Path] = []
@@ -124,21 +124,21 @@ def _refused(path: Path, error: OSError) -> AvisError:
 
 
 def _opened(path: Path) -> tuple[BinaryIO, str | None]:
-    """A file in the folder of `path`, and its name where it has one."""
+    """A temporary file in the folder of `path`, and its name if it has one."""
     if hasattr(os, "O_TMPFILE"):
-        with contextlib.suppress(OSError):  # some file systems (NFS, old overlays) refuse files without a name
+        with contextlib.suppress(OSError):  # some file systems (NFS, old overlays) do not support files without a name
             return open(os.open(path.parent, os.O_TMPFILE | os.O_RDWR, 0o600), "w+b"), None
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     return open(descriptor, "w+b"), name
 
 
 def _named(file: BinaryIO, path: Path) -> str:
-    """A hidden name beside the target for a file without one; its copy where the system gives it none."""
+    """Give a nameless file a hidden name beside the target; copy it if the system cannot link it."""
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with open(descriptor, "wb") as copy:
             try:
-                # Only a name that is free can be linked to: beside the one that was just found to be so.
+                # os.link needs a free name: use one derived from the name that mkstemp has just reserved.
                 os.link(f"/proc/self/fd/{file.fileno()}", f"{name}.", follow_symlinks=True)
                 os.replace(f"{name}.", name)
             except OSError:

@@ -1,4 +1,4 @@
-"""Short texts of results: one line in a terminal, a table in a notebook, instead of raw arrays."""
+"""Short representations of results: one line in a terminal, a table in a notebook, no raw arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 @dataclass(frozen=True)
 class SummarySettings:
-    """longest : letters of a value in a repr or a table. line : letters of a line to which sentences are wrapped."""
+    """longest : maximum number of characters of a value in a repr or table. line : line width for wrapped sentences."""
 
     longest: int = 60
     line: int = 100
@@ -22,12 +22,12 @@ SETTINGS = SummarySettings()
 
 
 def wrapped(sentence: str) -> str:
-    """In lines for a terminal."""
+    """Wrap a sentence to the width of a terminal."""
     return fill(sentence, SETTINGS.line)
 
 
 def in_short(value: Any) -> str:
-    """A number to five digits, an array by its shape, a long text by its beginning."""
+    """A number with five digits, an array as its shape, a long text as its beginning."""
     if isinstance(value, bool) or value is None:
         return str(value)
     if isinstance(value, (int, float)):
@@ -59,9 +59,9 @@ def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), title: s
 
 
 class Shown:
-    """Gives a dataclass (with repr=False) a short repr, and a table in notebooks.
+    """Mixin that gives a dataclass (with repr=False) a short repr, and a table in notebooks.
 
-    in_line : the fields in the repr; empty for all of them.
+    in_line : the fields in the repr; empty for all fields.
     """
 
     in_line: ClassVar[tuple[str, ...]] = ()

@@ -1,4 +1,4 @@
-"""A value with its standard deviation as text: the one rule by which sentences, tables and the terminal round it."""
+"""A value with its standard deviation as text. Sentences, tables and the terminal all use this rounding."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 
 
 def rounded(value: float, std: float) -> tuple[str, str]:
-    """Value and standard deviation, both to the second significant digit of the latter.
+    """Value and standard deviation, both rounded to the second significant digit of the standard deviation.
 
-    Where that would need many zeros, both are multiples of the value's power of ten (1.2340e9, 0.0012e9). Without a
-    positive, finite standard deviation five digits of the value are given.
+    If this would need many zeros, both are written with the value's power of ten (1.2340e9, 0.0012e9). Without a
+    positive, finite standard deviation the value is given with five digits.
     """
     if not (math.isfinite(std) and std > 0 and math.isfinite(value)):
         return f"{value:.5g}", f"{std:.2g}"
@@ -22,14 +22,14 @@ def rounded(value: float, std: float) -> tuple[str, str]:
 
 
 def with_prefix(value: float, std: float, unit: str) -> tuple[float, float, str]:
-    """Value, standard deviation and unit: below a hundredth of a second, metre or volt in thousandths of it."""
+    """Value, standard deviation and unit; values below 0.01 s, m or V are converted to ms, mm or mV."""
     if unit in ("s", "m", "V") and 0 < abs(value) < 0.01:
         return 1e3 * value, 1e3 * std, f"m{unit}"
     return value, std, unit
 
 
 def text(value: float, std: float, unit: str = "") -> str:
-    """value +- std unit; the value alone where there is no standard deviation."""
+    """Text "value +- std unit", or the value alone if there is no standard deviation."""
     value, std, unit = with_prefix(value, std, unit)
     first, second = rounded(value, std)
     known = f"{first} +- {second}" if math.isfinite(std) and std > 0 else first

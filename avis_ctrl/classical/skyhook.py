@@ -1,10 +1,9 @@
-"""The baseline: decentralised velocity feedback, one loop an axis ("skyhook" of both sources).
+"""Skyhook damping as the baseline: decentralised velocity feedback, one loop per axis.
 
     F_a = -g_a  s/(s + w_tilt)  1/(s/w_roll + 1)  v_a
 
-The first filter keeps gravity (tilt) and the sensor's drift out of the loop, the second keeps the loop's gain
-from meeting what lies above its band. Gains come from the classical rule or from the tuning in
-`avis_ctrl.classical.tuning`.
+The high-pass filter keeps gravity (tilt) and sensor drift out of the loop. The low-pass filter rolls the loop gain off
+above its band. The gains follow from the classical rule or from the tuning in `avis_ctrl.classical.tuning`.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from avis_ctrl.lti.statespace import StateSpace, append
 
 @dataclass(frozen=True)
 class Skyhook:
-    """Velocity feedback of some axes.
+    """Velocity feedback on some axes.
 
     Parameters
     ----------
     axes : names; rotations as edge displacements.
-    gains : N s/m, one an axis (edge force per edge velocity for rotations).
+    gains : N s/m, one per axis (edge force per edge velocity for rotations).
     tilt_corner_Hz, roll_off_Hz : corners of the high-pass and of the low-pass filter.
 
     Raises
     ------
-    InputError : a negative gain, corners that are not positive or not in order.
+    InputError : a negative gain; corners that are not positive or not in ascending order.
     """
 
     axes: tuple[str, ...]
@@ -55,12 +54,12 @@ class Skyhook:
 
     @property
     def filter(self) -> StateSpace:
-        """Both filters, unit passband gain."""
+        """Both filters in series, with unit passband gain."""
         tilt, roll = 2 * np.pi * self.tilt_corner_Hz, 2 * np.pi * self.roll_off_Hz
         return cascade(np.zeros(1), [-tilt, -roll], roll)
 
     def loop(self, axis: str) -> StateSpace:
-        """One axis: seen velocity [m/s] -> force [N]. Raises InputError for an axis it does not have."""
+        """Loop of one axis: measured velocity [m/s] -> force [N]. Raises InputError for an unknown axis."""
         if axis not in self.axes:
             raise InputError(f"expected one of {list(self.axes)}", field="axis", value=axis)
         return self.filter.scaled(left=-self.gains[self.axes.index(axis)])
@@ -71,6 +70,6 @@ class Skyhook:
 
 
 def critical_damping(mass: Sequence[float], stiffness: Sequence[float], damping: Sequence[float]) -> np.ndarray:
-    """The classical rule: g = 2 sqrt(k m) - c makes each axis, taken alone, critically damped."""
+    """The classical rule: g = 2 sqrt(k m) - c damps each axis critically if the axes are decoupled."""
     m, k, c = (np.asarray(values, float) for values in (mass, stiffness, damping))
     return np.maximum(2.0 * np.sqrt(k * m) - c, 0.0)

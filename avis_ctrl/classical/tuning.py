@@ -1,10 +1,11 @@
-"""Automatic tuning of skyhook loops, so that the comparison with a synthesised controller is fair.
+"""Automatic tuning of skyhook loops, for a fair comparison with a synthesised controller.
 
-The search runs on frequency responses of sampled plants, where closing the loops costs an inverse of the size of the
-axes, and starts from what anyone would try first: critical damping and its neighbours. From the best of them all gains
-and corners are moved together by linear programs in a trust region on the largest singular values, whose slopes are
-known. The bound on the worst case is then computed by the caller on the whole uncertainty set; worst cases that the
-samples missed come back as new samples (`Scenarios.with_delta`, `Scenarios.with_worst`) until the tuning holds.
+The search uses frequency responses of sampled plants: closing the loops then costs one inverse of a matrix of the
+number of axes. It starts from the obvious tunings: critical damping and gains and corners around it. From the best of
+these, all gains and corners are improved together by linear programs in a trust region, on the largest singular values
+and their analytic gradients. The caller then computes a worst-case bound over the whole uncertainty set. Worst cases
+that the samples missed are added as new samples (`Scenarios.with_delta`, `Scenarios.with_worst`) until the samples
+represent the worst case.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """The responses between floor (w), payload (z), commands (u) and measurements (y) at each frequency."""
+    """Frequency responses between floor (w), payload (z), commands (u) and measurements (y)."""
 
     zw: np.ndarray
     zu: np.ndarray
@@ -40,7 +41,8 @@ class Channels:
 class Scenarios:
     """Sampled plants as frequency responses: `channels` arrays are (n_samples, n_omega, ...).
 
-    plants : how many of the samples, the first ones, are one plant at all frequencies.
+    plants : number of samples, from the first, whose perturbation is the same at all frequencies, so that they are
+        plants.
     """
 
     plant: GeneralizedPlant
@@ -54,11 +56,12 @@ class Scenarios:
     @staticmethod
     def sample(plant: GeneralizedPlant, floor: Sequence[str], payload: Sequence[str], omega: np.ndarray,
                count: int, seed: int) -> Scenarios:
-        """The nominal plant and `count` samples on the boundary of the set.
+        """The nominal plant and `count` samples on the boundary of the uncertainty set.
 
-        Complex blocks of one sample share a phase, and the phases of the samples go round the circle: alike channels
-        that all lag, or all lose their gain, together are what destabilises decentralised loops. Phases drawn for each
-        channel cancel in the sum, and the search then ends at loops that are not stable for the whole set.
+        All complex blocks of one sample have the same phase, and the phases of the samples cover the circle.
+        Decentralised loops are destabilised by similar channels that all lag, or all lose gain, at the same time.
+        Independent phases would average out in the sum of the channels; the search would then converge to loops that
+        are unstable for part of the set.
         """
         rng = np.random.default_rng(seed)
         deltas = np.zeros((count + 1, omega.size, plant.blocks.n_w, plant.blocks.n_z), complex)
@@ -69,24 +72,24 @@ class Scenarios:
                          count + 1)
 
     def with_delta(self, delta: np.ndarray) -> Scenarios:
-        """The same with one more sample: a worst case found by a bound, at every frequency alike."""
+        """A copy with one more sample: a worst case found by a bound, the same at every frequency."""
         more = np.broadcast_to(delta, self.deltas.shape[1:])
         at = self.plants
         return replace(self, deltas=np.concatenate([self.deltas[:at], more[None], self.deltas[at:]]), plants=at + 1)
 
     def with_worst(self, deltas: np.ndarray) -> Scenarios:
-        """The same with the worst case of each frequency on its own (n_omega, n_w, n_z) as one more sample."""
+        """A copy with one more sample: the worst case of each frequency by itself (n_omega, n_w, n_z)."""
         return replace(self, deltas=np.concatenate([self.deltas, deltas[None]]))
 
     def with_frequencies(self, omega: np.ndarray) -> Scenarios:
-        """The same at more frequencies [rad/s]; a worst case of its own there is that of the nearest one so far."""
+        """A copy with more frequencies [rad/s]; each new one takes the perturbations of the nearest old frequency."""
         every = np.union1d(self.omega, omega)
         nearest = np.argmin(np.abs(np.log(every[:, None] / self.omega)), axis=1)
         return replace(self, omega=every, responses=self.plant.P.frequency_response(every),
                        deltas=self.deltas[:, nearest])
 
     def channels(self) -> Channels:
-        """Closes Delta around the responses: F_u(P(j omega), Delta) sample by sample."""
+        """Close Delta around the responses: F_u(P(j omega), Delta), sample by sample."""
         n_w, n_z = self.plant.blocks.n_w, self.plant.blocks.n_z
         M, M12 = self.responses[:, :n_z, :n_w], self.responses[:, :n_z, n_w:]
         M21, M22 = self.responses[:, n_z:, :n_w], self.responses[:, n_z:, n_w:]
@@ -97,7 +100,7 @@ class Scenarios:
 
 
 def _boundary(plant: GeneralizedPlant, rng: np.random.Generator, phase: complex) -> np.ndarray:
-    """Real scalars at +-1, complex blocks of unit norm with the phase given."""
+    """Real scalars at +-1, complex blocks of unit norm with the given phase."""
     return plant.blocks.assemble([rng.choice([-1.0, 1.0]) if block.kind == "real"
                                   else phase if block.kind == "complex"
                                   else phase * np.eye(block.rows, block.cols) for block in plant.blocks.blocks])
@@ -105,7 +108,7 @@ def _boundary(plant: GeneralizedPlant, rng: np.random.Generator, phase: complex)
 
 @dataclass(frozen=True)
 class TuningRange:
-    """Where the search may go: gains as multiples of critical damping, corners in Hz."""
+    """Bounds of the search: gains as multiples of critical damping, corners in Hz."""
 
     critical: tuple[float, ...]
     gain_factor: tuple[float, float] = (0.05, 20.0)
@@ -113,7 +116,7 @@ class TuningRange:
     roll_off_Hz: tuple[float, float] = (5.0, 400.0)
 
     def bounds(self) -> np.ndarray:
-        """Bounds (n, 2) of the logarithms searched over: gains, tilt corner, roll-off."""
+        """Bounds (n, 2) of the logarithmic search variables: gains, tilt corner, roll-off."""
         limits = [*([self.gain_factor] * len(self.critical)), self.tilt_corner_Hz, self.roll_off_Hz]
         return np.log(np.array(limits, float))
 
@@ -125,7 +128,7 @@ class TuningRange:
         return Skyhook(axes, tuple(float(g) for g in factors * np.array(self.critical)), float(tilt), float(roll))
 
     def point(self, gain_factor: float, corners_Hz: tuple[float, float]) -> np.ndarray:
-        """The point with all gains alike, moved into the range where it lies beyond."""
+        """The point with the same gain factor for all axes, clipped to the range."""
         bounds = self.bounds()
         wanted = np.log([*([gain_factor] * len(self.critical)), *corners_Hz])
         return np.clip(wanted, bounds[:, 0], bounds[:, 1])
@@ -133,14 +136,14 @@ class TuningRange:
 
 @dataclass(frozen=True)
 class TuningSettings:
-    """Limits of the search; every limit is a count, none a time.
+    """Limits of the search. Every limit is a count, not a time.
 
     gain_factors : multiples of critical damping to start from, besides the classical rule (1).
-    tilt_corners_Hz, roll_offs_Hz : corners to start from: the usual ones and half a decade to either side.
-    refined : starts that are improved, the best by the measure of the search.
-    steps : linear programs from each start.
-    radius : first trust region, in logarithms (a factor e^0.5 of a gain or corner).
-    converged : gain of a step (relative) below which the next is not worth taking.
+    tilt_corners_Hz, roll_offs_Hz : corners to start from: the usual values and half a decade to either side.
+    refined : number of starting points that are improved, the best ones by the merit of the search.
+    steps : maximum number of linear programs per starting point.
+    radius : initial trust region, in logarithms (a factor e^0.5 of a gain or corner).
+    converged : relative improvement of a step below which the search stops.
     """
 
     gain_factors: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -154,10 +157,10 @@ class TuningSettings:
 
 @dataclass(frozen=True)
 class Merit:
-    """What a tuning is judged by, on samples or on the whole set: smaller is better, in this order.
+    """Figure of merit of a tuning, on samples or on the whole set; smaller is better.
 
-    A tuning that keeps the limit comes before one that does not; among those that do, the transmissibility in the band
-    counts, among those that do not the peak. unstable : half turns of the return difference about the origin.
+    Stable tunings that meet the limit on the peak rank before all others, by their transmissibility in the band. The
+    others rank by `unstable`, then by their peak. unstable : half turns of the return difference about the origin.
     """
 
     peak: float
@@ -175,7 +178,7 @@ class Merit:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """The tunings of some axes on sampled plants, by their largest singular values at each frequency."""
+    """Tunings of some axes on sampled plants, judged by the largest singular value at each frequency."""
 
     scenarios: Scenarios
     axes: tuple[str, ...]
@@ -189,34 +192,34 @@ class Search:
 
     @cached_property
     def inside(self) -> np.ndarray:
-        """Which frequencies lie in the band (n_omega,)."""
+        """Mask of the frequencies inside the band (n_omega,)."""
         low, high = (2 * np.pi * f for f in self.band_Hz)
         return (self.scenarios.omega >= low * (1 - 1e-9)) & (self.scenarios.omega <= high * (1 + 1e-9))
 
     def merit(self, point: np.ndarray, limit: float) -> Merit:
-        """A tuning on the samples."""
+        """Merit of a tuning on the samples."""
         K, _ = self._loops(point)
-        # Unstable loops have finite responses too: the return difference must not encircle the origin. A worst case
-        # of each frequency on its own is no plant, and turns say nothing there.
+        # Unstable loops have finite responses too: for stability the return difference must not encircle the origin. A
+        # sample with the worst case of each frequency by itself is not a plant, so its encirclements have no meaning.
         plants = self.channels.yu[:self.scenarios.plants]
         turns = encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
         sigma = largest_singular_value(self.channels.closed(K))
         return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, turns)
 
     def starts(self) -> list[np.ndarray]:
-        """The classical tunings: multiples of critical damping with the usual corners and their neighbours."""
+        """The classical tunings: multiples of critical damping with the usual corners and corners around them."""
         asked = self.settings
         points = [self.search.point(g, (tilt, roll)) for g in asked.gain_factors for tilt in asked.tilt_corners_Hz
                   for roll in asked.roll_offs_Hz]
         return list({tuple(np.round(point, 9)): point for point in points}.values())
 
     def best_starts(self, limit: float, more: Sequence[np.ndarray] = ()) -> list[np.ndarray]:
-        """The starts worth improving, best first; `more` joins them. Those that are not stable come last."""
+        """The best starting points, `more` included, best first. Unstable ones rank last."""
         ranked = sorted([*more, *self.starts()], key=lambda point: self.merit(point, limit).key())
         return ranked[:self.settings.refined]
 
     def improved(self, point: np.ndarray, limit: float) -> np.ndarray:
-        """Sequential linear programs in a trust region: least peak until it keeps the limit, then least in the band."""
+        """Minimise the peak down to the limit, then the maximum in the band, by linear programs in a trust region."""
         bounds, radius = self.search.bounds(), self.settings.radius
         here = self.merit(point, limit)
         for _ in range(self.settings.steps):
@@ -237,14 +240,14 @@ class Search:
         return point
 
     def _loops(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """K on the diagonal (n_omega, n_axes), and d log K to the logarithms of both corners (n_omega, 2)."""
+        """Diagonal of K (n_omega, n_axes), and d log K / d log corner for both corners (n_omega, 2)."""
         skyhook, s = self.search.skyhook(self.axes, point), 1j * self.scenarios.omega
         tilt, roll = 2 * np.pi * skyhook.tilt_corner_Hz, 2 * np.pi * skyhook.roll_off_Hz
         shape = s / (s + tilt) * roll / (s + roll)
         return -shape[:, None] * np.array(skyhook.gains), np.stack([-tilt / (s + tilt), s / (s + roll)], axis=1)
 
     def _linearised(self, point: np.ndarray, reach: float = 0.7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """log sigma (n,) near the peak or the band's, slopes to the point (n, n_point), and which lie in the band."""
+        """log sigma (n,) near the peak and the band's maximum, gradients (n, n_point), and a mask of the band."""
         K, of_corners = self._loops(point)
         parts = self.channels
         S = np.linalg.inv(np.eye(K.shape[-1]) - parts.yu * K[:, None, :])
@@ -266,9 +269,9 @@ class Search:
 
 def _minimax_step(values: np.ndarray, slopes: np.ndarray, in_band: np.ndarray, log_limit: float, low: np.ndarray,
                   high: np.ndarray) -> np.ndarray:
-    """Move between low and high: the least excess over the limit, to first order, and then the least in the band."""
+    """Step between low and high that minimises, to first order, the excess over the limit, then the band's maximum."""
     n = slopes.shape[1]
-    # Unknowns: the move, the excess of all lines over the limit (at least 0), the level of the band's.
+    # Unknowns: the step, the largest excess over the limit (at least 0), the maximum in the band.
     excess = np.hstack([slopes, -np.ones((values.size, 1)), np.zeros((values.size, 1))])
     level = np.hstack([slopes, np.zeros((values.size, 1)), -np.ones((values.size, 1))])[in_band]
     program = so.linprog(np.r_[np.zeros(n), 100.0, 1.0], A_ub=np.vstack([excess, level]),

@@ -1,4 +1,4 @@
-"""The `avis` command: thin, and late with its imports, so that `avis --help` answers at once."""
+"""The `avis` command. Imports are deferred so that `avis --help` responds at once."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from avis_ctrl.cli.sweep import sweep
 from avis_ctrl.errors import AvisError, ComputationError, InputError, UserInterruptError
 from avis_ctrl.measurement.layouts import FORMATS
 
-# A line a paragraph: the terminal breaks them.
+# One line per paragraph: the terminal wraps them.
 LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
 INTERRUPTED = UserInterruptError.exit_code
-AGAIN_S = 3.0  # time to clean up after an interrupt that was heard
+AGAIN_S = 3.0  # time for clean-up before the interrupt is repeated
 
 # Markdown: paragraphs of the help are wrapped to the terminal.
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="markdown",
@@ -45,7 +45,7 @@ def _commands(version: Annotated[bool, typer.Option("--version", callback=_versi
                                                     help="print the version")] = False) -> None:
     """Workbench for active vibration isolation tables.
 
-    Exit codes: 0 done (read the verdict), 2 the input is wrong, 3 a computation failed.
+    Exit codes: 0 done (read the verdict), 2 invalid input, 3 a computation failed.
     """
 
 
@@ -76,7 +76,7 @@ app.add_typer(new, name="new")
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """KeyboardInterrupt, and again after a while: one that falls into a callback of a compiled library is lost."""
+    """Raise KeyboardInterrupt, and again after AGAIN_S: one raised inside a callback of compiled code is lost."""
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, _interrupt)
         signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
@@ -89,7 +89,7 @@ def _no_more_alarms() -> None:
 
 
 def _silence_lost_interrupts() -> None:
-    """Keep Python from printing the traceback of an interrupt lost in a callback: the alarm interrupts again."""
+    """Suppress the traceback of a KeyboardInterrupt that was lost in a callback; the alarm raises it again."""
     usual = sys.unraisablehook
 
     def hook(ignored: Any) -> None:
@@ -99,18 +99,18 @@ def _silence_lost_interrupts() -> None:
 
 
 def _refusal(error: OSError) -> str:
-    """One line for an error of the operating system."""
+    """One-line message for an error of the operating system."""
     where = f"{error.filename}: " if error.filename else ""
     lines = str(error.strerror or error).splitlines() or [type(error).__name__]
     return f"{where}{lines[0]}; next: check free disk space and permissions"
 
 
 def _say_unusual() -> None:
-    """Print warnings about unusual rig files as one line, without the place in the source; leave the others alone."""
+    """Print warnings about unusual rig files as one line without the source location; others remain unchanged."""
     usual = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *of: Any, **also: Any) -> None:
-        if category.__name__ == "UnusualRig":  # by name: its module is not to be loaded for --help
+        if category.__name__ == "UnusualRig":  # compared by name: --help must not load its module
             print(f"avis: {message}", file=sys.stderr)
         else:
             usual(message, category, *of, **also)
@@ -118,45 +118,46 @@ def _say_unusual() -> None:
 
 
 def main() -> None:
-    """Entry point: errors of ours end in one line and their exit code."""
+    """Entry point: errors of avis_ctrl end in one line and an exit code."""
     _say_unusual()
     _silence_lost_interrupts()
-    # Before numpy is loaded: several BLAS threads round differently from one, and are slower on small matrices.
+    # Set before numpy is loaded: rounding depends on the number of BLAS threads, and more threads are slower on small
+    # matrices.
     os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     try:
-        # The parser hands back the code of typer.Exit, and 130 after Ctrl-C.
+        # The parser returns the code of typer.Exit, and 130 after Ctrl-C.
         code = app(standalone_mode=False)
-        sys.stdout.flush()  # if the output goes to a file, the disk may be full
+        sys.stdout.flush()  # fails if the output goes to a file and the disk is full
     except AvisError as error:
         _no_more_alarms()
         print(f"avis: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except OSError as error:
         print(f"avis: {_refusal(error)}", file=sys.stderr)
-        # Output that could not be written is not tried again at exit.
+        # Prevents a second attempt, at exit, to write this output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(ComputationError.exit_code)
     except typer.Abort as error:
-        if isinstance(error.__context__, EOFError):  # a question, and nobody there
+        if isinstance(error.__context__, EOFError):  # a prompt, but no more input
             print("\navis: the standard input ended before all values were given; give what is missing as options "
                   "(see --help)", file=sys.stderr)
             sys.exit(InputError.exit_code)
         code = INTERRUPTED
     except KeyboardInterrupt:
         code = INTERRUPTED
-    except SystemError as error:  # what numba makes of an interrupt while it loads compiled code
+    except SystemError as error:  # numba turns an interrupt into this while it loads compiled code
         reason: BaseException | None = error
         while reason is not None and not isinstance(reason, KeyboardInterrupt):
             reason = reason.__cause__ or reason.__context__
         if reason is None:
             raise
         code = INTERRUPTED
-    except Exception as error:  # usage errors of the command line parser carry their own code
+    except Exception as error:  # usage errors of the command line parser have their own exit code
         if not (hasattr(error, "exit_code") and hasattr(error, "format_message")):
             raise
-        if message := error.format_message():  # without a command the help has said it
+        if message := error.format_message():  # empty without a command: the help was printed
             print(f"avis: {message}", file=sys.stderr)
         sys.exit(error.exit_code)
     _no_more_alarms()

@@ -12,7 +12,7 @@ def compare(
     first: Annotated[Path, typer.Argument(metavar="DESIGN_A", help="output folder of avis design")],
     second: Annotated[Path, typer.Argument(metavar="DESIGN_B", help="another one")],
 ) -> None:
-    """Compare two designs side by side: what they requested, and their results."""
+    """Compare two designs side by side: differences of the design files, and the results."""
     from rich.console import Console
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""What the commands say while they work."""
+"""Progress output of the commands, and Ctrl-C as a stop request."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Progress:
-    """A line with the time at each step; on a terminal a spinner below says that work goes on."""
+    """Print a line with the elapsed time at each step; on a terminal also show a spinner."""
 
     def __init__(self, console):
         self.console, self.began = console, time.monotonic()
@@ -30,8 +30,10 @@ class Progress:
 
 
 class StopRequest:
-    """Ctrl-C as a request: from the first call on, it lets a computation end with the best result so far instead of
-    ending the command. A second one ends the command as usual.
+    """Ctrl-C as a stop request.
+
+    From the first call of this object on, Ctrl-C lets a computation stop with the best result so far instead of ending
+    the command. A second Ctrl-C ends the command as usual.
     """
 
     def __init__(self, say: Callable[[str], None]):

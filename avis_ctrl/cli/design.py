@@ -21,7 +21,8 @@ def design(
     sensor volts to drive volts, all axes), study.json (the inputs, for avis export), plant.json and result.json into
     DIR. Ctrl-C during the D-K iteration continues with the best controller so far; a second Ctrl-C ends the command.
 
-    The exit code is 3 if the closed loop is unstable for any simulated plant; the first sentence names the cause.
+    The exit code is 3 if the closed loop is unstable for any simulated plant; the first sentence of the output names
+    the cause.
     """
     from rich.console import Console
 
@@ -30,7 +31,7 @@ def design(
     from avis_ctrl.study.output import FILES, FOLDERS, write_study
 
     console = Console(highlight=False)
-    design, rig = read_study(file)  # before anything is imported or written that takes time
+    design, rig = read_study(file)  # before slow imports, and before anything is written
     with output_folder(out, FILES, FOLDERS) as folder, Progress(console) as progress:
         from avis_ctrl.report import rendered
         from avis_ctrl.report.content import document

@@ -1,4 +1,4 @@
-"""`avis export`: the controller that a rig's processor loads, with the certificate of its numbers."""
+"""`avis export`: the controller for a rig's processor, with a certificate computed from the exported numbers."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def export(
         console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
     controller = controller or "mu"
-    K = folder.controller(controller)  # a wrong name is said before anything is created
+    K = folder.controller(controller)  # a wrong name is reported before anything is created
     with output_folder(out, (*FILES, ORDERS)) as path, Progress(console) as progress:
         pictures, most = dict[str, bytes](), float("inf")
         if order is not None:
@@ -84,7 +84,7 @@ def export(
 
 
 def _picture(orders) -> bytes:
-    """Order against mu as a picture (PNG)."""
+    """Plot of mu against controller order (PNG)."""
     import io
 
     from matplotlib.figure import Figure
@@ -108,7 +108,7 @@ def _orders(console, orders) -> None:
 
 
 def _anti_windup(choice) -> str:
-    """What was chosen, and the recovery at the highest level with and without it."""
+    """The chosen anti-windup, and the recovery at the highest level with and without it."""
     with_it, without = (1e3 * one[-1, 0] for one in (choice.chosen, choice.without))
     after = f"after floor motion that demands {choice.levels[-1]:g} times the drives' range"
     if choice.corner_Hz is None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-# Of `convert` and `identify`: what a file may lack.
+# Options of `convert`, `identify` and `gap` for information that a file may lack.
 PERIOD = Annotated[float | None, typer.Option("--period", metavar="SECONDS", help="period of a multisine, if the file "
                                               "does not state it")]
 EXCITATION = Annotated[str | None, typer.Option("--excitation", metavar="KIND", help="multisine, noise, rest, floor or "
@@ -19,6 +19,6 @@ UNIT_Y = Annotated[str | None, typer.Option("--unit-y", metavar="UNIT", help="un
 
 def known_hints(period_s: float | None, excitation: str | None, sample_rate_Hz: float | None,
                 y_unit: str | None) -> dict[str, Any]:
-    """Those of the hints that were given."""
+    """The hints that were given, by name."""
     given = {"period_s": period_s, "excitation": excitation, "sample_rate_Hz": sample_rate_Hz, "y_unit": y_unit}
     return {name: value for name, value in given.items() if value is not None}

@@ -1,4 +1,4 @@
-"""`avis gap`: which physical effect a model still misses."""
+"""`avis gap`: the physical effects that a model lacks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def gap(
                                                          "has the result stop")] = False,
     seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
-    """Find where model and measurement disagree, and name the physical effects that the model misses.
+    """Find where model and measurement disagree, and name the physical effects that the model lacks.
 
     Writes gap.json, gap.html, gap.pdf and the models baseline and updated (.json, .toml) into DIR. Then `avis predict
     DIR OTHER --out PRED.h5` predicts another campaign with both models.
@@ -54,7 +54,7 @@ def gap(
     from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
-    GapOptions(seed, band_Hz, amplifier_corner_Hz=amplifier_Hz)  # what is wrong with them is said now
+    GapOptions(seed, band_Hz, amplifier_corner_Hz=amplifier_Hz)  # raises at once if they are invalid
     own = None
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
@@ -65,7 +65,7 @@ def gap(
     if design or design_file is not None:
         from avis_ctrl.study.gap_design import design_for
 
-        design_for(start, design_file)  # what is wrong with it is said now, not after the search
+        design_for(start, design_file)  # raises at once, not after the search, if it is invalid
     mapping = parse_columns(columns) if columns else None
     measured = read_measurements(campaign, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     if not isinstance(measured, Campaign):

@@ -1,4 +1,4 @@
-"""`avis gap-axis`: what a model of one axis lacks, named from a measurement."""
+"""`avis gap-axis`: the effects that a model of one axis lacks, found in a measurement."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def gap_axis(
                                              "that avis predict reads")] = None,
     seed: Annotated[int, typer.Option("--seed", hidden=True, help="has no influence any more")] = 1,
 ) -> None:
-    """Find the effects that a model of one axis misses, with size, probability, and the gap before and after.
+    """Find the effects that a model of one axis lacks: their size and probability, and the gap before and after.
 
     For example: avis gap-axis drive drive.mat --columns force=vir,position=qm,reference=qg,t=t --scale force=35.15
     """

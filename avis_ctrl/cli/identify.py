@@ -1,4 +1,4 @@
-"""`avis identify` and `avis predict`: from measurements to a rig, and what that rig would have measured."""
+"""`avis identify`, `avis predict` and `avis single-axis`: models from measurements, and predictions with them."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def identify(
             more, made = design_start(found, design)
             then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
         except AvisError as error:
-            # The identification is valid without them.
+            # The identification is valid without the design files.
             more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
         progress("report")
         files = write_identification(found, folder, *rendered(document(found, made)), more)
@@ -150,7 +150,7 @@ def predict(
         measured = in_words_of(rig, measured)
     except InputError as error:
         raise error if error.file else error.in_file(campaign) from None
-    assert isinstance(measured, Campaign)  # as it was
+    assert isinstance(measured, Campaign)  # in_words_of keeps the type
     with Progress(console) as progress:
         write(folder, measured, out, progress)
         progress("prediction errors")
@@ -214,7 +214,7 @@ def single_axis(
     scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
     sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, if the file has none")] = None,
 ) -> None:
-    """Fit a small model of one axis: a seismometer, a free decay, a drive with friction, an oscillator."""
+    """Fit a small model of one axis: a seismometer, a free decay, a drive with friction, or an oscillator."""
     from rich.console import Console
 
     from avis_ctrl.identification.single_axis.identify import identify_single_axis
@@ -234,7 +234,7 @@ def single_axis(
         console.print(line)
 
 
-# What the fits take the numbers of each role for, after --scale.
+# Units that the fits assume for each role, after --scale.
 UNITS = {
     "seismometer": {"drive": "N (m/s where ground is mapped)", "coil": "V", "displacement": "m", "ground": "V"},
     "decay": {"y": "any unit"},
@@ -244,7 +244,7 @@ UNITS = {
 
 
 def _assumed_units(kind: str, roles: dict[str, str], factors: dict[str, float]) -> str:
-    """One line: what each column was taken for."""
+    """One line with the unit assumed for each column."""
     said = [f"{role} = {roles[role]}{f' times {factors[role]:g}' if role in factors else ''} in {unit}"
             for role, unit in UNITS[kind].items() if role in roles]
     unscaled = [role for role in roles if role in UNITS[kind] and role not in factors

@@ -1,4 +1,4 @@
-"""`avis excite`, `avis simulate-campaign`, `avis convert`: signals to play, rehearsals, file formats."""
+"""`avis excite`, `avis simulate-campaign`, `avis convert`: excitation signals, simulated campaigns, file formats."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from avis_ctrl.cli.console import Progress
 from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
 from avis_ctrl.errors import InputError
 
-# A rig is stiffer or better damped than its file says, but not twice.
+# Fraction of the largest level at which nothing clips: a rig may respond more strongly than its file predicts, but not
+# twice as strongly.
 LEVEL_SHARE = 0.5
 RIG = Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")]
 
@@ -144,7 +145,7 @@ def convert(
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
 ) -> None:
-    """Convert any measurement file to a campaign in HDF5, and print the assumptions."""
+    """Convert a measurement file to a campaign in HDF5, and print the assumptions made."""
     from rich.console import Console
 
     from avis_ctrl.measurement.campaign import Campaign, in_short

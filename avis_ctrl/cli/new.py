@@ -1,4 +1,4 @@
-"""`avis new`: asks a few questions and writes a commented rig file or design file. Each value is checked at once."""
+"""`avis new`: prompts for a few values, checks each at once, and writes a commented rig file or design file."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ app = typer.Typer(no_args_is_help=True, help="Write a commented rig file or desi
 
 
 def _absent(out: Path) -> Path:
-    """Refused before the first question."""
+    """Raise InputError for an existing file, before the first prompt."""
     if out.exists():
         raise InputError("this file exists; choose another name or remove it", file=out)
     return out
 
 
 def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], None]) -> Any:
-    """An option that is asked for where it is not given; an answer that does not pass is asked for again."""
+    """An option that is prompted for if it is not given; an invalid answer is prompted for again."""
     def checked(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
         try:
             check(ctx, str(param.name), value)
         except InputError as error:
-            if ctx.get_parameter_source(str(param.name)) is None:  # an answer: its source is noted after the question
+            if ctx.get_parameter_source(str(param.name)) is None:  # typed at the prompt: its source is set later
                 raise typer.BadParameter(str(error)) from None
             raise
         return value
-    # In a help text [kg] would be markup.
+    # [kg] in a help text would be markup.
     return typer.Option(flag, prompt=question, help=question.replace("[", r"\["), callback=checked)
 
 
@@ -86,17 +86,17 @@ def rig(
 
 
 def _check_design(ctx: typer.Context, name: str, value: Any) -> None:
-    """With what is usual in place of the other answers, so that what is wrong is this one."""
+    """Check one answer with defaults for the others, so that an error refers to this answer."""
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.new_files import NewDesign, new_design
 
     if name == "rig":
         load_rig(value)
         return
-    if "rig" not in ctx.params:  # still to be asked for; all is checked together in the end
+    if "rig" not in ctx.params:  # not yet known; everything is checked together at the end
         return
     fields = _design_fields({name: value})
-    if name == "peak_dB":  # asked for before the limit in the band, which must be lower
+    if name == "peak_dB":  # prompted for before the limit in the band, which must be lower
         fields["band_dB"] = min(NewDesign.band_dB, value - 1.0)
     elif name == "band_dB":
         fields["peak_dB"] = ctx.params.get("peak_dB", NewDesign.peak_dB)
@@ -133,13 +133,13 @@ def design(
     stiffness_percent: Annotated[float, _asked("--stiffness", "Stiffness known to within [%]", _check_design)] = 15.0,
     damping_percent: Annotated[float, _asked("--damping", "Damping known to within [%]", _check_design)] = 30.0,
 ) -> None:
-    """Write a design file for a rig from bounds on the transmissibility and the uncertainty of its parameters."""
+    """Write a design file for a rig from bounds on its transmissibility and parameter uncertainty."""
     from avis_ctrl.files import write_whole
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.design_file import read_study
     from avis_ctrl.study.new_files import NewDesign, design_text, new_design
 
-    # A design file names its rig relative to itself.
+    # In a design file, the path of the rig file is relative to the design file.
     named = os.path.relpath(rig, out.resolve().parent) if _is_file(rig) else rig
     made = new_design(NewDesign(**_design_fields({key: ctx.params[key] for key in DESIGN})), load_rig(rig), named)
     write_whole(out, design_text(made).encode())

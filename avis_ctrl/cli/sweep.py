@@ -1,4 +1,4 @@
-"""`avis sweep`: many designs, skyhooks or gaps from one file of points."""
+"""`avis sweep`: many designs, skyhooks, gap searches or function calls from one points file."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def sweep(
     """Compute many designs (points), and write a table and their Pareto front.
 
     Writes points/HASH.json as each point is finished, then sweep.csv, pareto.png, sweep.html and sweep.json into DIR.
-    If the command is interrupted, the same command continues with the missing points. A point that fails has the reason
-    in its row.
+    If the command is interrupted, the same command continues with the missing points. The row of a failed point has the
+    reason.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

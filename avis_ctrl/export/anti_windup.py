@@ -1,13 +1,13 @@
-"""Which anti-windup the code has, if any: chosen by simulation of the nonlinear table, each against none.
+"""Choice of the anti-windup by simulation of the nonlinear table; each law is compared with no anti-windup.
 
-No anti-windup is best for every controller: what the limits cut off may be what the table should not get anyway, and a
-law that reacts to it then prolongs the recovery. The circle criterion, by which these laws could guarantee an L2 gain,
-is not met even without anti-windup: at the upper crossover an eigenvalue of I - L has a phase beyond 90 degrees.
-So the choice is made by comparison: the floor moves as at the site, but so far that the linear loop would demand
-several times the drives' range, then it rests. A law is kept only if the table recovers no more slowly than without it,
-at every level of the floor. Of those kept, the one with the smallest geometric mean of all figures is exported; if none
-is better than no anti-windup, there is none. Random motion averages over the instants at which it may end; after a
-single sine the recovery depends on that instant more than on the law.
+No anti-windup is best for every controller. The part of the demand beyond the limits may be one that the table should
+not get anyway; a law that reacts to it then prolongs the recovery. The circle criterion, by which these laws could
+guarantee an L2 gain, is not satisfied even without anti-windup: at the upper crossover an eigenvalue of I - L has a
+phase beyond 90 degrees. Therefore the laws are compared: the floor moves as at the site, but so far that the linear
+loop would demand several times the drives' range, then it rests. A law qualifies only if the table recovers no more
+slowly than without it, at every level of the floor. Of these laws, the one with the smallest geometric mean of all
+figures is exported; if none is better than no anti-windup, none is exported. Random motion averages over the instants
+at which it may end; after a single sine the recovery depends on that instant more than on the law.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, AntiWindup, Sample
 @dataclass(frozen=True)
 class AntiWindupSettings:
     """levels : largest voltage that the linear loop would demand, in units of the drive's limit: from hardly limited to
-    limited throughout. records : of the floor's random motion at each level. motion_s, fade_s : it lasts several
-    periods of the slowest floor motion, and ends within the latter. rest_s : the rest that is judged, in which a damped
-    table settles. late_s : the part of it, from and to, whose largest velocity is judged: what rings on after the first
-    swing. corners_Hz, gains : of the lags tried; around the table's resonances, which the controller damps, and above
-    the corners of the slow states that wind up. alike : recoveries that differ by less than this fraction are alike;
-    other draws of the floor change them by a tenth. seed : of the floor.
+    always limited. records : number of random floor motions at each level. motion_s, fade_s : duration of the motion,
+    several periods of the slowest floor motion, and of its fade-out. rest_s : the rest that is evaluated, in which a
+    damped table settles. late_s : start and end of the part of it in which the largest velocity is evaluated: what
+    still rings after the first swing. corners_Hz, gains : of the lags tried; around the table's resonances, which the
+    controller damps, and above the corners of the slow states that wind up. alike : recoveries that differ by less than
+    this fraction count as equal; other floor records change them by a tenth. seed : of the floor.
     """
 
     levels: tuple[float, ...] = (1.5, 3.0, 6.0, 12.0)
@@ -48,9 +48,9 @@ class AntiWindupSettings:
 
 @dataclass(frozen=True)
 class Choice:
-    """law : the one that is exported. corner_Hz, gain : of its lag, None without one. levels : of the floor.
-    without, chosen : (levels, 2) the r.m.s. velocity of the kept axes in the rest, and the largest in its late part,
-    each r.m.s. over the records [m/s]; rotations at the edge."""
+    """law : the exported law. corner_Hz, gain : of its lag, None without one. levels : of the floor. without, chosen :
+    (levels, 2) r.m.s. velocity of the kept axes in the rest, and largest velocity in its late part, each r.m.s. over
+    the records [m/s]; rotations at the edge."""
 
     law: AntiWindup
     corner_Hz: float | None
@@ -60,7 +60,7 @@ class Choice:
     chosen: np.ndarray
 
     def as_dict(self) -> dict[str, Any]:
-        """Of certificate.json."""
+        """Entry of certificate.json."""
         def row(figures: np.ndarray) -> dict[str, list[float]]:
             return {"rms_m_per_s": figures[:, 0].tolist(), "late_peak_m_per_s": figures[:, 1].tolist()}
         return {"chosen": "none" if self.corner_Hz is None else "lag of the excess", "corner_Hz": self.corner_Hz,
@@ -70,9 +70,9 @@ class Choice:
 
 def choose_anti_windup(loop: SampledLoop, axes: tuple[str, ...],
                        settings: AntiWindupSettings = AntiWindupSettings()) -> Choice:
-    """The anti-windup for the loop of the exported controller, judged by the velocity of `axes`.
+    """Choose the anti-windup for the loop of the exported controller by the velocity of `axes`.
 
-    Converter and noise are left out: beyond the converter's range the code lets go of the table, and the drives do not
+    Converter and noise are omitted: beyond the converter's range the code switches the drives off, so that they do not
     reach their limits.
     """
     sensors = replace(loop.sensors, converter=None, noise_rms_V=np.zeros(1), flicker_rms_V=np.zeros(1),
@@ -99,7 +99,7 @@ def choose_anti_windup(loop: SampledLoop, axes: tuple[str, ...],
 
 
 def _floors(loop: SampledLoop, settings: AntiWindupSettings) -> np.ndarray:
-    """(records, n + 1, 6) floor velocities that end in rest, at which the linear loop just demands a drive's limit."""
+    """(records, n + 1, 6) floor velocities that end in rest; the linear loop just demands a drive's limit."""
     n = round((settings.motion_s + settings.rest_s) * loop.sample_rate_Hz)
     time = np.arange(n + 1) * loop.period_s
     fade = np.clip((settings.motion_s - time) / settings.fade_s, 0.0, 1.0)[:, None]
@@ -115,7 +115,8 @@ def _floors(loop: SampledLoop, settings: AntiWindupSettings) -> np.ndarray:
 
 def _recovery(loop: SampledLoop, axes: tuple[str, ...], floors: np.ndarray, settings: AntiWindupSettings
               ) -> np.ndarray:
-    """(2,) of the rest: r.m.s. velocity, and the largest in its late part, r.m.s. over the records."""
+    """(2,) r.m.s. velocity in the rest, and largest velocity in its late part, r.m.s. over the records; inf if
+    unstable."""
     kept = [COORDINATES.index(name) for name in axes]
     start, *late = (round((settings.motion_s + t) * loop.sample_rate_Hz) for t in (0.0, *settings.late_s))
     found = []

@@ -1,23 +1,24 @@
-"""Bounds of the loop that runs the emitted numbers: mu, worst-case transmissibility, stability.
+"""Bounds of the loop with the emitted numbers (those of controller.json): mu, worst-case transmissibility, stability.
 
-The design's uncertain plant stays in continuous time, and so does a rational controller K_s in its loop; what the
-emitted controller does beyond that is covered by two more uncertain blocks, of measured size (`sampled_response`):
+The design's uncertain plant stays in continuous time, with a rational controller K_s in its loop. Two more uncertain
+blocks cover what the emitted controller does differently; their size is computed in `sampled_response`:
 
     force = K_s seen + W_a Delta_a [K_s; k I] seen     |W_a| >= |M|, R - K_s exp(-j omega tau) = M [K_s; k I]
     seen  = G force + W_E Delta_E force                |W_E| >= |E|, the images of the sample rate
 
-An error of the controller is thus relative to the controller, direction by direction: the singular values of a
-controller of several axes may differ by a factor of a hundred or more; an error that is small beside the largest of
-them, but allowed in all directions, can exceed the smallest. k bounds the error in directions where the controller has
-little gain.
+"seen" are the velocities of the axes that the controller computes from its sensors. The error of the controller is
+relative to the controller, direction by direction. The singular values of a multi-axis controller may differ by a
+factor of a hundred or more: an error that is small compared with the largest of them, but allowed in all directions,
+can exceed the smallest. k bounds the error in directions in which the controller has little gain.
 
-Whatever the rounded, sampled and held controller does to frequencies below half the sample rate lies in this set, so
-that the bounds of `mu_peak` and `worst_case_gain` for it are bounds for the code. K_s is the design's own controller;
-any other function would do, with other W_a. A number of controller.json that is changed changes W_a and every bound.
+This set contains everything that the rounded, sampled and held controller does to frequencies below half the sample
+rate. The bounds of `mu_peak` and `worst_case_gain` for the set are therefore bounds for the code. K_s is the design's
+own controller; any other function would be valid, with another W_a. A change of any number in controller.json changes
+W_a and every bound.
 
-Stability of the sampled loop: det(I - L) does not vanish from frequency 0 to half the sample rate for any member of the
-set, so that its argument changes as that of the continuous loop with K_s, which is stable, provided that the loop gain
-is below 1 from half the rate on, where both arguments then end at zero (Nyquist, all parts stable by themselves).
+Stability of the sampled loop: for no member of the set does det(I - L) vanish between frequency 0 and half the sample
+rate. Its argument therefore changes as that of the continuous loop with K_s, which is stable, provided that the loop
+gain is below 1 from half the rate on, so that both arguments end at zero (Nyquist; all parts are stable by themselves).
 """
 
 from __future__ import annotations
@@ -43,26 +44,26 @@ from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 @dataclass(frozen=True)
 class CoverSettings:
-    """Filters that cover the two errors.
+    """Settings of the filters that cover the two errors.
 
-    lowest : as a fraction of half the sample rate, where the logarithmic intervals begin; below it the errors are
-        constant, and the intervals at most as wide as the first logarithmic one.
-    intervals : of the logarithmic grid, over each of which the errors are bounded; 0.4 % wide.
-    remainder, divisions : an interval in which Taylor's remainder is above `harmless` and above this fraction of the
-        error is divided, into at most so many parts. This happens near the controller's own modes.
-    fitted : every so many intervals are fitted; the filter is then raised over all of them.
-    beyond, points_beyond : up to this multiple of half the sample rate a filter is kept from rising, at so many points.
-    excess_dB : by which a filter may exceed the error; more order than that needs is not spent.
-    harmless : errors below this fraction of the controller, and below `harmless_images` of the largest gain of the
-        table, need not be followed closely. The smallest gain of the table may be a thousandth of the largest.
+    lowest : start of the logarithmic intervals, as a fraction of half the sample rate; below it the errors are
+        constant, and the intervals are at most as wide as the first logarithmic one.
+    intervals : number of logarithmic intervals over which the errors are bounded; each is 0.4 % wide.
+    remainder, divisions : an interval in which Taylor's remainder exceeds `harmless` and this fraction of the error is
+        divided, into at most this many parts. This happens near the controller's own modes.
+    fitted : one of this many intervals is used in the fit; the filter is then raised to cover all of them.
+    beyond, points_beyond : the filter must not rise up to this multiple of half the sample rate, at this many points.
+    excess_dB : allowed excess of a filter over the error; the order is no higher than this requires.
+    harmless, harmless_images : fraction of the controller, and of the largest gain of the table, below which the errors
+        need no close fit. The smallest gain of the table may be a thousandth of the largest.
     least, least_of_all : gain below which the controller's error is measured absolutely, as a fraction of its gain at
-        half the sample rate, and at least as a fraction of its largest gain. The error is largest at half the rate, and
-        this gain should add little to it; at low frequencies, where a controller may have no gain, rounding leaves a
-        little.
-    most : highest order of a filter: what a slow controller pole and hold at half the rate ask for together.
+        half the sample rate, and at least as a fraction of its largest gain. The error is largest at half the rate,
+        where this gain should add little to it. At low frequencies, where a controller may have no gain, a small
+        rounding error remains.
+    most : highest order of a filter; a slow controller pole together with the hold at half the rate requires it.
     first_points : number of frequencies, from half the sample rate on, at which the loop gain is computed first.
-    points, few_points : number of frequencies at which the worst-case gain is bounded from above, in addition to those
-        of the highest gains: `points` for its curve, `few_points` where none is wanted.
+    points, few_points : number of frequencies with an upper bound of the worst-case gain, in addition to those of the
+        highest gains: `points` if its curve is wanted, `few_points` otherwise.
     """
 
     lowest: float = 1e-7
@@ -98,7 +99,7 @@ class Grid:
         return Grid((ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2)
 
     def divided(self, parts: np.ndarray) -> Grid:
-        """Each interval divided into so many (n,) equal ones."""
+        """Divide each interval into this number (n,) of equal parts."""
         within = np.arange(np.sum(parts)) - np.repeat(np.cumsum(parts) - parts, parts)
         half, start = np.repeat(self.half / parts, parts), np.repeat(self.centre - self.half, parts)
         return Grid(start + (2 * within + 1) * half, half)
@@ -106,7 +107,7 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """The controller in the proof, and filters that cover what the emitted one does differently.
+    """The controller in the proof, and filters that cover the differences of the emitted controller.
 
     K : continuous, from seen velocities to forces. W_a : covers the error relative to [K; least I], least in N s/m.
     W_E : covers the images of the sample rate [m/(N s)].
@@ -119,9 +120,9 @@ class Errors:
 
     def closed(self, plant: GeneralizedPlant, W_v: Rational | None = None, W_f: Rational | None = None
                ) -> tuple[StateSpace, BlockStructure]:
-        """The loop closed with K, the two errors' blocks behind those of the plant.
+        """The loop closed with K; the blocks of the two errors follow those of the plant.
 
-        W_v, W_f : of further outputs W_v force, and of further inputs that add W_f times them to what is seen.
+        W_v, W_f : for additional outputs W_v force, and inputs whose product with W_f is added to what is seen.
         """
         P, blocks, n = plant.P, plant.blocks, plant.nmeas
         force, seen = [f"{name} applied" for name in plant.u], [f"{name} alone" for name in plant.y]
@@ -151,12 +152,12 @@ class Errors:
 class Bounds:
     """Upper bounds of the loop that runs the emitted numbers.
 
-    mu : robust performance of the weighted channels. peak, band : worst-case transmissibility, largest singular value,
+    mu : robust performance of the weighted channels. peak, band : worst-case transmissibility (largest singular value)
     up to half the sample rate and in the design's band.
-    all_times : worst-case r.m.s. gain from the floor's velocity up to half the sample rate to the payload's velocity at
-    all times, between the samples too. above : the same from the floor's velocity above half the rate, which the
-    samples show at other frequencies. Both inf where not proved.
-    gain_above : largest loop gain at and above half the sample rate; the proof of stability needs it below 1.
+    all_times : worst-case r.m.s. gain from the floor velocity up to half the sample rate to the payload velocity at all
+    times, also between the samples. above : the same from the floor velocity above half the rate, which the samples
+    show at other frequencies. Both are inf if not proved.
+    gain_above : largest loop gain at and above half the sample rate; the proof of stability requires less than 1.
     """
 
     mu: MuPeak
@@ -168,7 +169,7 @@ class Bounds:
 
 
 class StabilityNotProvedError(ComputationError):
-    """The proof of stability has failed. reason : why, in words."""
+    """The proof of stability failed. reason : why, in words."""
 
     def __init__(self, reason: str):
         super().__init__("the loop of the exported controller is not proved stable", measured=reason)
@@ -180,16 +181,16 @@ def gain_above_in_words(gain: float) -> str:
 
 
 def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings = CoverSettings()) -> Bounds:
-    """Bounds of the loop that runs the emitted numbers; first what the proof of stability needs, the cheapest first.
+    """Bounds of the loop with the emitted numbers; first the conditions of the stability proof, the cheapest first.
 
     Parameters
     ----------
-    only_stable : end as soon as that proof cannot succeed.
+    only_stable : stop as soon as that proof cannot succeed.
 
     Raises
     ------
     StabilityNotProvedError : only with `only_stable`.
-    ComputationError : the emitted controller is so far from the design's that no loop with it can be proved stable.
+    ComputationError : a nominal closed loop that is unstable with the design's controller, or a gain without a bound.
     """
     folder, design = axes.folder, axes.folder.design
     plant, K = folder.plant, folder.controller(axes.controller.name)
@@ -199,7 +200,7 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
     least = max(settings.least * float(gains[-1]), settings.least_of_all * float(np.max(gains)))
     W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
                  np.full(grid.centre.size, settings.harmless), settings)
-    # The table's bounds between frequencies take minutes where it has many blocks; at a few frequencies, seconds.
+    # Bounds of the table between frequencies take minutes if it has many blocks; at a few frequencies, seconds.
     if only_stable and not (at_least := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + SLACK:
         raise StabilityNotProvedError("the bound of the loop gain from half the sample rate on is at least "
                                       f"{at_least:.3g}; the proof needs less than 1")
@@ -218,7 +219,7 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
                                cause="files of different designs in one folder", next_step="run avis design again")
     whole = blocks.with_performance(len(plant.synthesis.w), len(plant.synthesis.z))
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
-    # One proof of robust stability for all gains: the further channels do not change the loop of the blocks.
+    # One proof of robust stability serves all gains: the additional channels do not change the loop of the blocks.
     robust = stability_bound(motion.select(range(blocks.n_z), range(blocks.n_w)), blocks)
     if only_stable and (largest := float(np.max(robust.upper_curve, initial=robust.lower))) >= 1 + SLACK:
         raise StabilityNotProvedError("mu of the uncertainty together with the sampling errors is at least "
@@ -238,7 +239,7 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
 
 def _controller_error(axes: SampledAxes, K: StateSpace, least: float, grid: Grid, settings: CoverSettings
                       ) -> np.ndarray:
-    """(n,) bound over each interval of the emitted controller's error relative to [K; least I]."""
+    """(n,) bound of the emitted controller's error relative to [K; least I], over each interval."""
     error, remainder = axes.controller_error(K, least, grid.centre, grid.half)
     allowed = np.maximum(settings.harmless, settings.remainder * (error - remainder))
     parts = np.clip(np.ceil(np.sqrt(remainder / allowed)), 1, settings.divisions).astype(int)
@@ -261,8 +262,8 @@ def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> f
 
 def _gain_above_at_least(axes: SampledAxes, K: StateSpace, least: float, W_a: Rational, settings: CoverSettings
                          ) -> float:
-    """A lower bound of `_gain_above`, up to the accuracy of the optimised bounds: at some of its frequencies, with the
-    nearest image only, at half the rate."""
+    """A lower bound of `_gain_above`, up to the accuracy of the optimised bounds: at some of its frequencies, and with
+    only the nearest image at half the rate."""
     omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
     omega = omega[::(settings.intervals - 1) // (settings.first_points - 1)]
     table = axes.force_to_seen_at(omega)
@@ -278,10 +279,11 @@ def _emitted_gain(K: StateSpace, least: float, W_a: Rational, omega: np.ndarray)
 
 def _between_samples(axes: SampledAxes, errors: Errors, grid: Grid, settings: CoverSettings
                      ) -> tuple[StateSpace, StateSpace]:
-    """The lifted loop from the floor up to half the sample rate, and from that above, to all of the payload.
+    """The lifted loops from the floor up to half the sample rate, and from the floor above it, to all payload motion.
 
-    The held forces move the payload above half the rate by at most W_v times their r.m.s. The floor there acts on the
-    samples like a seen velocity of at most W_f times its r.m.s.; beside that the payload follows it as without control.
+    The held forces move the payload above half the rate by at most W_v times their r.m.s. Floor motion there acts on
+    the samples like a seen velocity of at most W_f times its r.m.s.; in addition, the payload follows it as without
+    control.
     """
     plant = axes.folder.plant
     part = plant.full.restricted(plant.floor_velocities, plant.velocities)
@@ -301,15 +303,15 @@ def _gain(system: StateSpace, omega: np.ndarray) -> np.ndarray:
 
 
 def _cover(grid: Grid, error: np.ndarray, harmless: np.ndarray, settings: CoverSettings) -> Rational:
-    """A filter with |W| >= error over all intervals, of the lowest order that is near it where it is not harmless."""
+    """A filter with |W| >= error over all intervals, of the lowest order that is close to it where it matters."""
     lower = np.maximum(error, np.finfo(float).tiny)
     upper = np.maximum(lower, harmless)
-    # Corners may lie a factor `reach` outside the fitted frequencies: the lowest is still far above the width of the
+    # Corners may lie a factor `reach` outside the fitted frequencies; the lowest is still far above the width of the
     # first intervals.
     reach = 10.0
     every = slice(int(np.searchsorted(grid.centre, settings.lowest * grid.centre[-1])), None, settings.fitted)
-    # Above half the rate nothing has to be covered: the filter must not rise there, where the proof of robust stability
-    # meets it, and may fall.
+    # Above half the rate there is no error to cover. The filter must not rise there, because it still enters the proof
+    # of robust stability, but it may fall.
     end = grid.centre[-1]
     omega = np.concatenate([grid.centre[every], np.geomspace(1.1, settings.beyond, settings.points_beyond) * end])
     most = np.concatenate([upper[every], np.full(settings.points_beyond, upper[-1])])

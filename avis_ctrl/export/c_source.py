@@ -136,7 +136,7 @@ void avis_controller_step(avis_controller_t *c, const real_t y[], real_t u[])
 
 @dataclass(frozen=True)
 class Provenance:
-    """What the header comment says: each a line."""
+    """Content of the header comment, one entry per line."""
 
     lines: tuple[str, ...]
 
@@ -146,7 +146,7 @@ class Provenance:
 
 
 def _harmless(line: str) -> str:
-    """One line of printable ASCII that cannot end a C comment, whatever a title holds."""
+    """One line of printable ASCII that cannot end a C comment, whatever a title contains."""
     plain = "".join(one if " " <= one <= "~" else "?" for one in line)
     return plain.replace("*/", "* /").replace("/*", "/ *").replace("??/", "?? /").rstrip("\\")
 
@@ -192,21 +192,21 @@ def c_files(controller: SampledController, guard: Protection, provenance: Proven
 
 
 def _filled(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) first column of each row that is not zero, and one past the last."""
+    """(n,) first nonzero column of each row, and one past the last."""
     spans = [np.flatnonzero(row) for row in A]
     return (np.array([span[0] if span.size else 0 for span in spans], int),
             np.array([span[-1] + 1 if span.size else 0 for span in spans], int))
 
 
 def operations(controller: SampledController) -> int:
-    """Multiplications of one step without limits."""
+    """Number of multiplications in one step, without limits."""
     first, last = _filled(controller.system.A)
     K = controller.system
     return int(np.sum(last - first)) + K.B.size + K.C.size + K.D.size + K.noutputs
 
 
 def constants_of(source: str, dtype: type[np.floating]) -> dict[str, np.ndarray]:
-    """The arrays in the text of avis_controller.c by name, as the processor holds them. Raises InputError."""
+    """Arrays in the text of avis_controller.c by name, as the processor stores them. Raises InputError."""
     found = {}
     for name, shape, body in re.findall(r"static const real_t (\w+)((?:\[\d+\])+) = \{(.*?)\};", source, re.DOTALL):
         sizes = [int(one) for one in re.findall(r"\d+", shape)]

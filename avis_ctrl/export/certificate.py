@@ -1,4 +1,4 @@
-"""The certificate of the shipped code: every figure from the numbers in controller.json."""
+"""The certificate of the exported code; all of it is computed from the numbers in controller.json."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class StabilitySettings:
-    """plants : random plants of the uncertainty set, of all axes, whose loops are checked beside the proof for the kept
-    axes. gains : between 0 and 1, at which the start must be stable: steps of 10 %, between which the poles of a loop
+    """plants : random plants of the uncertainty set, of all axes, whose loops are checked in addition to the proof for
+    the kept axes. gains : between 0 and 1, at which the start must be stable. Between steps of 10 % the poles of a loop
     that is stable at both ends move little."""
 
     plants: int = 20
@@ -38,8 +38,8 @@ class StabilitySettings:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """content : certificate.json. loop : the emitted controller on the nominal rig. worst : worst plant of
-    transmissibility. reasons : what keeps `stable` or `guaranteed` from being true, in words."""
+    """content : certificate.json. loop : the emitted controller on the nominal rig. worst : plant with the worst
+    transmissibility. reasons : why `stable` or `guaranteed` is not true, in words."""
 
     content: dict[str, Any]
     loop: SampledLoop
@@ -47,7 +47,7 @@ class Certificate:
     reasons: tuple[str, ...]
 
     def one_line(self) -> str:
-        """For the header of the C files."""
+        """Summary for the header of the C files."""
         c = self.content
         known = {"mu": c["mu_upper"], "peak": c["worst_case_peak_transmissibility_dB"],
                  "band": c["worst_case_band_transmissibility_dB"]}
@@ -65,23 +65,23 @@ def shipped_loop(folder: DesignFolder, controller: SampledController) -> Sampled
 
 def certify(folder: DesignFolder, controller: SampledController, progress: Progress = lambda text: None,
             only_stable: bool = False, settings: StabilitySettings = StabilitySettings()) -> Certificate:
-    """Compute the certificate of a controller's numbers, without the time of a step.
+    """Compute the certificate of a controller's numbers, except for the execution time of a step.
 
     Parameters
     ----------
-    only_stable : end as soon as the loop cannot be proved stable.
+    only_stable : stop as soon as the loop cannot be proved stable.
 
     Raises
     ------
     StabilityNotProvedError : only with `only_stable`.
-    ComputationError : a loop for which no figure exists: unstable with the nominal plant.
+    ComputationError : a loop that is unstable with the nominal plant, for which nothing can be computed.
     """
     axes = SampledAxes.of(folder, controller)
     with threadpool_limits(1):
         loop = shipped_loop(folder, controller)
         progress("stability of all axes and rounding noise")
         noise = rounding_noise(controller, loop)
-        # Eigenvalues take seconds, the bounds minutes: first the eigenvalues.
+        # Eigenvalues first, because they take seconds and the bounds minutes.
         unstable = _unstable(_sampled_plants(folder, loop, settings))
         if only_stable and unstable:
             raise StabilityNotProvedError("; ".join(unstable))
@@ -123,7 +123,7 @@ def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: Stabil
 
 
 def _unstable(loops: Sequence[tuple[str, SampledLoop]], most: int = 3) -> tuple[str, ...]:
-    """At most `most` of the unstable loops in words, and how many more there are."""
+    """Descriptions of at most `most` unstable loops, and the number of further ones."""
     radii = [(name, radius) for name, loop in loops if not (radius := spectral_radius(loop)) < 1]
     found = tuple(f"{name}: spectral radius {radius:.6g}" for name, radius in radii[:most])
     return (*found, f"and {len(radii) - most} more of the {len(loops)} loops") if len(radii) > most else found

@@ -1,4 +1,4 @@
-"""The C code compiled with gcc and called from Python."""
+"""The C code, compiled with gcc and called from Python."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from avis_ctrl.export.c_source import SOURCE
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.files import write_together
 
-# Every warning of the contract.
+# All warnings that the contract requires.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wdouble-promotion", "-Werror")
-# Products and sums stay two roundings, as the certificate's error model counts them.
+# No fused multiply-add: product and sum are rounded separately, as the certificate's error model assumes.
 BUILD = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
 
 
 @dataclass(frozen=True)
 class TimingSettings:
-    """runs : how often the clock is read; the median ignores interrupts. steps : between two readings, far longer
-    than the clock's resolution."""
+    """runs : number of clock readings; the median suppresses interrupts. steps : between two readings, long compared
+    with the clock's resolution."""
 
     runs: int = 31
     steps: int = 2000
 
 
 def compiler() -> str | None:
-    """gcc, where it is installed."""
+    """Path of gcc; None if it is not installed."""
     return shutil.which("gcc")
 
 
 class CompiledController:
-    """The shared library of a controller's C files, with one struct of its own.
+    """The shared library of a controller's C files, with its own state.
 
     Raises
     ------
-    ComputationError : no compiler, or it refuses the source.
+    ComputationError : no compiler, or source that does not compile.
     """
 
     def __init__(self, files: Mapping[str, str], controller: SampledController, flags: Sequence[str] = BUILD):
@@ -85,7 +85,7 @@ class CompiledController:
         return self._u.astype(float)
 
     def skip_start(self) -> None:
-        """The gain at 1, as after the start."""
+        """Set the gain to 1, as after the start."""
         self.state.gain, self.state.wait = 1.0, 0
 
 

@@ -1,4 +1,4 @@
-"""A folder that `avis design` wrote, read for export."""
+"""A folder written by `avis design`, read for export."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from avis_ctrl.study.simulation import bare_loop
 
 @dataclass(frozen=True, eq=False)
 class Added:
-    """A controller of the logical axes that was made from those of the folder.
+    """A controller of the logical axes that was derived from those of the folder.
 
-    orders : number of states and upper bound of the design's mu (continuous, between all frequencies) of the controller
-    it was made from, of those on the way, and last of its own.
+    orders : number of states and upper bound of the design's mu (continuous, at all frequencies) of the original
+    controller, of the intermediate ones, and finally of this one.
     """
 
     K: StateSpace
@@ -38,7 +38,7 @@ class Added:
 
 @dataclass(frozen=True, eq=False)
 class DesignFolder:
-    """What a design's folder holds.
+    """Contents of a design folder.
 
     result : result.json. plant : the generalized plant of the design, built from its inputs.
     added : further controllers, by name.
@@ -53,16 +53,16 @@ class DesignFolder:
 
     @property
     def names(self) -> list[str]:
-        """The controllers that have a file."""
+        """Names of the controllers that have a file."""
         return [row["name"] for row in self.result["controllers"] if row.get("file")]
 
     @property
     def inputs_sha256(self) -> str | None:
-        """Hash of the design's inputs, as avis design wrote it."""
+        """Hash of the design's inputs, as written by avis design."""
         return self.result.get("provenance", {}).get("inputs_sha256")
 
     def controller(self, name: str) -> StateSpace:
-        """The continuous controller of the logical axes. Raises InputError with the names that there are."""
+        """The continuous controller of the logical axes. Raises InputError, which lists the known names."""
         if name in self.added:
             return self.added[name].K
         if name not in self.names:
@@ -70,7 +70,7 @@ class DesignFolder:
         return self.controller_in(self.path / "controllers" / f"{name}.json")
 
     def controller_in(self, path: Path) -> StateSpace:
-        """The controller of the logical axes that a file has. Raises InputError."""
+        """The controller of the logical axes in a file. Raises InputError."""
         content = read_json(path, "avis-controller")
         try:
             A, B, C, D = (np.array(content[part], float) for part in "ABCD")
@@ -82,12 +82,12 @@ class DesignFolder:
         return K
 
     def loop(self, K: StateSpace) -> SampledLoop:
-        """The controller on its nominal rig, the other axes under the loops that the design checked."""
+        """The controller on its nominal rig; the other axes have the loops that the design checked."""
         loops = {one.axis: one.loop() for one in map(_companion, self.result["all_axes"].get("companions", ()))}
         return replace(bare_loop(self.design, self.rig, self.plant, K), loops=loops)
 
     def sampled(self, name: str, arithmetic: Arithmetic = "float64") -> SampledController:
-        """Sensor volts to drive volts, in the form and with the numbers that the processor holds."""
+        """The controller from sensor volts to drive volts, in the form and with the numbers that the processor uses."""
         loop = self.loop(self.controller(name))
         system = processor_form(digital_controller(loop))
         names = loop.rig.sensor_rows()[0], loop.rig.equations_of_motion().actuators

@@ -1,4 +1,4 @@
-"""A controller of fewer states for the processor, by descent on mu itself instead of truncation."""
+"""A controller with fewer states for the processor, by minimisation of mu itself instead of truncation."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 
 def mu_asked(design: Design) -> float:
-    """What the design's requirements allow mu to be; inf where they do not name it."""
+    """Largest mu that the design's requirements allow; inf if they do not limit it."""
     return min(design.upper_limits("mu_upper"), default=np.inf)
 
 
 def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Progress = lambda text: None
                       ) -> tuple[DesignFolder, str]:
-    """The folder with one controller more, of at most `order` states in the logical axes, and that controller's name.
+    """The folder with an additional controller of at most `order` states in the logical axes, and its name.
 
-    It is made by descent on the peak of mu (`fixed_order`) from the controller `name`, order by order, and from the
-    others of the folder that have no more states. The states that decode the sensors and those of the other axes'
-    loops are not counted.
+    The controller is found by descent on the peak of mu (`fixed_order`). The initial controllers are `name`, reduced
+    step by step, and the others of the folder that have at most `order` states. The states that decode the sensors and
+    those of the other axes' loops are not counted.
 
     Raises
     ------
     InputError : an order that is not below that of the controller in the folder.
-    ComputationError : no controller of so few states that stabilises the nominal plant was found.
+    ComputationError : no controller of this order that stabilises the nominal plant was found.
     """
     K, P = folder.controller(name), folder.plant.synthesis
     if not 1 <= order < K.nstates:
@@ -51,7 +51,7 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
                 tried.append(_order_and_mu(P, found))
                 progress(f"{found.nstates} states: mu at most {tried[-1][1]:.4g} with the design's model")
         except ComputationError as error:
-            # The first is the controller that the folder has.
+            # The first entry is the controller of the folder.
             on_the_way = ", ".join(f"{mu:.4g} with {states} states" for states, mu in tried[1:])
             if not on_the_way:
                 raise
@@ -62,5 +62,5 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
 
 
 def _order_and_mu(P: GeneralizedPlant, K: StateSpace) -> tuple[int, float]:
-    """States of K, and the upper bound of mu of the design model with it."""
+    """Number of states of K, and upper bound of mu of the design model with K."""
     return K.nstates, mu_peak(P.closed(K), P.all_blocks, slack=SLACK).upper

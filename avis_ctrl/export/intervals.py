@@ -1,8 +1,8 @@
-"""Functions of frequency bounded over whole intervals, not at points: value and slope at the centre, and a bound of the
-second derivative (Taylor's theorem).
+"""Bounds of functions of frequency over whole intervals: value and slope at the centre, and a bound of the second
+derivative (Taylor's theorem).
 
-Intervals |omega - centre| <= half, all quantities arrays over the intervals. Resolvents: with X0 = (p0 I - A)^-1 and
-|p - p0| |X0| = rho < 1, |C X| <= |C X0| / (1 - rho), and alike for X and X B.
+Intervals are |omega - centre| <= half; all quantities are arrays over the intervals. Resolvents: with
+X0 = (p0 I - A)^-1 and |p - p0| |X0| = rho < 1, |C X| <= |C X0| / (1 - rho), and likewise for X and X B.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Jet:
     curve: np.ndarray
 
     def __mul__(self, other: Jet) -> Jet:
-        """Product with a scalar function `self`."""
+        """Product; `self` is a scalar function."""
         shape = (-1, *[1] * (other.value.ndim - 1))
         value, slope = self.value.reshape(shape), self.slope.reshape(shape)
         return Jet(value * other.value, slope * other.value + value * other.slope, self.size * other.size,
@@ -40,14 +40,14 @@ class Jet:
                    self.steep + other.steep, self.curve + other.curve)
 
     def remainder(self, half: np.ndarray) -> np.ndarray:
-        """(n,) largest distance from value and slope at the centre over each interval."""
+        """(n,) largest deviation from the linear expansion about the centre, over each interval."""
         return half ** 2 / 2 * self.curve
 
     def relative_to(self, K: Jet, least: float, half: np.ndarray, further: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n,) bound over each interval of |M| in E + F = M [K; least I], where E is this function and |F| <= further;
-        and the part of the bound that falls with the square of the interval's width.
+        and the part of the bound that decreases with the square of the interval width.
 
-        P = [K; least I]. With M = E P^+ and N = (E' - M P') P^+ at the centre, E = (M + t N) P + G anywhere in the
+        Let P = [K; least I], M = E P^+ and N = (E' - M P') P^+ at the centre. Then E = (M + t N) P + G anywhere in the
         interval, |t| <= half, where G contains only remainders. The smallest singular value of P is at least `least`,
         and at least its value at the centre minus half |P'| minus the remainder.
         """
@@ -66,10 +66,10 @@ class Jet:
 
 def roots_jet(zeros: Iterable[complex], poles: Iterable[complex], leading: float, centre: np.ndarray,
               half: np.ndarray) -> Jet:
-    """leading * prod(s - z) / prod(s - p) at s = j omega."""
+    """Jet of leading * prod(s - z) / prod(s - p) at s = j omega."""
     s = 1j * centre
     signed = [*((complex(one), 1.0) for one in zeros), *((complex(one), -1.0) for one in poles)]
-    S1, S2 = log_slopes([root for root, _ in signed], centre, half)  # first: it refuses a root on the axis
+    S1, S2 = log_slopes([root for root, _ in signed], centre, half)  # first, because it refuses a root on the axis
     value, first = np.full(centre.size, leading, complex), np.zeros(centre.size, complex)
     for root, sign in signed:
         value = value * (s - root) ** sign
@@ -91,13 +91,13 @@ def log_slopes(roots: Iterable[complex], centre: np.ndarray, half: np.ndarray) -
 
 
 def delay_jet(delay_s: float, centre: np.ndarray) -> Jet:
-    """exp(-j omega delay)."""
+    """Jet of exp(-j omega delay)."""
     value, one = np.exp(-1j * centre * delay_s), np.ones(centre.size)
     return Jet(value, -1j * delay_s * value, one, delay_s * one, delay_s ** 2 * one)
 
 
 def sinc_jet(period_s: float, centre: np.ndarray) -> Jet:
-    """sin(x) / x with x = omega T / 2; its derivatives by x are at most 1/2 and 1/3."""
+    """Jet of sin(x) / x with x = omega T / 2; its derivatives with respect to x are at most 1/2 and 1/3."""
     x, one = centre * period_s / 2, np.ones(centre.size)
     safe = np.where(x > 1e-4, x, 1.0)
     slope = np.where(x > 1e-4, (safe * np.cos(safe) - np.sin(safe)) / safe ** 2, -x / 3)
@@ -105,10 +105,10 @@ def sinc_jet(period_s: float, centre: np.ndarray) -> Jet:
 
 
 def system_jet(system: StateSpace, centre: np.ndarray, half: np.ndarray) -> Jet:
-    """The frequency response of a continuous or sampled system."""
+    """Jet of the frequency response of a continuous or sampled system."""
     T, n = system.dt, system.nstates
     point = np.exp(1j * centre * T) if T else 1j * centre
-    first = 1j * T * point if T else np.full(centre.size, 1j)  # of the point by omega
+    first = 1j * T * point if T else np.full(centre.size, 1j)  # derivative of the point with respect to omega
     X = np.linalg.inv(point[:, None, None] * np.eye(n) - system.A)
     CX, XB = system.C @ X, X @ system.B
 

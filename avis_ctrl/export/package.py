@@ -1,4 +1,4 @@
-"""The files of an export, and the check that they belong together."""
+"""The files of an export, and the check that they are consistent."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from avis_ctrl.study.output import controller_form
 
 CONTROLLER, CERTIFICATE, MAT = "controller.json", "certificate.json", "controller.mat"
 VECTORS, RESTARTS = "test_vectors.csv", "restart_vectors.csv"
-# Keys of the certificate that describe them.
+# Key of the certificate that describes each of them.
 TESTS = {VECTORS: "test_vectors", RESTARTS: "restart_vectors"}
-# The controller of the logical axes from which the exported one was made, where the design's folder does not have it.
+# The controller of the logical axes from which the exported one was derived, if the design's folder does not have it.
 CONTINUOUS = "continuous_controller.json"
 FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, RESTARTS, CERTIFICATE)
 FORMATS = ("c", "mat", "json")
@@ -42,8 +42,8 @@ FORMATS = ("c", "mat", "json")
 
 @dataclass(frozen=True, eq=False)
 class Package:
-    """What an export writes: contents by file name, the certificate last. anti_windup : which, and why. replay : of the
-    worst plant through the compiled code; None without gcc."""
+    """Contents of an export by file name, the certificate last. anti_windup : the chosen law with its figures. replay :
+    of the worst plant with the compiled code; None without gcc."""
 
     controller: SampledController
     certificate: Certificate
@@ -53,7 +53,7 @@ class Package:
 
 
 def formats_of(text: str) -> tuple[str, ...]:
-    """Of a list such as "c,mat". Raises InputError."""
+    """Formats in a list such as "c,mat". Raises InputError."""
     asked = tuple(dict.fromkeys(one.strip() for one in text.split(",")))
     if unknown := [one for one in asked if one not in FORMATS]:
         raise InputError(f"expected some of {','.join(FORMATS)}", field="--format", value=unknown[0])
@@ -62,16 +62,16 @@ def formats_of(text: str) -> tuple[str, ...]:
 
 def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "float64", formats: Sequence[str] = FORMATS,
                  progress: Progress = lambda text: None, mu_at_most: float = np.inf) -> Package:
-    """Everything that `avis export` writes; controller.json and certificate.json always.
+    """Everything that `avis export` writes; controller.json and certificate.json are always included.
 
     Raises
     ------
-    InputError : a name that the folder does not have.
-    ComputationError : a controller that is not stable by itself, or whose loop is not, or has a larger mu than allowed.
+    InputError : a controller name that the folder does not have.
+    ComputationError : a controller that is unstable by itself, not proved stable in its loop, or of too large mu.
     """
     text = folder.sampled(name, arithmetic).as_bytes()
-    controller = parse_controller(text)  # the numbers as the file has them
-    try:  # first, because it shows soonest that a controller cannot be exported
+    controller = parse_controller(text)  # the numbers as in the file
+    try:  # first, because it is the quickest test of whether a controller can be exported
         certificate = certify(folder, controller, progress, True)
     except StabilityNotProvedError as error:
         raise _not_proved(folder, name, arithmetic, error.reason) from None
@@ -122,7 +122,7 @@ def _sha256(data: bytes) -> str:
 
 
 def _content_sha256(content: Mapping[str, Any]) -> str:
-    """Hash of the certificate's keys and values but for itself: it shows what was changed by accident."""
+    """Hash of the certificate without the hash itself; it reveals accidental changes."""
     return _sha256(as_json({key: value for key, value in content.items() if key != "content_sha256"}))
 
 
@@ -152,11 +152,11 @@ def _mat(controller: SampledController) -> bytes:
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Relative difference that a figure computed again may have from the one in the file.
+    """Relative tolerance of a recomputed figure compared with the one in the file.
 
-    searched : of bounds that a search ends; its steps may fall differently with another numerical library.
-    direct : of the rounding noise, a closed formula that every coefficient enters.
-    rounding : factor by which a tolerance may differ from the one computed again: another processor may add in another
+    searched : for bounds that result from a search; its steps may differ with another numerical library.
+    direct : for the rounding noise, a closed formula that depends on every coefficient.
+    rounding : factor by which a tolerance may differ from the recomputed one: another processor may add in another
         order.
     """
 
@@ -167,19 +167,19 @@ class CheckSettings:
 
 def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda text: None, name: str | None = None,
                   settings: CheckSettings = CheckSettings()) -> list[str]:
-    """What does not agree in an exported folder, each as a line; empty if all does.
+    """Inconsistencies in an exported folder, one line each; empty if there are none.
 
-    First the files: those that are missing or not listed, the hashes, the numbers in the C and .mat files, the test
-    vectors; each finding goes to `progress` at once. Then the certificate is computed again, unless controller.json is
-    unchanged and another file is not, or the design is another one.
+    First the files are checked: missing or unlisted files, the hashes, the numbers in the C and .mat files, the test
+    vectors; each finding goes to `progress` at once. Then the certificate is recomputed, unless only files other than
+    controller.json have changed, or the design is another one.
 
     Parameters
     ----------
-    name : controller that is expected in the folder; None accepts any.
+    name : controller expected in the folder; None accepts any.
 
     Raises
     ------
-    InputError : no folder of an export, files that cannot be read, another controller.
+    InputError : a folder that is not an export, unreadable files, another controller.
     """
     def told(lines: list[str]) -> list[str]:
         for line in lines:
@@ -224,7 +224,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
 
 
 def _unlike(key: str, stored: object, computed: object, tolerance: float) -> list[str]:
-    """A line for each figure that differs; a figure within a table by its path."""
+    """One line for each figure that differs; a figure within a table by its path."""
     if isinstance(stored, dict) and isinstance(computed, dict) and stored.keys() == computed.keys():
         return [line for name in stored for line in _unlike(f"{key}.{name}", stored[name], computed[name], tolerance)]
     if isinstance(stored, float) and isinstance(computed, float):
@@ -236,7 +236,7 @@ def _unlike(key: str, stored: object, computed: object, tolerance: float) -> lis
 
 
 def _require_export(out: Path) -> None:
-    """Raises InputError with what is missing where the folder is not one of `avis export`."""
+    """Raise InputError, with what is missing, if the folder was not written by `avis export`."""
     if not (out / CERTIFICATE).exists():
         lacks = f"{CERTIFICATE} is missing in it" if out.is_dir() else "there is no such folder"
         if (out / "result.json").exists():
@@ -245,8 +245,8 @@ def _require_export(out: Path) -> None:
 
 
 def _wrong_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
-    """Files that the certificate lists and that are missing, or are not the ones that were exported; and files of an
-    export that it does not list."""
+    """Files that the certificate lists but that are missing or differ from the exported ones; and files of an export
+    that it does not list."""
     hashes, found = stored.get("files"), []
     hashes = hashes if isinstance(hashes, dict) else {}
     for name, digest in ({CONTROLLER: stored.get("controller_sha256")} | hashes).items():
@@ -265,7 +265,8 @@ def _wrong_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
 
 def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Path, stored: Mapping[str, Any],
                    settings: CheckSettings) -> list[str]:
-    """Test vectors that controller.json does not give, with the anti-windup of the certificate; wrong tolerances."""
+    """Test vectors that differ from the response of controller.json with the certificate's anti-windup; wrong
+    tolerances."""
     found = []
     for file, key in TESTS.items():
         if not (out / file).exists():
@@ -294,7 +295,7 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
 
 
 def _guard(folder: DesignFolder, controller: SampledController, stored: Mapping[str, Any]) -> Protection:
-    """With the anti-windup that the certificate names."""
+    """Protection with the anti-windup of the certificate."""
     corner, gain = stored["anti_windup"]["corner_Hz"], stored["anti_windup"]["gain"]
     law = NO_ANTI_WINDUP if corner is None else AntiWindup.of(float(corner), float(gain), controller.system.dt)
     return protection(controller, folder.rig, law)

@@ -1,12 +1,12 @@
-"""What the processor does beside x+ = A x + B y, u = C x + D y: safe start, drive limits, inputs out of range.
+"""Protection around x+ = A x + B y, u = C x + D y: safe start, drive limits, inputs out of range.
 
     v = y, clipped to the converter's range; 0 where it is not finite
     w = g (C x + D v - b),   u = limit(w),   x+ = A x + B v,   b+ = keep b + feed (w - u)
 
-The gain g rises from 0 to 1 after every input has been valid for a while, and falls to 0 as soon as one is not: a
-start and a recovery without a jump, because the states follow the inputs while g = 0. With g = 1 the controller is
-exactly the linear one until a drive reaches its limit. The anti-windup b (`AntiWindup`) is outside the linear loop: it
-only decays once the limits have been left.
+The gain g rises from 0 to 1 after every input has been valid for a while, and falls to 0 as soon as one is invalid.
+Start and recovery have no jump, because the states follow the inputs while g = 0. With g = 1 the controller is exactly
+linear until a drive reaches its limit. The anti-windup b (`AntiWindup`) is outside the linear loop: once the limits
+have been left, it only decays.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, AntiWindup
 class ProtectionSettings:
     """Times of start and fall-back.
 
-    wait_s : valid inputs required before the gain rises; a geophone of 1 Hz forgets the step of switching on.
-    rise_s : from gain 0 to 1; a few periods of a table's lowest resonances, so that the rise excites none.
-    fall_s : from gain 1 to 0; short, because a wrong input drives the table meanwhile.
+    wait_s : valid inputs required before the gain rises; the switch-on step of a 1 Hz geophone has then decayed.
+    rise_s : from gain 0 to 1; a few periods of a table's lowest resonances, so that the rise does not excite them.
+    fall_s : from gain 1 to 0; short, because a wrong input drives the table until then.
     """
 
     wait_s: float = 0.5
@@ -37,9 +37,9 @@ class ProtectionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Protection:
-    """Constants of the code beside the controller's.
+    """Constants of the code in addition to those of the controller.
 
-    input_limit_V : (n_y,) a magnitude from which on an input is out of the converter's range; inf for none.
+    input_limit_V : (n_y,) magnitude from which an input is out of the converter's range; inf for none.
     wait : samples of valid inputs before the gain rises. rise, fall : change of the gain per sample.
     """
 
@@ -52,7 +52,7 @@ class Protection:
 
 def protection(controller: SampledController, rig: Rig, anti_windup: AntiWindup = NO_ANTI_WINDUP,
                settings: ProtectionSettings = ProtectionSettings()) -> Protection:
-    """For this controller and the rig's converter."""
+    """Constants for this controller and the rig's converter."""
     rate, system, dtype = controller.sample_rate_Hz, controller.system, controller.dtype
     largest = np.inf if rig.converter is None else min(abs(volts) for volts in rig.converter.limits_V)
     return Protection(np.full(system.ninputs, dtype(largest), float), max(1, round(settings.wait_s * rate)),
@@ -62,19 +62,18 @@ def protection(controller: SampledController, rig: Rig, anti_windup: AntiWindup 
 
 
 def _exact_in_sums(change: float) -> float:
-    """The next multiple of 2^-23, of which float32 holds all up to 1: the gain has no rounding in either precision."""
+    """Round up to a multiple of 2^-23; float32 has all of these up to 1, so that the gain has no rounding error."""
     return float(np.ceil(change * 2.0 ** 23) / 2.0 ** 23)
 
 
 class Processor:
-    """The code's arithmetic in double precision, sample by sample: what the compiled code is compared with.
+    """The code's arithmetic in double precision, sample by sample: the reference for the compiled code.
 
     dtype : another precision.
 
     Attributes
     ----------
-    x : (n,) state. excess : (n_u,) b. gain : 0 to 1. wait : samples of valid inputs still to come before the gain
-    rises.
+    x : (n,) state. excess : (n_u,) b. gain : 0 to 1. wait : valid samples still required before the gain rises.
     """
 
     def __init__(self, controller: SampledController, guard: Protection, dtype: type[np.floating] = np.float64):

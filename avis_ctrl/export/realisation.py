@@ -1,9 +1,9 @@
-"""The realisation that a processor runs: states of like size, little arithmetic, poles that rounding moves least.
+"""Realisation for a processor: states of similar size, few operations, poles with minimum sensitivity to rounding.
 
-Each group of states that no other one acts on is balanced (equal Gramians), then turned into real Schur form by an
-orthogonal matrix. Of A only the upper triangle and the pairs on the diagonal remain: about half the multiplications.
-The poles stand on the diagonal, so that rounding a coefficient moves a real pole by that coefficient's own rounding and
-a pair by that of its block; a companion or modal form has no such bound where poles are close to one another.
+Each group of states that is not coupled to any other is balanced (equal Gramians), then transformed into real Schur
+form by an orthogonal matrix. Only the upper triangle of A and the pairs on its diagonal remain: about half the
+multiplications. The poles are on the diagonal: rounding a coefficient moves a real pole by the rounding error of that
+coefficient, and a pair by that of its block. A companion or modal form has no such bound for poles close to each other.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def processor_form(system: StateSpace) -> StateSpace:
 
     Raises
     ------
-    ComputationError : a controller that is not stable by itself: it cannot start from zero output.
+    ComputationError : a controller that is unstable by itself: it cannot start from zero output.
     """
     if not system.is_stable():
         raise ComputationError("the sampled controller is not stable by itself, so it cannot run with its output at "
@@ -45,7 +45,7 @@ def _part(system: StateSpace, kept: np.ndarray) -> StateSpace:
 
 
 def _schur(part: StateSpace) -> StateSpace:
-    """Balanced as far as the Gramians are regular, in real Schur form with the slowest poles first."""
+    """Balanced as far as the Gramians are regular, in real Schur form."""
     part = balanced(part)
     T, Q = la.schur(part.A, output="real")
     T = np.triu(T, -1)
@@ -53,7 +53,7 @@ def _schur(part: StateSpace) -> StateSpace:
 
 
 def balanced(part: StateSpace) -> StateSpace:
-    """States with equal and diagonal Gramians; only evened out where a state is almost unreachable or unseen."""
+    """States with equal and diagonal Gramians; only scaled if a state is almost unreachable or unobservable."""
     part = balance(part)
     Lc, Lo = gramian_factors(part)
     U, sigma, Vt = la.svd(Lo.T @ Lc)

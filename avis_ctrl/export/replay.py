@@ -1,4 +1,4 @@
-"""The worst plant of the certificate in closed loop with the compiled code, on the nonlinear table with six axes."""
+"""Closed-loop simulation of the certificate's worst plant, a nonlinear six-axis table, with the compiled code."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from avis_ctrl.study.simulation import with_delta
 
 @dataclass(frozen=True)
 class ReplaySettings:
-    """settle_s : before the measurement; the start of the code and the slowest poles of such loops, some 0.02 Hz.
-    periods : of the sine that are measured, whole ones. velocity_rms : r.m.s. of the floor's sine as a multiple of the
-    site's velocity; the table is then as nonlinear as at the site."""
+    """settle_s : time before the measurement; covers the start of the code and the slowest poles of such loops, about
+    0.02 Hz. periods : number of whole periods of the sine that are measured. velocity_rms : r.m.s. of the floor's sine
+    over the site's velocity; the table is then as nonlinear as at the site."""
 
     settle_s: float = 40.0
     periods: int = 4
@@ -30,7 +30,7 @@ class ReplaySettings:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """gain : payload velocity over floor velocity of the kept axes, in the sine's worst direction; inf if the loop
+    """gain : payload velocity over floor velocity of the kept axes, in the worst direction of the sine; inf if the loop
     diverged. record : of the measured periods."""
 
     gain: float
@@ -41,12 +41,12 @@ def replay_worst_plant(folder: DesignFolder, certificate: Certificate, controlle
                        files: Mapping[str, str], settings: ReplaySettings = ReplaySettings()) -> Replay:
     """Move the floor of the worst plant with a sine at the worst frequency, in the worst direction.
 
-    The motion that the noise of sensors and converter causes is subtracted: it is that of a second simulation with the
-    same noise and a floor at rest.
+    The motion caused by sensor and converter noise is subtracted. It comes from a second simulation with the same noise
+    and the floor at rest.
 
     Raises
     ------
-    ComputationError : no compiler.
+    ComputationError : no compiler, or source that does not compile.
     """
     worst, design, rig = certificate.worst, folder.design, folder.rig
     loop = with_delta(rig, folder.plant, certificate.loop, "worst case", worst.delta, worst.omega)

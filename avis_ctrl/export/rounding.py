@@ -1,14 +1,14 @@
-"""What rounding inside the code does to the payload.
+"""Effect of the rounding in the code on the payload.
 
-Standard model of floating-point arithmetic (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sec. 3.1): a
-sum of n products is off by at most n eps / (1 - n eps) times the sum of the magnitudes. With magnitudes of inputs and
-states that the site does not exceed, each step adds at most e to the states and voltages. Whatever these errors are, in
-the closed loop the payload's velocity then stays within
+Standard model of floating-point arithmetic (Higham, Accuracy and Stability of Numerical Algorithms, 2002, sec. 3.1):
+the error of a sum of n products is at most n eps / (1 - n eps) times the sum of the magnitudes. For the largest inputs
+and states at the site, each step thus adds at most e to the states and voltages. For any such errors, the payload
+velocity in the closed loop stays within
 
     sum over k of |C Phi^k Gamma| e,
 
 the l1 norm of the sampled linear loop: a worst-case bound, not a standard deviation. The magnitudes are those that a
-Gaussian signal passes once in ten minutes (`study.analysis.PEAK_FACTOR` times the r.m.s. of floor and sensor noise).
+Gaussian signal exceeds once in ten minutes (`study.analysis.PEAK_FACTOR` times the r.m.s. of floor and sensor noise).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from avis_ctrl.study.analysis import PEAK_FACTOR
 
 def rounding_noise(controller: SampledController, loop: SampledLoop, points: int = 1500, steps: int = 100_000
                    ) -> np.ndarray:
-    """(6,) bound of the payload's velocity by rounding, rotations at the edge [m/s].
+    """(6,) bound of the payload velocity due to rounding, rotations at the edge [m/s].
 
-    loop : with `digital` the controller's system. points : of the frequency grid of the signals' r.m.s. values.
+    loop : its `digital` is the controller's system. points : number of frequencies for the signals' r.m.s. values.
     steps : samples summed one by one; the rest is bounded by the loop's modes.
 
     Raises
@@ -43,7 +43,7 @@ def rounding_noise(controller: SampledController, loop: SampledLoop, points: int
     K, eps = controller.system, float(np.finfo(controller.dtype).eps) / 2
 
     def errors(by_state: np.ndarray, by_input: np.ndarray) -> np.ndarray:
-        # One more rounding of the inputs as they are read.
+        # One more rounding when the inputs are read.
         terms = np.count_nonzero(by_state, axis=1) + by_input.shape[1] + 1
         return terms * eps / (1 - terms * eps) * (np.abs(by_state) @ x + np.abs(by_input) @ y)
     e = np.concatenate([errors(K.A, K.B), errors(K.C, K.D)])
@@ -63,7 +63,7 @@ def _peak_gain(Phi: np.ndarray, Gamma: np.ndarray, rows: np.ndarray, steps: int)
     for _ in range(steps):
         total += np.abs(rows @ Gamma)
         rows = rows @ Phi
-    # The rest by modes: |rows V| |lambda|^k |inv(V) Gamma|, a geometric series.
+    # The rest from the modes: |rows V| |lambda|^k |inv(V) Gamma|, a geometric series.
     return total + np.abs(rows @ vectors) / (1 - size) @ np.abs(np.linalg.solve(vectors, Gamma.astype(complex)))
 
 
@@ -83,7 +83,7 @@ def _levels(loop: SampledLoop, points: int) -> tuple[np.ndarray, np.ndarray]:
 
     def peak(density: np.ndarray) -> np.ndarray:
         return PEAK_FACTOR * np.sqrt(np.trapezoid(np.sum(np.abs(density) ** 2, axis=2), omega / (2 * np.pi), axis=0))
-    # The offsets of the channels beside that, each of either sign; at rest nothing is fed back but by position sensors.
+    # In addition the offsets of the channels, of either sign; at rest only position sensors are fed back.
     offset = np.array([one.offset_V for one in loop.rig.sensors()])
     to_states = replace(K, C=np.eye(K.nstates), D=np.zeros((K.nstates, K.ninputs)), outputs=(), states=())
     held = np.abs(gain_at_rest(to_states)) @ offset

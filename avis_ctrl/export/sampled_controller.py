@@ -1,4 +1,4 @@
-"""The controller that a processor runs, as numbers: x+ = A x + B y, u = C x + D y."""
+"""The controller as a processor runs it, in numbers: x+ = A x + B y, u = C x + D y."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ FORMAT = "avis-sampled-controller"
 
 @dataclass(frozen=True, eq=False)
 class SampledController:
-    """Sensor volts to drive volts at the rig's rate, every axis included.
+    """Controller from sensor volts to drive volts at the rig's sample rate, including every axis.
 
     Attributes
     ----------
-    system : A (n, n), B (n, n_y), C (n_u, n), D (n_u, n_y), discrete; inputs and outputs named as the rig's sensors
-        and drives. With float32 arithmetic every number is a float32 value.
+    system : A (n, n), B (n, n_y), C (n_u, n), D (n_u, n_y), discrete; inputs and outputs have the names of the rig's
+        sensors and drives. With float32 arithmetic all numbers are float32 values.
     limits_V : (n_u,) largest magnitude of each drive voltage.
-    delay_samples : from the sample to the voltage it causes.
+    delay_samples : delay from the sample to the resulting voltage.
     """
 
     name: str
@@ -50,7 +50,7 @@ class SampledController:
         return {name: getattr(self.system, name) for name in "ABCD"}
 
     def rounded(self, arithmetic: Arithmetic) -> SampledController:
-        """The same controller with its numbers rounded to what the processor holds."""
+        """The same controller with its numbers rounded to those that the processor can store."""
         to = np.float32 if arithmetic == "float32" else np.float64
         A, B, C, D = (matrix.astype(to).astype(float) for matrix in self.matrices().values())
         return replace(self, system=replace(self.system, A=A, B=B, C=C, D=D), arithmetic=arithmetic)
@@ -70,11 +70,11 @@ class SampledController:
 
 
 def read_controller(path: Path) -> SampledController:
-    """The controller of a file.
+    """Read a controller from a file.
 
     Raises
     ------
-    InputError : no such file, another format, numbers that make no controller or are no float32 where the file says so.
+    InputError : no such file, another format, numbers that form no controller or are not float32 as the file states.
     """
     content = read_json(path, FORMAT, "a file of avis export")
     try:
@@ -86,7 +86,7 @@ def read_controller(path: Path) -> SampledController:
 
 
 def controller_from(content: dict[str, Any]) -> SampledController:
-    """The controller of a file's content."""
+    """The controller from a file's content."""
     if content["arithmetic"] not in ("float32", "float64"):
         raise InputError("expected float32 or float64", field="arithmetic", value=content["arithmetic"])
     rate, limits = float(content["sample_rate_Hz"]), np.array(content["limits_V"], float)
@@ -106,5 +106,5 @@ def controller_from(content: dict[str, Any]) -> SampledController:
 
 
 def parse_controller(text: bytes) -> SampledController:
-    """The controller of the bytes that `as_bytes` makes."""
+    """The controller from the bytes that `as_bytes` returns."""
     return controller_from(json.loads(text))

@@ -1,19 +1,22 @@
-"""The controller as the continuous table feels it, and its distance from rational functions.
+"""Response of the emitted controller as the continuous table receives it, and its distance from rational functions.
 
-From the seen velocities of the kept axes to the forces on them, at a frequency omega below half the sample rate,
+From the seen velocities of the kept axes (those that the controller computes) to the forces on these axes, at a
+frequency omega below half the sample rate,
 
     R(omega) = hold(omega) exp(-j omega tau) T K(exp(j omega T_s)) diag(gain / F(j omega)) rows
 
-K are the numbers of controller.json, hold(omega) = (1 - exp(-j omega T_s)) / (j omega T_s), T turns drive volts into
-the axes' forces, rows turn axes into sensors, F is the filter that the design's model of the sensors has and the code
-does itself. R is exact for what the controller makes of the frequency omega at that frequency. A sampled loop also
-folds: the held force at omega + 2 pi k / T_s moves the table a little, and its sensors show that motion at omega. With
-G the table from forces to seen velocities, the controller sees (G + E) times its forces instead of G,
+K has the numbers of controller.json, hold(omega) = (1 - exp(-j omega T_s)) / (j omega T_s), T maps drive volts to the
+forces on the axes, rows maps axes to sensors, and F is the filter that the design's sensor model contains and that the
+code implements itself. R is exact for the part of the response to the frequency omega that is at omega itself. A
+sampled loop also has aliasing: the held force at omega + 2 pi k / T_s moves the table a little, and its sensors show
+that motion at omega. With G the table from forces to seen velocities, the controller sees (G + E) times its forces
+instead of G times,
 
     |E| <= sum over k != 0 of |F(omega) / F(omega_k)| |G(omega_k)| |omega / omega_k|,
 
-|G| taken over the whole uncertainty set, each image with a perturbation of its own, which the true ones cannot exceed.
-An anti-alias filter is known and the same in all channels: |G| is bounded without it, and its magnitude multiplied.
+where |G| is the maximum over the whole uncertainty set, with a separate perturbation for each image; the true images
+cannot exceed it. An anti-alias filter is known and equal in all channels: |G| is bounded without it and then multiplied
+by its magnitude.
 """
 
 from __future__ import annotations
@@ -43,15 +46,15 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """images : pairs of images summed one by one; the rest is bounded by the decay of hold and table together, at least
-    as k^-2. points, order : of the function that bounds the table's gain above half the sample rate, where it falls
-    smoothly: the frequencies it is fitted to and its order. lowest : where it begins, as a fraction of half the rate:
-    the intervals of the grid reach a little beyond theirs. rest : a frequency far below every pole, as a fraction of
-    half the rate, at which the gain at rest is taken: position sensors have none at zero itself. near : how many of the
-    points, the first ones, get the bound of the blocks themselves; the loop gain is largest there. The others get that
-    of the simplified blocks, a larger set: some per cent higher, but proved between frequencies in a third of the time.
-    slack : as for `worst_case_gain`; the gain relative to the function is flat over frequency, where a small slack
-    needs many intervals."""
+    """images : number of pairs of images that are summed one by one; the rest is bounded by the joint decay of hold and
+    table, at least as k^-2. points, order : of the function that bounds the table's gain above half the sample rate,
+    where the gain decreases smoothly: number of fitted frequencies and order. lowest : its lowest frequency, as a
+    fraction of half the rate; the intervals of the grid reach slightly below half the rate. rest : a frequency far
+    below every pole, as a fraction of half the rate, at which the gain at rest is evaluated; that of position sensors
+    is zero at zero frequency. near : number of points, the first ones, with the bound for the blocks themselves; the
+    loop gain is largest there. The others have the bound for the simplified blocks, a larger set: some per cent higher,
+    but proved between frequencies in a third of the time. slack : as for `worst_case_gain`; the gain relative to the
+    function is flat over frequency, where a small slack needs many intervals."""
 
     images: int = 8
     points: int = 12
@@ -68,8 +71,8 @@ class SampledAxes:
 
     Attributes
     ----------
-    forces : (n, n_u) axes' forces [N] per drive volt. rows : (n_y, n) motion along each sensor per axis.
-    gains_V : (n_y,) volts per unit of motion.
+    forces : (n, n_u) forces on the axes [N] per drive volt. rows : (n_y, n) motion along each sensor per motion of each
+    axis. gains_V : (n_y,) volts per unit of motion.
     """
 
     folder: DesignFolder
@@ -81,7 +84,8 @@ class SampledAxes:
 
     @staticmethod
     def of(folder: DesignFolder, controller: SampledController) -> SampledAxes:
-        """Raises InputError where the axes are measured by sensors in space and against the chassis at once."""
+        """Raises InputError if axes are measured both in space and against the chassis, or by several kinds of
+        sensors."""
         rig, keep, plant = folder.rig, folder.design.keep, folder.plant
         if plant.relative and len(plant.relative) != len(plant.axes):
             raise InputError("expected axes that are all measured in space, or all against the chassis; a mixture has "
@@ -112,12 +116,12 @@ class SampledAxes:
         return np.pi / self.period_s
 
     def hold(self, omega: np.ndarray) -> np.ndarray:
-        """(n,) hold and delay."""
+        """(n,) response of hold and delay."""
         T = self.period_s
         return np.sinc(omega * T / (2 * np.pi)) * np.exp(-1j * omega * T * (0.5 + self.controller.delay_samples))
 
     def pade(self, omega: np.ndarray) -> np.ndarray:
-        """(n,) the design model's delay, which the plant holds already."""
+        """(n,) delay of the design model, which the plant already contains."""
         rig = self.folder.rig
         system = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
         return system.frequency_response(omega)[:, 0, 0]
@@ -129,18 +133,18 @@ class SampledAxes:
         return [systems[one] for one in found]
 
     def sensor_volts(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega, n_y) volts per seen velocity along each sensor."""
+        """(n_omega, n_y) volts of each sensor per seen velocity along it."""
         known = {id(one): 1.0 / one.frequency_response(omega)[:, 0, 0] for one in self._filters if one is not None}
         return np.stack([gain * (known[id(one)] if one is not None else np.ones(omega.size))
                          for one, gain in zip(self._filters, self.gains_V, strict=True)], axis=1)
 
     def volts(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega, n_u, n) drive volts computed per seen velocity of the axes."""
+        """(n_omega, n_u, n) drive volts per seen velocity of the axes."""
         K = self.controller.system.frequency_response(omega)
         return K @ (self.sensor_volts(omega)[:, :, None] * self.rows)
 
     def response(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega, n, n) R without the design model's delay: what stands in the place of its controller."""
+        """(n_omega, n, n) R without the design model's delay; it takes the place of the design's controller."""
         return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
 
     def gain_at_rest(self) -> float:
@@ -149,16 +153,16 @@ class SampledAxes:
 
     def controller_error(self, K: StateSpace, least: float, centre: np.ndarray, half: np.ndarray
                          ) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) bound over |omega - centre| <= half of |M| in R - K exp(-j omega tau) = M [K; least I], with what the
-        rounded decoding adds; and the part of it that falls with the square of the interval's width.
+        """(n,) bound over |omega - centre| <= half of |M| in R - K exp(-j omega tau) = M [K; least I], including the
+        effect of rounded decoding; and the part of it that decreases with the square of the interval width.
 
-        K : continuous, from seen velocities to forces [N s/m]; the delay is that of the design's model.
+        K : continuous, from seen velocities to forces [N s/m]; the delay tau is that of the design model.
         least : gain [N s/m] below which the error is measured absolutely.
         """
         T, rig, own = self.period_s, self.folder.rig, self.controller.system
         design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
         delay = design_delay.poles().tolist()
-        # The all-pass of the design's delay, inverted; its sign is 1 at rest.
+        # The inverse of the all-pass of the design's delay; it is 1 at zero frequency.
         no_pade = roots_jet(delay, [-one for one in delay], (-1.0) ** len(delay), centre, half)
         channel = self._channel
         unfiltered = roots_jet(channel.poles, channel.zeros, 1 / channel.leading, centre, half)
@@ -166,7 +170,7 @@ class SampledAxes:
                           self.forces @ own.D @ (self.gains_V[:, None] * self.rows), T)
         held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
         R = held * (unfiltered * system_jet(code, centre, half))
-        # What rounding sends beside the axes is some 1e-7 of R and as smooth: doubled for the interval.
+        # The part that rounding adds beside the axes is about 1e-7 of R and as smooth: doubled for the interval.
         alone = system_jet(K, centre, half)
         return (R - alone).relative_to(alone, least, half, 2 * self._beside(centre))
 
@@ -179,9 +183,9 @@ class SampledAxes:
         return np.sum(terms, axis=0) + self._rest(terms)
 
     def _beside(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) what the chains' errors make of voltages and sensor signals that no axis stands for [N s/m].
+        """(n_omega,) effect of chain errors on the voltages and sensor signals that belong to no axis [N s/m].
 
-        With exact decoding and allocation it would be zero; rounded coefficients make it some 1e-7 of the controller.
+        With exact decoding and allocation it would be zero; rounded coefficients make it about 1e-7 of the controller.
         """
         plant, volts = self.folder.plant, self.volts(omega)
         hold = np.abs(self.hold(omega))
@@ -203,24 +207,24 @@ class SampledAxes:
     # -- images of the sample rate -------------------------------------------------------
     @property
     def _channel(self) -> Filter:
-        """F, one for all sensors of the axes."""
+        """F, the same for all sensors of the axes."""
         used = np.any(np.abs(self.rows) > 0, axis=1)
         found = conditioning(self.folder.rig, self.folder.design.loop.integrator_corner_Hz)
         return next(one for one, in_use in zip(found, used, strict=True) if in_use)
 
     def _filter(self, centre: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) largest and least |F| over the intervals."""
+        """(n,) largest and smallest |F| over the intervals."""
         one = self._channel
         jet = roots_jet(one.zeros, one.poles, one.leading, centre, half)
         return jet.size, np.abs(jet.value) ** 2 / jet.size
 
     def _images(self, omega: np.ndarray) -> list[np.ndarray]:
-        """(n_omega,) frequencies that fold onto omega, the nearest first."""
+        """(n_omega,) frequencies that are aliased to omega, the nearest first."""
         rate = 2 * np.pi / self.period_s
         return [np.abs(omega + k * rate) for n in range(1, self.settings.images + 1) for k in (-n, n)]
 
     def _rest(self, terms: list[np.ndarray]) -> np.ndarray:
-        """(n_omega,) bound of the sum beyond the n nearest pairs of images, given terms that fall at least as k^-2.
+        """(n_omega,) bound of the sum beyond the n nearest pairs of images, for terms that decrease at least as k^-2.
 
         Images lie at k + x and k - x, x at most 1/2. The sum of 1/(k - 1/2)^2 over k > n is below 1/n (midpoint rule),
         and the last terms are at most (n + 1/2)^2 times smaller than that function at 1.
@@ -229,15 +233,15 @@ class SampledAxes:
         return (n + 0.5) ** 2 / n * (terms[-2] + terms[-1])
 
     def held_images(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        """(n,) bound over each interval of the payload velocity at all images per force, r.m.s. [m/(N s)]."""
+        """(n,) bound over each interval of the r.m.s. payload velocity at all images, per force [m/(N s)]."""
         terms = [np.square(self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half))
                  for image in self._images(centre)]
         return np.sqrt(np.sum(terms, axis=0) + self._rest(terms))
 
     def folded_floor(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-        """(n,) bound over each interval of the seen velocity per floor velocity at the nearest images, r.m.s.
+        """(n,) bound over each interval of the r.m.s. seen velocity from the nearest images, per floor velocity.
 
-        An accelerometer without a filter shows motion at every image alike: over all of them there is no bound.
+        An accelerometer without a filter shows motion equally at every image, so that the sum over all has no bound.
         """
         own = self._filter(centre, half)[0]
         terms = [np.square(self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1])
@@ -254,7 +258,7 @@ class SampledAxes:
 
     @property
     def high_grid(self) -> np.ndarray:
-        """(points,) rad/s from half the sample rate on; the first image of half the rate lies there."""
+        """(points,) rad/s from half the sample rate on, where the first image of half the rate lies."""
         ends = self.settings.lowest, 2 * self.settings.images + 1
         return np.geomspace(*ends, self.settings.points) * self.half_rate
 
@@ -263,12 +267,12 @@ class SampledAxes:
         return self._high_gain("force", "seen", omega, np.zeros(omega.size))
 
     def force_to_seen_at(self, omega: np.ndarray) -> np.ndarray:
-        """(n_omega,) bound of the table's gain at these frequencies only [m/(N s)]; not above `force_to_seen`, and
+        """(n_omega,) bound of the table's gain at these frequencies only [m/(N s)]; at most `force_to_seen`, and
         computed in seconds instead of minutes."""
         return self._gains_at("force", "seen", omega) * self._low_pass(omega, np.zeros(omega.size))
 
     def passive_above(self) -> float:
-        """Bound of payload over floor velocity above half the sample rate, where no controller acts."""
+        """Bound of payload velocity over floor velocity above half the sample rate, where no controller acts."""
         return self._high_bounds["floor", "velocity"].gain
 
     def _high_gain(self, source: str, target: str, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -284,9 +288,9 @@ class SampledAxes:
 
     @cached_property
     def _high_bounds(self) -> dict[tuple[str, str], Rational]:
-        """`_high_bound` of the four gains that are needed; of the floor's own motion a constant."""
+        """`_high_bound` of the four gains needed; a constant from floor to payload velocity."""
         pairs = [("force", "seen"), ("force", "velocity"), ("floor", "seen"), ("floor", "velocity")]
-        self._stability  # noqa: B018 (computed once, before the processes part)
+        self._stability  # noqa: B018 (computed once, before the processes fork)
         return dict(zip(pairs, each(lambda pair: self._high_bound(*pair), pairs), strict=True))
 
     @cached_property
@@ -297,8 +301,8 @@ class SampledAxes:
         return stability_bound(part.select(range(blocks.n_z), range(blocks.n_w)), blocks)
 
     def _high_bound(self, source: str, target: str) -> Rational:
-        """A function whose magnitude the worst-case gain does not exceed above half the rate: fitted to values, then
-        raised to what `worst_case_gain` proves between them."""
+        """A function whose magnitude bounds the worst-case gain above half the rate: fitted to values, then raised to
+        what `worst_case_gain` proves between them."""
         if (source, target) == ("floor", "velocity"):
             return Rational(self._proved(source, target, None))
         near, far = np.split(self.high_grid, [self.settings.near])
@@ -308,7 +312,7 @@ class SampledAxes:
         return fitted.scaled(self._proved(source, target, fitted))
 
     def _gains_at(self, source: str, target: str, omega: np.ndarray, simplified: bool = False) -> np.ndarray:
-        """(n_omega,) bounds of the worst-case gain at these frequencies, above half the rate and without the filter."""
+        """(n_omega,) bounds of the worst-case gain at these frequencies above half the rate, without the filter."""
         part, whole = self._part(source, target)
         M = part.frequency_response(omega)[:, None]
         gains = skewed_upper_bound(M, whole.simplified()).beta if simplified else np.full(omega.size, np.inf)
@@ -320,12 +324,12 @@ class SampledAxes:
         return gains
 
     def _proved(self, source: str, target: str, weight: Rational | None) -> float:
-        """Proved bound of the worst-case gain over |weight| above half the sample rate."""
+        """Proved bound of the ratio of worst-case gain and |weight| above half the sample rate."""
         part, whole = self._part(source, target)
         n_z, blocks = part.noutputs - whole.blocks[-1].cols, BlockStructure(whole.blocks[:-1])
         if weight is not None:
             part = append(gain(np.eye(n_z)), *[weight.inverse().system()] * (part.noutputs - n_z)) @ part
-        # points=0: only the largest gain is wanted, no curve.
+        # points=0: only the largest gain is required, no curve.
         found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=self.settings.slack,
                                 robust=self._stability, points=0)
         if not (found.guaranteed and np.isfinite(found.upper)):
@@ -333,8 +337,7 @@ class SampledAxes:
         return found.upper
 
     def _part(self, source: str, target: str) -> tuple[StateSpace, BlockStructure]:
-        """The open table without anti-alias filter, with its blocks, from forces or floor to seen velocities or
-        velocities."""
+        """The open table without anti-alias filter, and its blocks; from force or floor to seen or payload velocity."""
         plant = self._unfiltered
         blocks, P = plant.full.blocks, plant.full.P
         names = {"force": plant.full.u, "floor": plant.floor_velocities, "seen": plant.full.y,

@@ -1,9 +1,9 @@
-"""Test vectors: inputs that take the code through its start, its limits and its fall-back, and the outputs expected.
+"""Test vectors: inputs that exercise the start, limits and fall-back of the code, and the expected outputs.
 
-`vectors` has the start to the full gain, an excitation in the linear range in which, in double precision, every
-coefficient that matters shows if it is wrong by 0.1 %, each drive up to its limits, as far as valid inputs can take it,
-and the fall-back after an input out of range. `restarts` has the fall-back to zero and the restart after inputs that
-are out of range, not a number and infinite: a whole start and a restart take more rows than `vectors` has.
+`vectors` contains the start up to full gain; an excitation in the linear range in which, in double precision, an error
+of 0.1 % in any coefficient that matters is visible; each drive up to its limits, as far as valid inputs can move it;
+and the fall-back after an input out of range. `restarts` contains the fall-back to zero and the restart after inputs
+that are out of range, not a number, and infinite: a whole start and a restart need more rows than `vectors` has.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from avis_ctrl.lti.statespace import StateSpace
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """start : part of the rows that the start takes, from drives at zero to the full gain. limits : part of the others
-    in which the drives are taken to their limits. falling : part of the others at the end, from the invalid input on.
-    low_Hz, high : band of the linear excitation: a period as long as the rows, and a part of half the sample rate.
-    fill : of the drives' limits that the linear excitation demands at most. overdrive : demand over limit, where a
-    limit is to be reached. range_fraction : of the converter's range that valid inputs use at most. unlimited_V : valid
-    inputs at most where the converter's range is not known. restart : part of the rise that is seen between the invalid
-    inputs of `restarts`. linear : rows at full gain at its end, relative to those of the rise.
-    margin : by which outputs may differ beyond what one precision's rounding makes: compilers add in another order. In
-    double precision the expected outputs are rounded, too: twice this margin. seed : of the phases.
+    """start : fraction of the rows for the start, from drives at zero to full gain. limits : fraction of the remaining
+    rows in which the drives are moved to their limits. falling : fraction of them at the end, from the invalid input
+    on.
+    low_Hz, high : band of the linear excitation, from a period as long as the rows to this fraction of half the sample
+    rate. fill : largest fraction of the drives' limits that the linear excitation demands.
+    overdrive : demand over limit where a limit is to be reached. range_fraction : largest fraction of the converter's
+    range that valid inputs use. unlimited_V : largest valid input if the converter's range is not known. restart :
+    fraction of the rise that is reached between the invalid inputs of `restarts`. linear : rows at full gain at its
+    end, relative to those of the rise.
+    margin : ratio of the allowed difference of outputs to that from the rounding of one precision: compilers add in
+    another order. In double precision the expected outputs are rounded, too: twice this margin. seed : of the phases.
     """
 
     start: float = 0.75
@@ -63,8 +65,8 @@ def vectors(controller: SampledController, guard: Protection, settings: SignalSe
 def restarts(controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
              ) -> tuple[np.ndarray, np.ndarray]:
     """Inputs (samples, n_y) and outputs (samples, n_u) from `init` on [V]: three times the beginning of a start and an
-    invalid input of one sample, then a whole restart. The inputs reach no limit in the linear range: the outputs agree
-    more closely."""
+    invalid input of one sample, then a whole restart. The inputs reach no limit in the linear range, so that the
+    outputs agree more closely."""
     seen = guard.wait + round(settings.restart / guard.rise)
     invalid = _invalid(guard)[1:]
     last = guard.wait + round((1 + settings.linear) / guard.rise)
@@ -76,23 +78,23 @@ def restarts(controller: SampledController, guard: Protection, settings: SignalS
 
 def agreement_V(controller: SampledController, guard: Protection, y: np.ndarray, u: np.ndarray,
                 settings: SignalSettings = SignalSettings()) -> float:
-    """By how much outputs of another implementation may differ from u (n, n_u) with the inputs y (n, n_y) [V].
+    """Allowed difference between the outputs of another implementation and u (n, n_u), for inputs y (n, n_y) [V].
 
-    From the difference that the controller's precision makes to the next higher one, rounded up to two digits.
+    From the difference between the controller's precision and the next higher one, rounded up to two digits.
     """
     other, margin = (np.longdouble, 2 * settings.margin) if controller.arithmetic == "float64" else (
         np.float32, settings.margin)
     differ = margin * float(np.max(np.abs(_run(Processor(controller, guard, other), y) - u)))
-    # Where long double is no wider than double, the difference is zero: then that of one rounding.
+    # If long double is no wider than double, the difference is zero; then that of one rounding is used.
     differ = max(differ, margin * float(np.finfo(controller.dtype).eps) * float(np.max(np.abs(u))))
     digit = 10.0 ** int(np.floor(np.log10(max(differ, np.finfo(float).tiny))) - 1)
     return float(f"{np.ceil(differ / digit) * digit:.1e}")
 
 
 def _linear(controller: SampledController, guard: Protection, samples: int, settings: SignalSettings) -> np.ndarray:
-    """(samples, n_y) all inputs at once, with random phases, within the range of inputs and drives. Their power falls
-    with the controller's gain: with inputs of one size at all frequencies the slow states hide the fast ones, with
-    drives that move alike the inputs reach their range at the highest frequencies."""
+    """(samples, n_y) excitation of all inputs at once, with random phases, within the range of inputs and drives. Its
+    power falls with the controller's gain: with equal inputs at all frequencies the slow states would hide the fast
+    ones; with equal drive voltages the inputs would reach their range at the highest frequencies."""
     K = controller.system
     frequency = np.fft.rfftfreq(samples, K.dt)
     used = (frequency >= settings.low_Hz) & (frequency <= settings.high * frequency[-1])
@@ -110,8 +112,8 @@ def _linear(controller: SampledController, guard: Protection, samples: int, sett
 
 
 def _extreme(controller: SampledController, guard: Protection, samples: int, settings: SignalSettings) -> np.ndarray:
-    """At most (samples, n_y): for each drive those inputs within their range that move its voltage most, up, then down
-    (the signs of the impulse response, backwards); less of them where that reaches the limit by far."""
+    """At most (samples, n_y): for each drive, the inputs within their range that move its voltage most, up, then down
+    (signs of the time-reversed impulse response); smaller where these would exceed the limit by far."""
     K, rows = controller.system, samples // (2 * controller.system.noutputs)
     response, column = [K.D], K.B
     for _ in range(rows - 1):
@@ -126,13 +128,13 @@ def _extreme(controller: SampledController, guard: Protection, samples: int, set
 
 
 def _range(guard: Protection, settings: SignalSettings) -> np.ndarray:
-    """(n_y,) magnitudes that valid inputs have at most."""
+    """(n_y,) largest magnitudes of valid inputs."""
     limit = np.where(np.isfinite(guard.input_limit_V), guard.input_limit_V, settings.unlimited_V)
     return settings.range_fraction * limit
 
 
 def _invalid(guard: Protection) -> tuple[float, ...]:
-    """An invalid input of `vectors` and three of `restarts`; out of the converter's range where it is known."""
+    """One invalid input for `vectors` and three for `restarts`; out of the converter's range if it is known."""
     if not np.all(np.isfinite(guard.input_limit_V)):
         return np.nan, -np.inf, np.nan, np.inf
     beyond = 2 * float(np.max(guard.input_limit_V))
@@ -140,7 +142,7 @@ def _invalid(guard: Protection) -> tuple[float, ...]:
 
 
 def _demand(controller: SampledController, guard: Protection, y: np.ndarray) -> float:
-    """Largest demand over limit with the inputs y, without any limits."""
+    """Largest ratio of demand to limit for the inputs y, with all limits removed."""
     free = Processor(controller, replace(guard, input_limit_V=np.full(guard.input_limit_V.size, np.inf)))
     free.limits_V = np.full(free.limits_V.size, np.inf)
     return max(float(np.max(np.abs(_run(free, y)) / controller.limits_V)), float(np.finfo(float).tiny))
@@ -161,13 +163,13 @@ def expected_V(controller: SampledController, guard: Protection, y: np.ndarray) 
 
 
 def as_csv(controller: SampledController, y: np.ndarray, u: np.ndarray) -> str:
-    """One row a sample; numbers read back exactly."""
+    """One row per sample; the numbers read back exactly."""
     K = controller.system
     return "\n".join([_head(K), *(",".join(map(repr, map(float, row))) for row in np.hstack([y, u]))]) + "\n"
 
 
 def read_csv(path: Path, controller: SampledController) -> tuple[np.ndarray, np.ndarray]:
-    """y and u of a file of `as_csv`. Raises InputError."""
+    """y and u from a file that `as_csv` made. Raises InputError."""
     K = controller.system
     try:
         head, *lines = path.read_text(encoding="utf-8").splitlines()

@@ -1,8 +1,8 @@
-"""Lower bounds: plants of the uncertainty set that the emitted controller meets, found at single frequencies.
+"""Lower bounds: the worst plants of the uncertainty set for the emitted controller, found at single frequencies.
 
-The loop is closed frequency by frequency with the exact response of the emitted numbers, hold and delay included, the
-images of the sample rate left out: where a chain may be wrong by more than 100 % at half the rate, the set has plants
-that have none. The worst one is replayed through the compiled code in time.
+The loop is closed frequency by frequency with the exact response of the emitted numbers, including hold and delay, but
+without the images of the sample rate: if a chain may be wrong by more than 100 % at half the rate, the set contains
+plants without images. The worst plant is then simulated in time with the compiled code.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
 
 class WorstPlant(NamedTuple):
     """gain : from floor to payload velocity of the kept axes, rotations at the edge. omega : rad/s. delta : (n_w, n_z)
-    of the design's blocks. direction : (n_axes,) complex floor velocity of norm 1 that is amplified so."""
+    of the design's blocks. direction : (n_axes,) complex floor velocity of norm 1 that has this gain."""
 
     gain: float
     omega: float
@@ -37,7 +37,7 @@ def mu_lower(axes: SampledAxes, found: Bounds) -> float:
 
 
 def worst_transmissibility(axes: SampledAxes, found: Bounds) -> WorstPlant:
-    """The worst plant of transmissibility, near the peaks of its upper bound."""
+    """The plant with the worst transmissibility, near the peaks of its upper bound."""
     plant = axes.folder.plant
     omega = _near(found.peak, axes.half_rate)
     M = _closed(plant.full.restricted(plant.floor_velocities, plant.velocities), axes, omega)
@@ -48,8 +48,8 @@ def worst_transmissibility(axes: SampledAxes, found: Bounds) -> WorstPlant:
 
 
 def _near(peak: MuPeak, half_rate: float, count: int = 12) -> np.ndarray:
-    """(n,) the frequencies of the highest upper bounds and of the highest local maxima of their curve, and where the
-    lower one was reached. The highest ones alone may all lie where the bound of the sampling errors is largest."""
+    """(n,) frequencies of the highest upper bounds, of the highest local maxima of their curve, and of the lower bound.
+    The highest bounds alone may all lie where the bound of the sampling errors is largest."""
     upper = peak.upper_curve
     beside = np.concatenate([[-np.inf], upper, [-np.inf]])
     maxima = np.flatnonzero((upper >= beside[:-2]) & (upper >= beside[2:]))
@@ -58,7 +58,7 @@ def _near(peak: MuPeak, half_rate: float, count: int = 12) -> np.ndarray:
 
 
 def _closed(plant: GeneralizedPlant, axes: SampledAxes, omega: np.ndarray) -> np.ndarray:
-    """(n_omega, n_z + n_e, n_w + n_d) the loop with the emitted controller."""
+    """(n_omega, n_z + n_e, n_w + n_d) response of the loop with the emitted controller."""
     # F_l(P, K) is F_u of P with its last inputs and outputs first.
     P = plant.P.frequency_response(omega)
     return perturbed(np.roll(P, (plant.nmeas, plant.ncon), axis=(1, 2)), axes.response(omega))

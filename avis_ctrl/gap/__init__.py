@@ -1,8 +1,8 @@
-"""The gap between a table's model and its measurement: the engine of `avis gap`.
+"""The gap between the model of a table and its measurement: the engine of `avis gap`.
 
-The package can also be called: `avis_ctrl.gap(campaign, rig)` searches for the effects that the model of a table
-misses, as `avis gap` does. Its parameters are those of `avis_ctrl.interface.workflow.gap`: see the help of this
-function, or docs/reference/workflow.md.
+The package is callable: `avis_ctrl.gap(campaign, rig)` searches for effects that are missing from the model of a table,
+as `avis gap` does. It takes the parameters of `avis_ctrl.interface.workflow.gap`: see the help of that function, or
+docs/reference/workflow.md.
 """
 
 import importlib
@@ -13,7 +13,7 @@ from typing import Any
 
 class _Callable(ModuleType):
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        # By name: the interface lies above this package.
+        # Imported at call time: the interface depends on this package.
         return importlib.import_module("avis_ctrl.interface.workflow").gap(*arguments, **options)
 
 

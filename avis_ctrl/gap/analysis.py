@@ -1,6 +1,6 @@
-"""The gap between a rig and a campaign, from signals to verdict.
+"""Gap analysis of a rig and a campaign, from the signals to the verdict.
 
-    prepare -> fit of rig -> with tolerances -> search -> names -> stages, shares and what remains
+    prepare -> fit of rig -> fit with tolerances -> search -> naming -> stages, power fractions and residual
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """base : the rig re-identified. tolerant : with every tolerance. steps : of the search. best : with all effects."""
+    """base : fit of the re-identified rig. tolerant : fit with all tolerances. steps : of the search. best : fit with
+        all effects."""
 
     base: Fitted
     tolerant: Fitted
@@ -68,10 +69,10 @@ class Fits:
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """What is named.
+    """Effects that are named.
 
-    updated : the model with it. probability, rivals : by label of its effects. refused : why an effect is not named, by
-    its label.
+    updated : fit with these effects. probability, rivals : by label of the effect. refused : why an effect is not
+        named, by label.
     """
 
     updated: Fitted
@@ -83,17 +84,17 @@ class Names:
 def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
             amplifier_corner_Hz: float | None = None, effects: Sequence[Effect] | None = None,
             progress: Progress = lambda text: None, each: Each = one_by_one, settings: GapSettings = SETTINGS) -> Gap:
-    """Find, name and close the gap.
+    """Search for missing effects, name them and update the model.
 
     Parameters
     ----------
-    campaign : records in the rig's own words, driven ones among them. rig : as its file has it.
-    band_Hz : of the comparison; the excited one where None. effects : candidates; the library where None.
-    each : how independent fits are done; one after the other by default.
+    campaign : records with the channel names of the rig; some of them drive the actuators. rig : as in its file.
+    band_Hz : of the comparison; the excited band if None. effects : candidates; the library if None.
+    each : runs independent fits; one after the other by default.
 
     Raises
     ------
-    InputError : a campaign that drives nothing, or tells no noise.
+    InputError : no record drives an actuator, or the noise cannot be estimated.
     """
     began = time.monotonic()
     prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress, each, settings)
@@ -105,7 +106,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         fits = _fits(prepared, rig, known, progress, each, settings)
     residual = ModelResidual.of(fits.best.model, prepared.held_out)
     if prepared.local_noise and residual.noise_nrmse ** 2 > settings.within_noise * residual.nrmse ** 2:
-        # A local model takes distortion for noise; the model with its effects may predict it.
+        # A local polynomial model counts distortion as noise; the model with its effects may predict it.
         progress("noise estimated again, with the effects that were found")
         prepared = with_noise_from(prepared, fits.best.model, each)
         fits = _refitted(fits, prepared, known, progress, each, settings)
@@ -137,8 +138,8 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Each,
               settings: GapSettings) -> Fits:
-    """The fits that follow from a new estimate of the noise: the last model again, and what is found beside it. The
-    effects that were found are judged by the noise with which they were found."""
+    """Refit the last model with the new noise estimate and continue the search from there. Effects found before are
+    still judged with the noise estimate with which they were found."""
     data, best = prepared.data(prepared.fitted, settings.lines), fits.best
     best = fit(best.model, best.priors, best.z, data, best.variances, settings)
     return _searched(replace(fits, best=best), data, effects, progress, each, settings)
@@ -146,11 +147,11 @@ def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progres
 
 def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Each, settings: GapSettings
               ) -> Fits:
-    """With the effects that the search finds beside those of the best fit."""
+    """Add the effects that the search finds in addition to those of the best fit."""
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
 
     def enough(step: Step) -> bool:
-        """What was found takes next to nothing of the gap."""
+        """Whether the effect found last explains a negligible part of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
     steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
@@ -159,8 +160,9 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
 
 def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
                   ) -> tuple[tuple[Step, ...], Fitted]:
-    """Without weak effects (`is_weak`) that the evidence does not need, and the fit that is left. A value beyond its
-    tolerance has its evidence in how far others had to move, or by narrower priors (`outliers`)."""
+    """Remove weak effects (`is_weak`) that the evidence does not require; the remaining steps and the fit. Values
+    beyond their tolerance are kept: their evidence lies in how far other values had to move, or in narrower priors
+    (`outliers`)."""
     weak = [step for step in steps if name_of(step.label)[0] not in BEYOND and is_weak(best, step.label, settings)]
     kept, best = without_needless(weak, best, data, settings)
     return tuple(step for step in steps if step in kept or step not in weak), best
@@ -176,8 +178,8 @@ def _excess(base: Fitted, data: Data) -> float:
 
 
 def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
-    """What was found and stands: the more probable of its alternatives, of the same size in both halves of band and
-    level, and borne out by held-out records."""
+    """Name the effects that pass all checks: an effect must be more probable than its alternatives, have the same size
+    in both halves of band and level, and make held-out records more likely."""
     data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
     best, probability, rivals, refused = fits.best, {}, {}, {}
     for step in fits.steps:
@@ -201,7 +203,7 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
 
 
 def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Data, settings: GapSettings) -> str:
-    """Why an effect that was found is not named; empty where it is."""
+    """Why an effect is not named; empty if it is named."""
     one = best.model.effect(step.label)
     if one.effect.outside:
         return "it is not in the library"
@@ -218,10 +220,10 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
 
 
 def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSettings) -> bool:
-    """Whether held-out records are more likely with an effect: when it was found, or, if not, beside all effects found
-    later. A weak effect may not show while a stronger one is missing."""
+    """Whether an effect makes held-out records more likely: when it was found or, failing that, together with all
+    effects found later. A weak effect may not show while a stronger one is missing."""
     def likelihood(one: Fitted) -> float:
-        # With the priors: a value beyond its tolerance shows in how far others had to move, and hardly in a residual.
+        # With the priors: a value beyond its tolerance shows in how far other values had to move, hardly in a residual.
         return sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
     if likelihood(step.fitted) > likelihood(step.before):
         return True
@@ -230,13 +232,13 @@ def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSe
 
 
 def _judged(one: ActiveEffect) -> list[str]:
-    """Parameters of an effect that halves of the data must agree on: without those that may end anywhere."""
+    """Parameters of an effect on which halves of the data must agree: all except those that may end at their bounds."""
     return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
 
 
 def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float,
          progress: Progress, each: Each, settings: GapSettings) -> Gap:
-    """Figures, maps and sentences, all on held-out records."""
+    """Assemble the result; stages, maps and sentences are computed on held-out records."""
     blocks, updated = prepared.held_out, names.updated
     before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
     raw = ModelResidual.of(fits.base.model, prepared.unmasked)
@@ -284,7 +286,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
 
 
 def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
-    """The models between that with tolerances and the updated one, an effect more each, in the order of finding."""
+    """The models from the one with tolerances to the updated one, each with one more effect, in order of finding."""
     found, data = [], prepared.data(prepared.fitted, settings.lines)
     one: Fitted | None = updated
     for label in reversed(updated.labels):
@@ -316,26 +318,27 @@ def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_
 
 
 def _share_of_signal(name: str, raw: ModelResidual, masked: ModelResidual, power: Power) -> float:
-    """Of what acts on the signals alone, over the baseline's excess with it: hum by the lines that it spoils; what is
-    in the noise (floor, converter) by the noise itself."""
+    """Part of the gap due to an effect on the signals alone, relative to the baseline's excess including this part. Hum
+    is measured on the lines that it pollutes; floor and converter, which are part of the noise, by the noise itself."""
     own = max(raw.nrmse ** 2 - masked.nrmse ** 2, 0.0) if name == "mains_hum" else power.noise
     return float(own / max(own + power.excess, 1e-300))
 
 
 def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remainder, settings: GapSettings) -> Verdict:
-    """By the rules of the contract. closed : what remains is noise. small : that, or less than 1 % of the response."""
+    """Verdict by the rules of the contract. closed : the residual is noise. small : closed, or below 1 % of the
+    response."""
     if not told:
         return "none" if small else "unexplained"
     return "explained" if closed or left.share <= 1 - settings.explained else "partly explained"
 
 
 def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
-    """Every value of the rig file with a tolerance, the most moved first."""
+    """Every value of the rig file with a tolerance, the largest shift first."""
     return moved(fitted, with_tolerance(fitted), tolerances_of(fitted.model.rig), settings)
 
 
 def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:
-    """Which measurement would tell an effect from what it cannot be told from."""
+    """The measurement that would distinguish an effect from its strongest rival; None if no rival remains."""
     for one in told:
         if one.indistinguishable_from and one.label:
             step = next(step for step in fits.steps if step.label == one.label)
@@ -346,7 +349,7 @@ def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:
 
 
 def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSettings) -> tuple[Considered, ...]:
-    """What was fitted and not named, step by step, the most probable first."""
+    """Effects that were fitted but not named, the most probable first."""
     rows, thin = [], prepared.data(prepared.held_out, settings.lines).blocks
     for number, step in enumerate(fits.steps, 1):
         best = max(step.tried.values(), key=lambda one: one.log_evidence)
@@ -370,7 +373,7 @@ def _percent(share: float) -> str:
 
 def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[NamedEffect], stages: Sequence[Stage],
              left: Remainder, after: ModelResidual) -> str:
-    """The one sentence."""
+    """The opening sentences: verdict and size of the gap."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"the noise alone is estimated at {_percent(after.noise_nrmse)}"
     also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
@@ -385,7 +388,7 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
-    """How much remains, where, and at which level."""
+    """How large the residual is, where, and at which level."""
     if left.over_noise <= 1.05:
         if not remaining:
             return "the residual is the noise"

@@ -1,4 +1,4 @@
-"""The campaign as `gap` uses it: what is fitted, what no fit sees, spectra with measured noise, and fewer lines."""
+"""The campaign as used by `gap`: fitted and held-out records, and spectra with measured noise."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 
 @dataclass(frozen=True)
 class SilentLineSettings:
-    """Of lines on which the drives are silent.
+    """Settings of the lines on which the drives are silent.
 
-    bands_per_octave : bands to the octave in which these lines are weighted by what is left of them.
-    weightings : how often these weights are formed anew, from equal ones on.
-    settled : periods of a record from which the first one may be left to the transient.
+    bands_per_octave : bands per octave in which these lines are weighted by their residual.
+    weightings : number of times these weights are computed, starting from weights that are equal over frequency.
+    settled : minimum number of periods of a record for its first period to be dropped as transient.
     """
 
     bands_per_octave: int = 2
@@ -44,7 +44,7 @@ SETTINGS = SilentLineSettings()
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Which records (or parts of them) are fitted and which no fit sees, and a sentence."""
+    """Fitted and held-out records (or parts of records), and a sentence on the choice."""
 
     fitted: Campaign
     held_out: Campaign
@@ -52,13 +52,14 @@ class Halves:
 
 
 def divide(campaign: Campaign) -> Halves:
-    """Hold out records of which another one of the same level and kind is fitted; else the last third of each.
+    """Hold out records if another record of the same level and kind is fitted; otherwise the last third of each record.
 
-    Highest level first, then the lowest: what depends on amplitude shows there. Never more than a third of the records.
+    The highest level is held out first, then the lowest: effects that depend on amplitude show there. At most a third
+    of the records is held out.
 
     Raises
     ------
-    InputError : no record that drives an actuator.
+    InputError : no record drives an actuator.
     """
     driven = [record for record in campaign.records if driven_inputs(record)]
     if not driven:
@@ -88,23 +89,23 @@ def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:
 
 
 def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]) -> list[SpectralBlock]:
-    """Spectra of every record that drives something or knows its floor."""
+    """Spectra of every record that drives an actuator or has its floor measured."""
     found = [record_block(record.load(), model.base, band_Hz) for record in campaign.records]
     return [block for block in found if np.any(block.U)]
 
 
 def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campaign, model: TableModel,
                band_Hz: tuple[float, float]) -> tuple[list[SpectralBlock], str]:
-    """The blocks with noise that no error of the model's drives can enter, and a sentence.
+    """The blocks with noise that is not affected by errors of the modelled response to the drives, and a sentence.
 
-    Of records at rest, and of the lines between the harmonics of periodic ones, first period left out: there u is
-    silent. Without either, of what a local polynomial model leaves (Schoukens, Vandersteen, Barbe, Pintelon 2009) of
-    `left`, the campaign less what the model predicts: whatever the model misses of the drives' response goes into the
-    local model, and that is smooth where the response itself is sharp.
+    The noise is measured where u is silent: in records at rest, and on the lines between the harmonics of periodic
+    records, without the first period. If there are none, it is the residual of a local polynomial model (Schoukens,
+    Vandersteen, Barbe, Pintelon 2009) of `left`, the campaign minus the model's prediction. The local model absorbs
+    what is missing from the modelled response to the drives; this error is smooth where the response itself is sharp.
 
     Raises
     ------
-    InputError : records from which no noise can be told.
+    InputError : the noise cannot be estimated from the records.
     """
     quiet = [found for record in campaign.records if (found := _silent(record, model, band_Hz)) is not None]
     kinds = {one.block.kind for one in quiet}
@@ -125,7 +126,7 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
 
 
 def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
-    """Whether `with_noise` finds lines on which the drives are silent for every kind of block."""
+    """Whether `with_noise` finds lines without drive for every kind of block."""
     kinds = {"floor measured" if r.header.floor_names else "floor not measured" for r in campaign.records
              if (r.header.period_samples and r.header.periods >= SETTINGS.settled) or not driven_inputs(r)}
     return {block.kind for block in blocks} <= kinds
@@ -136,7 +137,8 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
         return measured_noise(campaign, block, band_Hz)
     except AvisError:
         pass
-    # A floor that is still in part of the band cannot be told from the drives there; its response is taken off already.
+    # Where the floor does not move in part of the band, floor and drives cannot be separated there. The response to the
+    # floor is already subtracted.
     records = []
     for source in campaign.records:
         record = source.load()
@@ -151,8 +153,8 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
 
 
 def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float]) -> Residual | None:
-    """What the model leaves on lines without drive: of a record at rest all, of a periodic one those between its
-    harmonics, once the first period has carried the transient of the start away. None where there are none."""
+    """Residual of the model on lines without drive; None if there are none. At rest these are all lines; for a periodic
+    record they are the lines between its harmonics, after the first period, which contains the starting transient."""
     h = record.header
     if h.period_samples and h.periods >= SETTINGS.settled:
         segment = record.load(h.period_samples, h.periods * h.period_samples)
@@ -164,8 +166,8 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
         block = record_block(record.load(), model.base, band_Hz)
     else:
         return None
-    # What the ends of the record leave is found by weighted least squares: where the noise falls with frequency, equal
-    # weights would leave of it, everywhere, as much as the noise where it is largest.
+    # The transient of the record's ends is estimated by weighted least squares. With equal weights its error at all
+    # frequencies would be as large as the largest noise.
     power = np.broadcast_to(np.mean(np.abs(block.Y) ** 2, axis=(0, 2)), block.Y.shape[:2])
     octave = np.floor(SETTINGS.bands_per_octave * np.log2(block.omega / block.omega[0])).astype(int)
     lines = np.maximum(np.bincount(octave), 1)

@@ -1,4 +1,4 @@
-"""Dahl's friction: a spring before it slips, a constant force after (P. R. Dahl, A solid friction model, 1968)."""
+"""Dahl friction: a spring before slip, a constant force after it (P. R. Dahl, A solid friction model, 1968)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numba import njit
 def dahl(deflection, last, slip, state):
     """(samples, m) friction force over stiffness [m] for a deflection (samples, m), exact between samples.
 
-    While the motion keeps its direction, f -> +-slip as exp(-|dx|/slip). last, state : (m,) before the first sample.
+    While the motion keeps its direction, f approaches +-slip as exp(-|dx|/slip). last, state : (m,) deflection and
+    force over stiffness before the first sample.
     """
     n, m = deflection.shape
     out = np.empty((n, m))

@@ -1,9 +1,9 @@
-"""How large an effect would have to be to be seen: what a verdict of none is worth.
+"""Smallest detectable size of each effect: how much a verdict of "none" is worth.
 
-Of an effect that is linear in its parameters near none, the directions A of the score test (whitened, with everything
-that re-identification absorbs projected out) are also what a fit would know them by: the covariance of the parameters
-is inv(A A^T). A parameter gains the evidence that a name needs at between four and five of its standard deviations:
-five are given.
+Consider an effect that is linear in its parameters near zero strength. The directions A of its score test (whitened,
+with everything that re-identification absorbs projected out) also give the covariance that its parameters would have in
+a fit: inv(A A^T). A parameter reaches the evidence required for a name at four to five standard deviations; five are
+reported.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from avis_ctrl.gap.table_model import active
 
 
 def detection_limits(score: Score, effects: Sequence[Effect] | None = None) -> tuple[Detectable, ...]:
-    """For every effect, place and parameter the departure from its value without the effect, of five standard
-    deviations.
+    """Detection limits: five standard deviations of every parameter, as a difference from its value without the effect.
 
-    Of effects whose parameters are all linear, each parameter with the others of its effect free; of two laws of one
-    effect the larger value. One effect at a time. Infinite where re-identification absorbs a parameter.
+    One row for each effect, place and parameter of effects whose parameters are all linear. One effect at a time, with
+    the other parameters of the effect free. If an effect has two laws, the larger value is given. Infinite if
+    re-identification absorbs a parameter.
 
     Parameters
     ----------
-    score : at the fitted model. effects : the library where None.
+    score : at the fitted model. effects : the library if None.
     """
     model = score.model
     rows: dict[tuple[str, str, str], Detectable] = {}
@@ -50,12 +50,12 @@ def detection_limits(score: Score, effects: Sequence[Effect] | None = None) -> t
 
 
 def _standard_deviations(A: np.ndarray) -> np.ndarray:
-    """(k,) standard deviations of the parameters behind directions A (k, N); infinite where they are not determined."""
+    """(k,) standard deviations of the parameters with directions A (k, N); infinite for undetermined parameters."""
     size = np.linalg.norm(A, axis=1)
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh((A @ A.T) / np.outer(size, size))
     known = values > SETTINGS.least_eigenvalue * max(values[-1], 1e-300)
     variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1) / size ** 2
-    # What moves a parameter and changes nothing: there its standard deviation has no bound.
+    # Parameters in the null space change nothing: their standard deviation is infinite.
     loose = np.sum(vectors[:, ~known] ** 2, axis=1) > SETTINGS.least_left
     return np.where(loose, np.inf, np.sqrt(variance))

@@ -1,10 +1,10 @@
-"""A table on the lines of a whole record: the linear part of a simulation in time.
+"""Response of a table on the spectral lines of a whole record: the linear part of a time simulation.
 
-A record from rest is put before silence of at least its own length and `quiet_s`, so that what the discrete Fourier
-transform wraps around has died out. The responses are those of a fit (`TableResponse`): hold, delay and aliases
-included, the floor's velocity band-limited between its samples. At frequency zero, where displacement by velocity of
-the floor and an integrating loop are infinite while what is read is not, the line is taken at `lowest_line` of the line
-spacing.
+A record that starts from rest is padded with silence of at least its own length and at least `quiet_s`, so that the
+wrap-around of the discrete Fourier transform has died out. The responses are those of a fit (`TableResponse`),
+including hold, delay and aliases; the floor velocity is band-limited between its samples. At zero frequency, the
+floor's displacement per velocity and an integrating loop are infinite while the measured output is finite. This line is
+evaluated at `lowest_line` times the line spacing.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from avis_ctrl.gap.table_response import Acting, TableResponse
 
 @dataclass(frozen=True)
 class RecordLineSettings:
-    """Of a whole record on the lines of its transform.
+    """Settings of the response on the lines of a whole record.
 
-    quiet_s : silence behind a record [s]: with 1 % of damping at 1.5 Hz, motion falls to 0.4 % of itself.
-    highest_Hz : lines above this are taken as zero [Hz]: a table moves there by its mass alone, and little.
-    lowest_line : where the line at frequency zero is taken [line spacings].
-    chunk : lines of which the table is assembled at once: memory.
-    most_samples : samples of a record beyond which it does not fit into memory in one piece (padded: some 2 kB a
+    quiet_s : silence after a record [s]; with 1 % damping at 1.5 Hz, motion decays to 0.4 %.
+    highest_Hz : lines above this are set to zero [Hz]: there only the inertia of a table matters, and it moves little.
+    lowest_line : position of the line at frequency zero [line spacings].
+    chunk : number of lines for which the table is assembled at once; limits memory.
+    most_samples : maximum number of samples of a record that fits into memory in one piece (padded: about 2 kB per
         sample).
     """
 
@@ -43,12 +43,12 @@ SETTINGS = RecordLineSettings()
 
 
 class LineResponse:
-    """The table on lines of a padded record.
+    """The table on the lines of a padded record.
 
     Attributes
     ----------
-    samples, padded : of a record, without and with silence. omega : (n,) rad/s of the lines kept, from zero on.
-    parts : the table on successive lines, `chunk` of them each. kept : what is made of it once for all records.
+    samples, padded : of a record, without and with silence. omega : (n,) rad/s of the lines kept, starting at zero.
+    parts : the table on successive groups of `chunk` lines. kept : quantities computed from it once for all records.
     """
 
     def __init__(self, model: TableModel, samples: int, padded: int, sample_rate_Hz: float):
@@ -65,19 +65,19 @@ class LineResponse:
         return Assembled(self.model.operators(self.omega[lines]))
 
     def spectrum(self, samples: np.ndarray) -> np.ndarray:
-        """(n, m) of (samples, m) from rest."""
+        """(n, m) spectrum of (samples, m) from rest."""
         return scipy.fft.rfft(samples, self.padded, axis=0)[:len(self.omega)]
 
     def in_time(self, spectrum: np.ndarray) -> np.ndarray:
-        """(samples, m) of (n, m)."""
+        """(samples, m) time signal of a spectrum (n, m)."""
         return scipy.fft.irfft(spectrum, self.padded, axis=0)[:self.samples]
 
     def answer(self, u: np.ndarray, floor: np.ndarray | None, moved: np.ndarray | None = None,
                acceleration: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """y (samples, n_y), and deflection (samples, n_g) of the mounts.
 
-        u (samples, n_u), floor (samples, 3). moved : (n, n_q) spectrum of a motion beside that by u and floor.
-        acceleration : (samples, n_y) along the sensors that no motion of the table shows.
+        u (samples, n_u), floor (samples, 3). moved : (n, n_q) spectrum of a motion in addition to the response to u and
+        floor. acceleration : (samples, n_y) along the sensors in addition to that of the table's motion.
         """
         U = self.spectrum(np.hstack([u, np.zeros((len(u), 3)) if floor is None else floor]))
         beside = None if acceleration is None else -self.spectrum(acceleration) / (self.omega ** 2)[:, None]
@@ -96,11 +96,11 @@ _last: list[tuple[tuple, LineResponse]] = []
 
 
 def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> LineResponse:
-    """The linear part of a model for records of one length; the last one is kept.
+    """The linear part of a model for records of one length; the last result is cached.
 
     Raises
     ------
-    InputError : a record too long for one piece, a rate that is not the model's.
+    InputError : a record too long for one piece, or a sample rate other than the model's.
     """
     key = model.base, model.effects, samples, sample_rate_Hz
     if _last and _last[0][0] == key:
@@ -112,6 +112,6 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
         raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz",
                          value=sample_rate_Hz)
     padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(SETTINGS.quiet_s * sample_rate_Hz))), True)
-    _last.clear()  # first, so that two never lie in memory
+    _last.clear()  # first, so that memory never holds two
     _last.append((key, LineResponse(model, samples, padded, sample_rate_Hz)))
     return _last[0][1]

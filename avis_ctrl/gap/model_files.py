@@ -1,7 +1,8 @@
-"""A table with effects as JSON, and back: rig as the text of a rig file, sensors, drives, effects with their values.
+"""Read and write table models with effects as JSON.
 
-What is not kept: the records in time of effects that depend on them, and which physically possible ranges followed from
-these. The clock of the campaign is kept, for effects that depend on time.
+A file contains the rig as the text of a rig file, sensors, drives, and effects with their values. Not stored are the
+time records of effects that depend on them, and the physical bounds derived from these records. The clock of the
+campaign is stored, for effects that depend on time.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ class EffectFile(Section):
 class ModelFile(Section):
     """A model in a file.
 
-    rig : text of a rig file. rig_values : parameters of the rig that no rig file may hold, such as an inertia that the
-    data gave and no body has. suspensions : corner [Hz] and damping ratio of geophones that are not as their filters
-    assume. period_s : 0 for responses against the voltage itself.
+    rig : text of a rig file. rig_values : parameters of the rig that a rig file must not contain, such as an identified
+        inertia that no body has. suspensions : corner [Hz] and damping ratio of geophones that differ from those
+        assumed by their filters. period_s : 0 for responses to the voltage itself.
     """
 
     format: Literal["avis-gap-model"]
@@ -63,12 +64,12 @@ class ModelFile(Section):
     delay_s: Annotated[float, Field(ge=0, lt=1)]
     amplifier_corner_Hz: Positive | None
     effects: list[EffectFile]
-    fixed: list[str] = []  # of files before 0.5: says nothing of the model's response
+    fixed: list[str] = []  # from files before 0.5: has no influence on the response
     campaign_s: Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 def model_to_dict(model: TableModel) -> dict[str, Any]:
-    """What `model_from_dict` reads back, every number with all its digits.
+    """The content that `model_from_dict` reads back, every number with all its digits.
 
     Raises InputError for a rig that no rig file describes.
     """
@@ -87,7 +88,8 @@ def model_to_dict(model: TableModel) -> dict[str, Any]:
 
 
 def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
-    """Text of a rig file, and what it may not hold: products of inertia, and moments that no body has."""
+    """Text of a rig file, and values that it must not contain: products of inertia, and moments of inertia that no body
+    has."""
     text, loaded = rig_toml(rig), getattr(rig, "load", None) is not None
     try:
         rig_from(tomllib.loads(text), loaded)
@@ -103,12 +105,11 @@ def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
 
 
 def model_from_dict(content: Mapping[str, Any]) -> tuple[TableModel, tuple[float, float]]:
-    """The model that `model_to_dict` wrote, and the first and last time of the campaign that it was found from.
+    """The model written by `model_to_dict`, and the first and last time of the campaign from which it was found.
 
     Raises
     ------
-    InputError : a field that is missing, unknown or wrong, an effect that the library does not have, a rig that no
-        table has.
+    InputError : a missing, unknown or wrong field, an effect that is not in the library, or an impossible rig.
     """
     checked = _checked(content)
     begin, end = checked.campaign_s
@@ -116,9 +117,9 @@ def model_from_dict(content: Mapping[str, Any]) -> tuple[TableModel, tuple[float
 
 
 def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
-    """Model of a file, and the first and last time of the campaign that it was found from.
+    """The model in a file, and the first and last time of the campaign from which it was found.
 
-    Raises InputError naming file and field.
+    Raises InputError with the file and field.
     """
     content = read_json(Path(path), FORMAT, "the model of avis gap")
     try:
@@ -166,7 +167,7 @@ def _made(file: ModelFile) -> TableModel:
 
 
 def _require_answer(model: TableModel) -> None:
-    """Values that leave no finite response are no model."""
+    """Raise InputError for parameter values without a finite response."""
     try:
         with np.errstate(all="ignore"):
             finite = bool(np.all(np.isfinite(model.response(2 * np.pi * np.array([0.3, 3.0, 30.0])))))
@@ -178,9 +179,9 @@ def _require_answer(model: TableModel) -> None:
 
 
 def effect_at(model: TableModel, name: str, place: str | None, field: str) -> tuple[Effect, str]:
-    """An effect by its name, and the place where it acts: the one given, or the only one there is for None.
+    """An effect by name, and the place where it acts: the given one, or for None the only possible one.
 
-    Raises InputError with the names, or the places, that there are.
+    Raises InputError with the available names or places.
     """
     known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if name not in known:

@@ -1,10 +1,11 @@
-"""The motion of the mounts in a measured record: simulated by a model, corrected by what the sensors say.
+"""The motion of the mounts in a measured record: simulated with a model, corrected by the sensor signals.
 
     d = d_model + G q_e,    q_e = K (y - y_model)
 
-y - y_model is taken for the response to a force e that the model lacks, white within a third of an octave, and to white
-noise of the sensors. The most likely q_e is then K = P H^H S (H S H^H + N)^-1 (Wiener), with H = (y by force) and
-P = D^-1 S: the inverse of the sensors' chain where they see more than noise, nothing where they do not.
+y - y_model is modelled as the response to a missing force e, white within each third of an octave, plus white sensor
+noise. The most likely q_e is then given by the Wiener filter K = D^-1 S H^H (H S H^H + N)^-1, with H from force to y, S
+the variance of the force and N that of the noise. K inverts the sensor response where the signal exceeds the noise and
+is zero where it does not.
 """
 
 from __future__ import annotations
@@ -27,16 +28,15 @@ from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSour
 
 @dataclass(frozen=True)
 class RecordMotionSettings:
-    """Of the motion of the mounts in a measured record.
+    """Settings of the estimated motion of the mounts in a measured record.
 
-    low_Hz : lower end of the band in which the sensors correct the model, from nothing to all [Hz]: below, the
-        inverse of the sensors' chain would raise their noise.
-    high_Hz : upper end of that band, from all to nothing [Hz]: above, the mounts deflect little.
-    noise_from : fraction of the band from which on, to its upper end, only noise is left: its power is that of the
-        sensors [1].
-    margin_s : length to which a record is continued beyond its ends [s]: several periods of a table's lowest mode.
-    passes : passes in which that continuation is found.
-    relaxation : how far each pass goes beyond what it finds [1]: plain passes come nearer by a fifth only.
+    low_Hz : lower edge of the band in which the sensors correct the model; the correction rises from zero to full [Hz].
+        Below, inverting the sensor response would amplify sensor noise.
+    high_Hz : upper edge of that band; the correction falls from full to zero [Hz]. Above, the mounts deflect little.
+    noise_from : fraction of the band above which only noise remains; its power is that of the sensors [1].
+    margin_s : length by which a record is extrapolated beyond its ends [s]: several periods of a table's lowest mode.
+    passes : iterations of this extrapolation.
+    relaxation : over-relaxation of these iterations [1]: a plain iteration reduces the error by only a fifth.
     """
 
     low_Hz: tuple[float, float] = (0.4, 0.8)
@@ -52,17 +52,18 @@ SETTINGS = RecordMotionSettings()
 
 def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Each = one_by_one
               ) -> dict[str, RecordMotion]:
-    """Motion of every record of a campaign by its name, from its measured y.
+    """Motion of every record of a campaign, by record name, from its measured y.
 
     Parameters
     ----------
-    campaign : its records may be portions of others: these are taken whole, so that the portion starts in motion.
-    model : effects that depend on amplitude or time do not act in the simulation; the sensors say what they did.
-    whole : the campaign that sets the clock, where `campaign` is a part of it. each : how records are worked through.
+    campaign : records may be portions of longer ones: these are simulated as a whole, so that the portion starts in
+        motion.
+    model : effects that depend on amplitude or time are left out of the simulation; the sensor signals contain them.
+    whole : the campaign that sets the clock, if `campaign` is a part of it. each : runs the records.
 
     Raises
     ------
-    InputError : channels or rates that are not the model's, a record too long for one piece.
+    InputError : channels or sample rates other than the model's, or a record too long for one piece.
     """
     campaign_s = clock_of(whole or campaign)
     linear = model.linear
@@ -80,13 +81,13 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
 
 
 def clock_of(campaign: Campaign) -> tuple[float, float]:
-    """Begin of the first record and end of the last one, s."""
+    """Start of the first record and end of the last record [s]."""
     headers = [one.header for one in campaign.records]
     return min(h.start_s for h in headers), max(h.start_s + h.duration_s for h in headers)
 
 
 def origin(record: RecordSource) -> tuple[RecordSource, int, int]:
-    """The whole record, and which samples of it a record is."""
+    """The whole record, and the range of its samples (begin, stop) that a record covers."""
     begin, stop = 0, record.header.samples
     while isinstance(record, Portion):
         begin, stop = begin + record.start, stop + record.start
@@ -95,7 +96,7 @@ def origin(record: RecordSource) -> tuple[RecordSource, int, int]:
 
 
 def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows from q (n_g, 6), stiffness (n_g,) N/m, which are vertical (n_g,), row of each motor (n_u,)."""
+    """Rows from q (n_g, 6), stiffness (n_g,) N/m, mask of the vertical rows (n_g,), row of each motor (n_u,)."""
     mounts = mount_geometry(model.effective.rig)
     found = map(getattr(model.rig, "mount_of", lambda name: None), model.actuators)
     rows = [mounts.names.index(one[0]) for one in found if one and one[0] in mounts.names]
@@ -103,7 +104,7 @@ def mount_rows(model: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
 
 
 def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Volts (samples, n_u), deflection (samples, n_g), and y (samples, n_y) where all of it was measured."""
+    """Volts (samples, n_u), deflection (samples, n_g), and y (samples, n_y), empty unless every sensor was measured."""
     h = record.header
     u, floor = model_inputs(linear.base, record)
     limit = linear.rig.limits_of(linear.actuators)
@@ -111,7 +112,7 @@ def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray
     lines = line_response(linear, h.samples, h.sample_rate_Hz)
     predicted, deflection = lines.answer(u, floor)
     rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
-    if not rows or not deflection.size:  # nothing measured, or a rig without mounts of their own
+    if not rows or not deflection.size:  # nothing measured, or no individual mounts
         return u, deflection, np.zeros((0, 0))
     seen = np.array([name in h.y_names for name in linear.sensors.names])
     left = record.y[:, rows] - predicted[:, seen]
@@ -122,10 +123,11 @@ def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray
 
 
 def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:
-    """(samples, n_g) deflection that explains what the sensors read beyond the model.
+    """(samples, n_g) deflection that explains the difference between the measured and the modelled outputs.
 
-    Nothing is measured beyond the ends. There stands nothing at first, then what the force found so far leaves: behind
-    the record a motion that dies out, so that the last seconds are not bent by what never was.
+    Nothing is measured beyond the ends of the record. The margins start at zero and are then filled with the response
+    to the force found so far. After the record this is a decaying motion, so that no artificial step distorts the last
+    seconds.
     """
     samples, fs = len(left), lines.sample_rate_Hz
     margin = min(round(SETTINGS.margin_s * fs), (lines.padded - samples) // 2, samples - 1)
@@ -136,7 +138,7 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
     if "corrected" not in lines.kept:
         lines.kept["corrected"] = lines.at(at)
     table: Assembled = lines.kept["corrected"]
-    # A force on the payload, as much moment as its size makes of it.
+    # A force on the payload; its moments are scaled with the r.m.s. lever arms of the mounts.
     size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(table.G[:, 3:N_Q] ** 2, axis=0))])
     H = table.left[:, seen, :N_Q] * size
 
@@ -160,7 +162,7 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
 
 
 def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """(n_at, 6) most likely force behind y (n, n_y) on the lines `at`, H (n_at, n_y, 6)."""
+    """(n_at, 6) most likely force that causes y (n, n_y), on the lines `at`; H (n_at, n_y, 6)."""
     noise = np.median(np.abs(spectrum[frequency > SETTINGS.noise_from * frequency[-1]]) ** 2, axis=0) / np.log(2)
     noise = np.maximum(noise, 1e-8 * np.mean(np.abs(spectrum) ** 2))
     white, H = spectrum[at] / np.sqrt(noise), H / np.sqrt(noise)[:, None]
@@ -171,25 +173,25 @@ def _force(spectrum: np.ndarray, H: np.ndarray, at: np.ndarray, frequency: np.nd
 
 
 def _fade(frequency: np.ndarray) -> np.ndarray:
-    """(n,) one between `low_Hz` and `high_Hz`, zero outside."""
+    """(n,) weight that rises from zero to one over `low_Hz` and falls to zero over `high_Hz`."""
     up, down = np.interp(frequency, SETTINGS.low_Hz, (0.0, 1.0)), np.interp(frequency, SETTINGS.high_Hz, (1.0, 0.0))
     return np.sin(np.pi / 2 * up) ** 2 * np.sin(np.pi / 2 * down) ** 2
 
 
 def _strength(frequency: np.ndarray, white: np.ndarray, H: np.ndarray) -> np.ndarray:
-    """(n,) variance of the force, a third of an octave at a time, that makes what exceeds unit noise."""
+    """(n,) variance of the force, per third of an octave, that explains the power in excess of unit noise."""
     band = np.floor(3 * np.log2(frequency / frequency[0])).astype(int)
     lines = np.bincount(band) * white.shape[1]
     excess = np.bincount(band, np.sum(np.abs(white) ** 2, axis=1)) - lines
     made = np.bincount(band, np.sum(np.abs(H) ** 2, axis=(1, 2)))
-    # What noise alone would leave of the excess: two standard deviations are no force.
+    # Lower limit of the excess: 2 % of the standard deviation that noise alone would give it.
     least = 0.02 * np.sqrt(np.maximum(lines, 1))
     strength = np.maximum(excess, least) / np.maximum(made, np.finfo(float).tiny)
     return strength[band]
 
 
 def with_large_motion(motion: dict[str, RecordMotion], model: TableModel) -> dict[str, RecordMotion]:
-    """The records with the second-order terms of large rotations, from their motion."""
+    """The records with the second-order terms of large rotations, computed from their motion."""
     found = {}
     for name, one in motion.items():
         back = np.linalg.pinv(one.rows)

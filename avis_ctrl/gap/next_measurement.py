@@ -1,4 +1,4 @@
-"""What to measure next: what separates two explanations, or, without any, what shows most of what is missing."""
+"""The next measurement: one that separates two explanations or, failing that, shows most of what is missing."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from avis_ctrl.gap.table_model import TableModel
 
 @dataclass(frozen=True)
 class NextMeasurementSettings:
-    """Of what to measure next.
+    """Settings of the suggested next measurement.
 
-    telling : residual power over that of the noise from which a record shows how the residual grows [1].
-    another_level : ratio from which levels are two [1].
-    within : how far a power of the level may be from none, or from the linear one, to count as it [1].
-    unsure : standard deviation from which a power is not reported [1]: two of them reach from what grows with the
-        drives to what does not.
-    points : frequencies at which predictions are compared: 0.1 % apart, which misses no lightly damped peak.
-    near : fraction of the largest difference of two predictions, above which a frequency belongs to the band to look
-        at [1].
-    part : fraction of what remains at a sensor, above which a band is named [1].
+    telling : residual power over noise power above which a record shows how the residual grows [1].
+    another_level : minimum ratio of two different levels [1].
+    within : maximum distance of an exponent of the level from zero or one for it to count as such [1].
+    unsure : standard deviation from which an exponent is not reported [1]: two of them span the difference between a
+        residual proportional to the drives and one independent of them.
+    points : frequencies at which predictions are compared: 0.1 % apart, so that no lightly damped peak is missed.
+    near : fraction of the largest difference of two predictions, above which a frequency belongs to the suggested band
+        [1].
+    part : fraction of the residual at a sensor, above which a band is named [1].
     """
 
     telling: float = 2.0
@@ -39,7 +39,7 @@ SETTINGS = NextMeasurementSettings()
 
 
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
-    """What separates two explanations: where the predictions of their refitted models differ most."""
+    """How to separate two explanations: measure where the predictions of their refitted models differ most."""
     bent = {_bent_beside(a, b), _bent_beside(b, a)}
     if True in bent:
         why = ("only one of them depends on amplitude" if bent == {True, False} else
@@ -56,19 +56,19 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
 
 
 def _bent_beside(model: TableModel, other: TableModel) -> bool:
-    """Whether what a model has beside another one depends on amplitude."""
+    """Whether a model has amplitude-dependent (or time-dependent) effects that the other model lacks."""
     common = {one.label for one in other.effects}
     return any(one.effect.nonlinear for one in model.effects if one.label not in common)
 
 
 def _about(size: np.ndarray, k: int) -> tuple[int, int]:
-    """First points on either side of k, or the last there are, that are no larger than `near` of what is at k."""
+    """Nearest points on either side of k with at most `near` times the size at k; the end points if there are none."""
     far = np.flatnonzero(size <= SETTINGS.near * size[k])
     return int(far[far < k].max(initial=0)), int(far[far > k].min(initial=len(size) - 1))
 
 
 def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str:
-    """Where to measure what no effect explains, and how it depends on the level in these records."""
+    """Where to measure the unexplained residual, and how it depends on the level in these records."""
     where = _where(places)
     growth = grows(records)
     if growth is None:
@@ -90,12 +90,12 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
 
 
 def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
-    """(power, std) of the level with which the residual beyond noise grows; None without a clear power.
+    """(exponent, standard deviation) of the residual beyond noise as a power of the level; None if it is not clear.
 
-    Least squares of log residual on log level over the records, noise subtracted in power. The residual is relative to
-    the noise, which depends on whether the floor is measured, and different signals excite different parts of the gap:
-    each kind of record has its own size, all have the same power. None where the levels are too close, too few records
-    are above the noise, or the standard deviation is `unsure` or more.
+    Least squares of log residual on log level over the records, after subtraction of the noise power. The residual is
+    relative to the noise, which depends on whether the floor is measured, and different signals excite different parts
+    of the gap. Each kind of record therefore has its own factor; all have the same exponent. None if the levels are too
+    close, too few records exceed the noise, or the standard deviation is `unsure` or more.
     """
     telling = [r for r in records if r.level_V > 0 and r.after ** 2 > SETTINGS.telling]
     kinds = sorted({r.kind for r in telling})
@@ -113,7 +113,7 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
 
 
 def grows_faster(records: Sequence[RecordGap]) -> bool | None:
-    """Whether the residual beyond noise grows faster than the drives; None where the records do not say."""
+    """Whether the residual beyond noise grows faster than the drives; None if the records do not show it."""
     growth = grows(records)
     if growth is None:
         return None

@@ -1,13 +1,14 @@
-"""The table line by line: what effects change before its response is formed.
+"""The table line by line: the operators that effects change before the response is computed.
 
-    D x = T v + F_w w + transient - internal forces,     D = s^2 M + G^T z_pp G + Z_0 + G^T z_pf G_c B s^2 M
+    D x = T v + F_w w + transient - internal forces,     D = s^2 M + G^T z_pp G + Z_0 + G^T z_pf G_c B (s^2 M + Z_e)
     F_w = G^T z_pf G_c H_w + Z_f,        y = S sense (rows x) + aliases
 
-x holds the six coordinates q of the payload and those that effects add (its modes); G (n_g, n_q) takes x to the
-displacement of every mount along x, y, z at the payload, G_c that of the chassis. z_pp and z_pf (n, n_g) are the
-mounts' complex stiffnesses: force on the payload by its own displacement, and by that of the chassis; without mass
-inside the mount they are equal. Z_0 is whatever else holds the payload, Z_f the part of it that moves with the floor.
-The chassis follows the floor displacement w through H_w and recoils with B: zero and one on a stiff floor.
+x contains the six coordinates q of the payload and the coordinates that effects add (its modes). G (n_g, n_q) maps x to
+the displacement of every mount along x, y, z at the payload, G_c that of the chassis. z_pp and z_pf (n, n_g) are the
+complex stiffnesses of the mounts: force on the payload due to its own displacement, and due to that of the chassis;
+they are equal without mass inside the mount. Z_0 is the dynamic stiffness of everything else that supports the payload,
+Z_e its part that effects add, Z_f its part that moves with the floor. The chassis follows the floor displacement w
+through H_w and recoils with B; on a stiff floor H_w is one and B is zero.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from avis_ctrl.rigs.rigid_body import point_map
 class MountGeometry:
     """Mounts along the earth axes: names "isolator1.x", rows from q (n_g, 6) at payload and chassis, and values.
 
-    stiffness [N/m] and damping [N s/m], (n_g,). rest_K, rest_C (6, 6): what the rig has beside its mounts.
+    stiffness [N/m] and damping [N s/m], (n_g,). rest_K, rest_C (6, 6): stiffness and damping of the rig without its
+    mounts.
     """
 
     names: tuple[str, ...]
@@ -39,7 +41,8 @@ class MountGeometry:
 
     @staticmethod
     def of(rig: Rig) -> MountGeometry:
-        """Of a rig whose mounts have parameters of their own along the earth axes; any other keeps all as the rest."""
+        """The mounts of a rig that has mount parameters along the earth axes; for any other rig, everything is in
+        rest_K and rest_C."""
         if "isolator1.k_z" not in rig.parameters():
             eom = rig.equations_of_motion()
             none = np.zeros((0, 6))
@@ -54,14 +57,14 @@ class MountGeometry:
                              np.array(body.stiffness), np.array(body.damping))
 
     def along(self, axis: str) -> np.ndarray:
-        """Which of the rows are along an axis."""
+        """Mask of the rows along an axis."""
         return np.array([name.endswith("." + axis) for name in self.names])
 
 
 @dataclass(frozen=True, eq=False)
 class AddedCoordinate:
-    """A coordinate beside the six: shape over mounts (n_g,), actuators (n_u,) and sensors (n_y,), and its own dynamic
-    stiffness (n,) without mounts [N/m], for a displacement of 1 m where the shape is 1."""
+    """A coordinate in addition to the six: shape at mounts (n_g,), actuators (n_u,) and sensors (n_y,), and dynamic
+    stiffness (n,) without the mounts [N/m], for a displacement of 1 m where the shape is 1."""
 
     stiffness: np.ndarray
     at_mounts: np.ndarray
@@ -70,21 +73,22 @@ class AddedCoordinate:
 
 
 class Operators:
-    """Of a rig on lines omega (n,) rad/s, open to be changed by effects.
+    """Operators of a rig on lines omega (n,) rad/s; effects modify them.
 
     Attributes
     ----------
     s : (n,) j omega. base : rig, sensors, actuators. mounts : their geometry.
-    stiffness_factor, damping_factor : (n, n_g) complex, multiply the mounts' k and c.
-    internal_omega, internal_damping : (n_g,) rad/s and ratio of the resonance of a mass inside each mount, infinite
-        for none; the mount's own c bypasses the mass. payload_share : (n_g,) of the mount's compliance between that
-        mass and the payload.
-    extra, extra_floor : (n, 6, 6) and (n, 6, 3) N/m, dynamic stiffness on q, and force by floor displacement.
-    rows : (1 or n, n_y, 6) displacement seen by each sensor. sense : (n, n_y) chain and s^p, without sensitivity.
-    sensor_gain : (n_y,) factors. drive : (n, n_u) factors on the volts. delay_s, amplifier_corner_Hz : of the drives.
-    inner : (n, 6, m) forces on q by unit impulses on what an effect holds inside. decays : the same of states of first
-        order, of which an impulse is all there is.
-    added : coordinates beside the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
+    stiffness_factor, damping_factor : (n, n_g) complex factors of the mounts' k and c.
+    internal_omega, internal_damping : (n_g,) rad/s and damping ratio of the resonance of a mass inside each mount,
+        infinite without a mass; the mount's own c bypasses the mass. payload_share : (n_g,) fraction of the mount's
+        compliance between that mass and the payload.
+    extra, extra_floor : (n, 6, 6) and (n, 6, 3) N/m, dynamic stiffness on q, and force per floor displacement.
+    rows : (1 or n, n_y, 6) displacement measured by each sensor. sense : (n, n_y) sensor chain and s^p, without
+        sensitivity.
+    sensor_gain : (n_y,) factors. drive : (n, n_u) factors of the volts. delay_s, amplifier_corner_Hz : of the drives.
+    inner : (n, 6, m) forces on q due to unit impulses on internal states of effects. decays : the same for first-order
+        states, which need impulses only.
+    added : coordinates in addition to the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 
     extra: np.ndarray | None = None
@@ -115,14 +119,15 @@ class Operators:
         return self.base.actuators.index(name)
 
     def borne(self, M: np.ndarray) -> np.ndarray:
-        """(n, 6, 6) force per displacement of the payload that mounts and motors bear, and their reaction a chassis:
-        its inertia, and what hangs on it or holds it beside them."""
+        """(n, 6, 6) force per displacement of the payload that mounts and motors supply and that reacts on a chassis:
+        due to the payload's inertia and the elements that effects attach to it."""
         inertia = self.s[:, None, None] ** 2 * M
         return inertia if self.extra is None else inertia + self.extra
 
     def add_impedance(self, dynamic_stiffness: np.ndarray, rows: np.ndarray,
                       grounded: np.ndarray | None = None) -> None:
-        """Elements along rows (m, 6) of dynamic stiffness (n, m) [N/m]; grounded (n, m): the part tied to the floor."""
+        """Add elements along rows (m, 6) of dynamic stiffness (n, m) [N/m]; grounded (n, m): the part connected to the
+        floor."""
         Z = np.einsum("nm,mi,mj->nij", dynamic_stiffness, rows, rows)
         self.extra = Z if self.extra is None else self.extra + Z
         if grounded is not None:
@@ -134,7 +139,7 @@ _geometry: list[tuple[Rig, MountGeometry]] = []
 
 
 def mount_geometry(rig: Rig) -> MountGeometry:
-    """`MountGeometry.of`, kept for the rigs asked for last: a fit asks for the same one again and again."""
+    """`MountGeometry.of`, cached for the most recent rigs: a fit requests the same geometry many times."""
     for known, found in _geometry:
         if known is rig:
             return found
@@ -145,11 +150,11 @@ def mount_geometry(rig: Rig) -> MountGeometry:
 
 
 class Assembled:
-    """The table as `Operators` left it, ready for its response.
+    """The table assembled from `Operators`, ready for its response.
 
     D (n, n_q, n_q) and its inverse; M (6, 6); G (n_g, n_q); z_pp, z_pf, slope_pp, slope_pf (n, n_g): the slopes are
-    derivatives by the mount's stiffness k; by its c both are s damping_factor. T (n_q, n_u) N/V, without the factors of
-    the drives.
+    derivatives with respect to the mount's stiffness k; with respect to its c both are s damping_factor. T (n_q, n_u)
+    N/V, without the factors of the drives.
     """
 
     def __init__(self, ops: Operators):
@@ -184,12 +189,12 @@ class Assembled:
 
     @cached_property
     def left(self) -> np.ndarray:
-        """(n, n_y, n_q) y by a force on the coordinates."""
+        """(n, n_y, n_q) y per force on the coordinates."""
         return self.gain * self.ops.sense[:, :, None] * (self.rows @ self.inverse)
 
     @property
     def gain(self) -> np.ndarray:
-        """(n_y, 1) sensitivities as effects leave them."""
+        """(n_y, 1) sensitivities including the gains set by effects."""
         return (self.ops.base.sensors.sensitivity * self.ops.sensor_gain)[:, None]
 
     @property
@@ -198,14 +203,14 @@ class Assembled:
 
     @property
     def volts(self) -> np.ndarray:
-        """(n, n_u) commanded volts to acting ones."""
+        """(n, n_u) factors from commanded to acting volts."""
         return self.hold[:, None] * self.ops.drive
 
     @cached_property
     def forces_of_states(self) -> np.ndarray:
-        """(n, n_q, m) forces on the coordinates by unit initial states of what moves inside beside the payload:
-        impulses on the modes, masses inside mounts, and the chassis, and on what effects say of their own
-        (`Operators.inner`); steps on the same; and states of first order (`Operators.decays`)."""
+        """(n, n_q, m) forces on the coordinates due to unit initial states of internal dynamics. In this order:
+        impulses on the modes, on masses inside mounts, on the chassis and on the states defined by effects
+        (`Operators.inner`); steps on the same; first-order states (`Operators.decays`)."""
         ops, n = self.ops, len(self.ops.s)
 
         def of_body(force: np.ndarray) -> np.ndarray:
@@ -226,12 +231,12 @@ class Assembled:
 
     @property
     def _moves(self) -> np.ndarray:
-        """(n, 6, m) chassis displacement by unit forces in the directions in which it can move."""
+        """(n, 6, m) chassis displacement per unit force in the directions in which it can move."""
         assert self.ops.recoil is not None
         return self.ops.recoil[:, :, np.any(self.ops.recoil, axis=(0, 1))]
 
     def _chassis_states(self, inner: np.ndarray) -> np.ndarray:
-        """(n, 6, 1) chassis displacement by its part of the initial states of `forces_of_states`."""
+        """(n, 6, 1) chassis displacement due to the chassis' own part of the initial states of `forces_of_states`."""
         ops, moves = self.ops, self._moves
         n_decays = sum(one.shape[2] for one in ops.decays)
         n_impulses = (len(inner) - n_decays) // 2
@@ -241,7 +246,7 @@ class Assembled:
             moves @ inner[n_impulses:][own])[:, :, None]
 
     def floor_force(self, w: np.ndarray) -> np.ndarray:
-        """(n, n_q, m) force of floor displacement w (n, 3, m)."""
+        """(n, n_q, m) force due to floor displacement w (n, 3, m)."""
         ops = self.ops
         chassis = self.follow(w)
         force = np.swapaxes(self.G, 0, 1) @ (self.z_pf[:, :, None] * (ops.mounts.chassis @ chassis))
@@ -255,7 +260,7 @@ class Assembled:
         return force
 
     def follow(self, w: np.ndarray) -> np.ndarray:
-        """(n, 6, m) chassis displacement by the floor alone."""
+        """(n, 6, m) chassis displacement due to the floor alone."""
         if self.ops.follow is not None:
             moved = self.ops.follow @ w
             if self.ops.recoil is not None and self.ops.extra_floor is not None:
@@ -264,11 +269,11 @@ class Assembled:
         return np.concatenate([w, np.zeros_like(w)], axis=1)
 
     def deflection(self, x: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """(n, n_g, m) of the mounts, payload less chassis."""
+        """(n, n_g, m) deflection of the mounts, payload minus chassis."""
         return self.G @ x - self.ops.mounts.chassis @ self.chassis(x, w)
 
     def chassis(self, x: np.ndarray, w: np.ndarray, inner: np.ndarray | None = None) -> np.ndarray:
-        """(n, 6, m) chassis displacement, its recoil included, and what it starts with (`forces_of_states`)."""
+        """(n, 6, m) chassis displacement, including its recoil and its initial states (`forces_of_states`)."""
         moved = self.follow(w)
         if self.ops.recoil is not None:
             moved = moved - self.ops.recoil @ (self.ops.borne(self.M) @ x[:, :N_Q])
@@ -278,9 +283,9 @@ class Assembled:
 
 
 def _with_internal_mass(s: np.ndarray, ops: Operators) -> tuple[np.ndarray, np.ndarray]:
-    """(n, n_g) what multiplies the mounts' k in z_pp and z_pf, with a mass m between springs a k and b k in series.
+    """(n, n_g) factors of the mounts' k in z_pp and z_pf, for a mass m between springs a k and b k in series.
 
-    With 1/a + 1/b = 1, w^2 = (a + b) k/m, and g the factor of k, loss 2 zeta s/w of both springs included,
+    With 1/a + 1/b = 1, w^2 = (a + b) k/m, and g the factor of k including the loss 2 zeta s/w of both springs,
 
         z_pf/k = g^2/(g + s^2/w^2),     z_pp/k = a g - (a/b) g^2/(g + s^2/w^2).
     """

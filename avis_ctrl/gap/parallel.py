@@ -1,4 +1,4 @@
-"""Independent calculations: one after the other, or several at a time where a caller knows how."""
+"""Run independent calculations: one after the other, or in parallel with a function that the caller provides."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ Result = TypeVar("Result")
 
 
 class Each(Protocol):
-    """Results of independent calculations, in their order; where there are processors, several at a time."""
+    """Results of independent calculations, in order; computed in parallel where processors are available."""
 
     def __call__(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]: ...
 
 
 def one_by_one(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """The same, one after the other."""
+    """Run the calculations one after the other."""
     return [function(item) for item in items]

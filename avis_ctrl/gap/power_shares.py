@@ -1,19 +1,20 @@
-"""Which share of each output's power the model, noise, nonlinearity and unmeasured inputs account for.
+"""Decomposition of each output's power into model, model error, noise, nonlinearity and unmeasured inputs.
 
-In a window of lines the outputs of all records of one level are split, with G the linear part of the model,
+In a window of lines, the outputs of all records of one level are decomposed. With G the linear part of the model,
 
     y = G u + (model's nonlinear terms) + e,    e_lin = y - G u = A c + r,    e = A c' + r'
 
-where A has the columns G_kj u_j, constant and, where lines allow it, linear over the window: c is a relative error of
-each path. Where that leaves more than noise, a common denominator is tried, for poles that lie elsewhere than the
-model's (local rational method; McKelvey and Guerin, IFAC Proc. 45-16 (2012) 424-429). r is what no response near the
-model's, linear in the measured inputs, accounts for: the incoherent part, whose share is one less the multiple
-coherence (Bendat and Piersol, Random Data, 4th ed., 2010, section 7.3). Its power is that of noise, unmeasured inputs
-and nonlinearity. Each squared residual is divided by one less its leverage, so that unknowns cost no power (MacKinnon
-and White, J. Econometrics 29 (1985) 305-325).
+where A has the columns G_kj u_j, constant and, with enough lines, linear over the window: c is a relative error of each
+path. If the residual exceeds the noise, a common denominator is tried, for poles that differ from the model's (local
+rational method; McKelvey and Guerin, IFAC Proc. 45-16 (2012) 424-429). r is the incoherent part: no response near the
+model's, linear in the measured inputs, explains it. Its fraction of the power is one minus the multiple coherence
+(Bendat and Piersol, Random Data, 4th ed., 2010, section 7.3). It is due to noise, unmeasured inputs and nonlinearity.
+Each squared residual is divided by one minus its leverage, so that fitted unknowns do not bias the power (MacKinnon and
+White, J. Econometrics 29 (1985) 305-325).
 
-Noise does not know of the drives. It is measured where these are silent; without such lines it is taken for what is
-left, nonlinear terms of the model taken off, at the lowest level: whatever is more at a higher level is not linear.
+Noise does not depend on the drives. It is measured where these are silent. Without such lines, the residual at the
+lowest level, after subtraction of the model's nonlinear terms, counts as noise: any increase at a higher level is
+nonlinear.
 """
 
 from __future__ import annotations
@@ -37,19 +38,20 @@ from avis_ctrl.measurement.campaign import RecordHeader
 
 @dataclass(frozen=True)
 class PowerSettings:
-    """Of the split of each output's power.
+    """Settings of the decomposition of each output's power.
 
-    bands_per_octave : windows to the octave.
-    least_lines : lines of a window for each unknown of its regression: with fewer, leverage leaves no residual.
-    linear_lines : the same from which the error may be linear over the window.
-    most_leverage : leverage from which on a line says nothing of the noise [1].
-    alarm : chance that an error of the model is seen in a window of noise [1].
-    scatter : chance that nonlinearity is seen in a band of noise [1].
-    excess : times the noise from which on an error may be one of a pole [1].
-    gained : fraction to which that error must fall for a pole to be taken [1].
-    pole_rounds : rounds of the fit of a pole, linearised in each.
-    nearest_pole : least value of its denominator, which is one in the middle of the window [1]: nearer, it fits a
-        single line.
+    bands_per_octave : bands per octave.
+    least_lines : minimum number of lines of a band per unknown of its regression: with fewer, the leverage leaves no
+        residual.
+    linear_lines : the same for an error that is linear over the window.
+    most_leverage : maximum leverage [1]: a line above it carries no information on the noise.
+    alarm : probability that an error of the model is detected in a window of noise alone [1].
+    scatter : probability that nonlinearity is detected in a band of noise alone [1].
+    excess : residual power over noise power above which an error of a pole is considered [1].
+    gained : fraction to which the residual power must fall for the new poles to be accepted [1].
+    pole_rounds : iterations of the fit of the poles, each of them linear.
+    nearest_pole : minimum magnitude of its denominator, which is one in the middle of the window [1]: a closer pole
+        fits a single line.
     """
 
     bands_per_octave: int = 3
@@ -69,10 +71,10 @@ SETTINGS = PowerSettings()
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Driven lines of the records of one level, by frequency.
+    """Driven lines of the records of one level, sorted by frequency.
 
-    frequency_Hz (n,); Y, left, beyond (n, n_y): outputs, what the whole model leaves of them, what its linear part
-    leaves; columns (n, n_y, n_u): G_kj u_j; noise (n, n_y): measured power.
+    frequency_Hz (n,); Y, left, beyond (n, n_y): outputs, residual of the whole model, residual of its linear part;
+    columns (n, n_y, n_u): G_kj u_j; noise (n, n_y): measured power.
     """
 
     frequency_Hz: np.ndarray
@@ -89,9 +91,9 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Power a line, (n_bands, n_y) each: of the output; incoherent in the linear part's error and in the model's;
-    coherent in the model's error; measured noise. lines (n_bands,): how many; effective
-    (n_bands, n_y): as many alike lines scatter as these do."""
+    """Power per line, (n_bands, n_y) each: of the output; incoherent in the error of the linear part and in that of the
+    model; coherent in the model's error; measured noise. lines (n_bands,): number of lines; effective (n_bands, n_y):
+    number of lines of equal power with the same scatter."""
 
     whole: np.ndarray
     incoherent: np.ndarray
@@ -104,13 +106,13 @@ class Split:
 
 def power_shares(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader], model: TableModel,
                  silent_noise: bool, sensors_rms: Mapping[str, float] | None) -> tuple[PowerShares, ...]:
-    """For each level, the lowest first; empty where no record drives the actuators with lines enough.
+    """Decomposition for each level, the lowest first; empty if no record drives the actuators on enough lines.
 
     Parameters
     ----------
-    errors : what `model` leaves of each block. headers : of the blocks' records by name.
+    errors : residuals of `model` on each block. headers : of the blocks' records by name.
     silent_noise : the blocks' noise was measured where the drives are silent.
-    sensors_rms : own noise of each output's channel (white at the sample rate), unit of y; None where not known.
+    sensors_rms : sensor noise of each output's channel (white at the sample rate), unit of y; None if not known.
     """
     found = []
     for group in _levels(errors, headers):
@@ -139,11 +141,11 @@ def power_shares(errors: Sequence[PredictionError], headers: Mapping[str, Record
 
 
 def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dict[str, np.ndarray]:
-    """Shares (n_bands, n_y) that add up to one; noise : power a line of it, sensors : (n_y,) the part of the sensors'
-    own, None where that is not known."""
+    """Fractions (n_bands, n_y) that add up to one; noise : power per line, sensors : (n_y,) the part due to sensor
+    noise, None if not known."""
     incoherent = np.minimum(one.incoherent, one.whole)
     missing = np.minimum(one.missing, one.whole - incoherent)
-    # Within its own scatter the incoherent part is noise; as many lines count as share its power.
+    # Within its scatter the incoherent part counts as noise, with the effective number of lines as degrees of freedom.
     scatter = incoherent < stats.f.isf(SETTINGS.scatter, 2 * one.effective, 2 * one.effective) * noise
     noise = np.where(scatter, incoherent, np.minimum(noise, incoherent))
     own = np.zeros_like(noise) if sensors is None else np.minimum(noise, sensors)
@@ -153,7 +155,7 @@ def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dic
 
 
 def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader]) -> list[list[PredictionError]]:
-    """Driven records of one level and excitation; the lowest level first."""
+    """Driven records grouped by level and excitation; the lowest level first."""
     def told(e: PredictionError) -> tuple[str, float]:
         return headers[e.block.name].excitation, headers[e.block.name].level_V
     groups = of_one_level([e for e in errors if told(e)[0] not in ("rest", "floor")], told)
@@ -161,7 +163,7 @@ def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeade
 
 
 def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
-    """Lines that the drives excite, of several records."""
+    """Lines of several records that the drives excite."""
     n_a = len(model.actuators)
     known: dict[bytes, np.ndarray] = {}
     made = []
@@ -184,7 +186,7 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
 
 
 def bands(groups: Sequence[Lines]) -> np.ndarray:
-    """Edges in Hz: `bands_per_octave`, but none with fewer lines of any level than its unknowns ask for."""
+    """Band edges [Hz]: `bands_per_octave`, merged where a level has too few lines for its number of unknowns."""
     low = min(float(one.frequency_Hz[0]) for one in groups if len(one.frequency_Hz))
     high = max(float(one.frequency_Hz[-1]) for one in groups if len(one.frequency_Hz)) * (1 + 1e-9)
     grid = np.geomspace(low, high, max(int(np.ceil(SETTINGS.bands_per_octave * np.log2(high / low))), 1) + 1)
@@ -207,7 +209,7 @@ def _unknowns(columns: np.ndarray) -> int:
 
 
 def split(lines: Lines, edges: np.ndarray) -> Split:
-    """Powers a line by band; a band with many lines is cut into windows, each with its own regression."""
+    """Power per line by band; a band with many lines is divided into windows, each with its own regression."""
     n_y = lines.Y.shape[1]
     found = np.zeros((5, len(edges) - 1, n_y))
     count, alike = np.zeros(len(edges) - 1), np.ones((len(edges) - 1, n_y))
@@ -245,8 +247,8 @@ def _window(lines: Lines, at: np.ndarray) -> np.ndarray:
 
 
 def _smooth(A: np.ndarray, e: np.ndarray, x: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residual (n,) of e after a smooth relative error of each column of A, and leverage (n,) of each line; e itself
-    where that error is not significant."""
+    """Residual (n,) of e after subtraction of a smooth relative error of each column of A, and leverage (n,) of each
+    line; e itself if that error is not significant."""
     if len(e) >= SETTINGS.linear_lines * A.shape[1]:
         A = np.hstack([A, A * x[:, None]])
     Q = _basis(A / sigma[:, None])
@@ -261,10 +263,10 @@ def _smooth(A: np.ndarray, e: np.ndarray, x: np.ndarray, sigma: np.ndarray) -> t
 
 def _with_poles(A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, plain: tuple[np.ndarray, np.ndarray]
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `_smooth`, of a response whose poles lie elsewhere than the model's: y = A b(x) / a(x), a of second degree.
+    """As `_smooth`, for a response whose poles differ from the model's: y = A b(x) / a(x), a of second degree.
 
-    By iterated linear least squares (Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963) 56-58); `plain` where
-    that is no better by more than its own unknowns can make it, or lines are too few.
+    Iterated linear least squares (Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963) 56-58). Returns `plain`
+    if the improvement is no larger than the additional unknowns explain, or if there are too few lines.
     """
     unknowns = 2 * A.shape[1] + 2
     if len(y) < 2 * unknowns:
@@ -294,5 +296,5 @@ def _leverage(Q: np.ndarray) -> np.ndarray:
 
 
 def _basis(A: np.ndarray) -> np.ndarray:
-    """Orthonormal basis of the columns' span, each column alike, without directions that are round-off."""
+    """Orthonormal basis of the span of the columns, each normalised first, without directions at round-off level."""
     return orth(A / np.linalg.norm(A, axis=0), rcond=1e-10) if A.size else np.zeros((len(A), 0), complex)

@@ -1,8 +1,8 @@
-"""A campaign made ready for the search: signals mended, spectra with measured noise, motion in time, what is held out.
+"""Preparation of a campaign for the search: repaired signals, spectra with noise, motion in time, held-out data.
 
-What the signals themselves show (a converter that clips or is coarse, hum) is found and taken out before any fit, since
-no fit of a table can absorb it. A first fit, every line weighted relative to its response, is close enough to tell
-noise and hum from the response.
+Faults visible in the signals themselves (a converter that clips or is coarse, hum) are detected and removed before any
+fit, since no fit of a table can absorb them. A first fit, with every line weighted relative to its response, is
+accurate enough to distinguish noise and hum from the response.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.rigs.rig import Rig
 
 Progress = Callable[[str], None]
-# Second-order terms as Newton and Euler have them, with sensors fixed to the payload and forces along earth axes.
+# Second-order terms by Newton-Euler, with sensors fixed to the payload and forces along the earth axes.
 BY_PHYSICS = (1.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A campaign made ready.
+    """A prepared campaign.
 
     campaign : without hum and clipping. fitted, held_out : spectra of all lines, with noise. unmasked : the held-out
-    ones with the lines that hum spoils. noise : in words, where the noise comes from. nominal : the rig as its file has
-    it. rough : the first fit. faults : of the signals. clipped : the campaign before clipped samples were mended, None
-    where there are few. left : what the rough model leaves of each record in time.
+        spectra including the lines polluted by hum. noise : a sentence on the source of the noise. nominal : the rig as
+        in its file. rough : the first fit. faults : of the signals. clipped : the campaign before the repair of clipped
+        samples, None if there are few. left : residual of the rough model in each record, in time.
     """
 
     campaign: Campaign
@@ -65,22 +65,23 @@ class Prepared:
 
     @property
     def local_noise(self) -> bool:
-        """Whether the noise is that of a local polynomial model of driven records, which holds their distortion."""
+        """Whether the noise is that of a local polynomial model of driven records, which includes their distortion."""
         return not all_silent(self.halves.fitted, self.fitted)
 
     def data(self, blocks: Sequence[SpectralBlock], lines: int) -> Data:
-        """Some lines of blocks, each with the level of its group of like records."""
+        """Some lines of blocks, with the level of the group of records to which each block belongs."""
         return Data.of(blocks, levels_of((*self.halves.fitted.records, *self.halves.held_out.records)), lines)
 
 
 def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
             amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None,
             each: Each = one_by_one, settings: GapSettings = SETTINGS) -> Prepared:
-    """From records to spectra with noise.
+    """Compute spectra with noise from the records.
 
     Raises
     ------
-    InputError : a band in which nothing is excited, too few lines, records that drive nothing or tell no noise.
+    InputError : a band without excitation, too few lines, no record that drives an actuator, or noise that cannot be
+        estimated.
     """
     progress("converters; choice of the held-out records")
     converter = converter_faults(campaign, rig)
@@ -109,7 +110,7 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
 
 def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each: Each, settings: GapSettings
                 ) -> Prepared:
-    """The same with clipped samples as a better model expects them."""
+    """Repair the clipped samples again, with the prediction of a better model."""
     assert prepared.clipped is not None
     expected = predicted(prepared.clipped, model, each)
     campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
@@ -119,7 +120,7 @@ def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each:
 
 
 def with_noise_from(prepared: Prepared, model: TableModel, each: Each) -> Prepared:
-    """The same with noise from what a better model leaves of the records."""
+    """Estimate the noise again, from the residual of a better model."""
     groups = [list(prepared.fitted), list(prepared.held_out), list(prepared.unmasked)]
     left = left_by(prepared.campaign, model, each)
     (fitted, held_out, unmasked), how = _noise(groups, prepared.halves, left, prepared.rough, prepared.band_Hz)
@@ -127,7 +128,7 @@ def with_noise_from(prepared: Prepared, model: TableModel, each: Each) -> Prepar
 
 
 def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSettings) -> None:
-    """Raises InputError for a band in which the records are not excited, or have too few lines."""
+    """Raise InputError for a band in which the records are not excited, or have too few lines."""
     low, high = excited_band(campaign)
     if band[1] <= low or band[0] >= high:
         raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
@@ -142,7 +143,7 @@ def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSetti
 def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: TableModel, band: tuple[float, float],
            converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress, each: Each,
            settings: GapSettings) -> Prepared:
-    """Hum taken out, spectra with noise, and the motion of every record with its second-order terms."""
+    """Remove hum; compute spectra with noise, and the motion of every record with its second-order terms."""
     left = left_by(campaign, rough, each)
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(left)
@@ -170,7 +171,7 @@ def with_second_order(model: TableModel) -> TableModel:
 
 def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[RecordResidual, ...], model: TableModel,
            band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
-    """Groups of blocks with the noise of the fitted records, from what a model leaves of them in time; in words."""
+    """Groups of blocks with the noise of the fitted records, from the residual of a model in time; and a sentence."""
     of, records = {one.header.name: one for one in left}, []
     for source in halves.fitted.records:
         whole, start, stop = origin(source)
@@ -183,13 +184,13 @@ def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[Re
 
 
 def _rough(model: TableModel, halves: Halves, band: tuple[float, float], settings: GapSettings) -> TableModel:
-    """A first fit, each line weighted by its response."""
+    """A first fit, each line weighted relative to its response."""
     blocks = [thinned(block, settings.lines) for block in relative_noise(blocks_of(halves.fitted, model, band))]
     return replace(model, base=fit(model.base, blocks).model)
 
 
 def _masked(blocks: Sequence[SpectralBlock], campaign: Campaign, hum: HumFinding | None) -> list[SpectralBlock]:
-    """Blocks without the lines that hum has spoiled."""
+    """Blocks without the lines polluted by hum."""
     if hum is None:
         return list(blocks)
     found = []

@@ -1,4 +1,4 @@
-"""How probable an effect is among those that were fitted in its place."""
+"""Probability of an effect among the alternatives fitted in its place."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from avis_ctrl.identification.likelihood import Fitted
 
 
 def name_of(label: str) -> tuple[str, str]:
-    """Name and location of an effect by its label, without the variant of its law."""
+    """Name and location of an effect from its label, without the variant of its law."""
     name, _, place = label.partition("@")
     return name, place.partition("/")[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One more effect: the fit with it, and all fits that were tried in its place, by label.
+    """A step of the search: the fit with one more effect, and all fits that were tried in its place, by label.
 
-    before : the fit without it. candidates : how many effects and places were scored. label : of the effect, the last
-    one by default.
+    before : the fit without the effect. candidates : number of effects and places scored. label : of the effect; by
+        default the last effect of the fit.
     """
 
     before: Fitted
@@ -40,11 +40,11 @@ class Step:
 
 
 def odds_against(one: Mapping[Any, float], other: Mapping[Any, float], beside: float = 0.0) -> float:
-    """Odds of another model against one, by how evenly the difference of their log-likelihoods is spread over bands and
-    levels (Q. H. Vuong, Econometrica 57 (1989) 307-333).
+    """Odds of `other` against `one`, from the spread of their log-likelihood difference over bands and levels.
 
-    Textbook laws are not quite those of real elements. A model that is ahead here and behind there is not certain to be
-    the better one, however much it is ahead in sum. beside : difference of what does not belong to any band (priors).
+    Q. H. Vuong, Econometrica 57 (1989) 307-333. Real elements follow textbook laws only approximately. A model that is
+    better in some bands and worse in others is not certain to be the better model, however large the total difference.
+    beside : part of the difference that belongs to no band (priors).
     """
     d = np.array([value - other[group] for group, value in one.items() if group in other])
     spread = float(np.sqrt(np.sum((d - d.mean()) ** 2)))
@@ -53,22 +53,22 @@ def odds_against(one: Mapping[Any, float], other: Mapping[Any, float], beside: f
 
 
 def larger_odds(one: Mapping[Any, float], other: Mapping[Any, float], beside: float) -> float:
-    """Odds of another model against one: by the sum of all, or by how evenly that is spread (`odds_against`), whichever
-    is larger."""
+    """Odds of `other` against `one`: from the total difference, or from its spread (`odds_against`), whichever is
+    larger."""
     ahead = sum(one.values()) - sum(other.values()) + beside
     return max(math.exp(-min(max(ahead, -50.0), 50.0)), odds_against(one, other, beside))
 
 
 def odds_against_fit(one: Fitted, other: Fitted) -> float:
-    """Of another fit against one (`larger_odds`)."""
+    """Odds of fit `other` against fit `one` (`larger_odds`)."""
     mine, theirs = one.log_likelihoods, other.log_likelihoods
     beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
     return larger_odds(mine, theirs, beside)
 
 
 def probability_of(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
-    """Probability of the effect that was taken among all that were fitted in its place, and the names that cannot be
-    ruled out. What has no name in the library is less probable beforehand."""
+    """Probability of the accepted effect among all effects fitted in its place, and the names that cannot be ruled out.
+    Effects without a name in the library have a lower prior probability."""
     own, mine = name_of(step.label), step.tried[step.label]
     odds = {("", ""): odds_against_fit(mine, step.before)}
     for label, one in step.tried.items():

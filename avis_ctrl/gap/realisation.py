@@ -1,9 +1,9 @@
-"""The linear content of a model with effects as one state-space system, and how well it follows the model's response.
+"""Realisation of the linear part of a model with effects as one state-space system, and its error.
 
-What is exact in state space: rig parameters, sensors' gains, directions and corners, gravity, amplifiers, added masses,
-springs, dampers and modes. What is not: delay and hold (Pade), loss independent of frequency (a ladder), aliases of
-sampling (left out), effects that depend on amplitude (taken at rest) or on time (at one moment). `Realised` carries
-the largest difference from `TableModel.response`, measured on a grid, so that nobody has to believe the rest.
+Exact in state space: rig parameters, gains, directions and corners of sensors, gravity, amplifiers, added masses,
+springs, dampers and modes. Not exact: delay and hold (Pade), loss independent of frequency (a ladder), aliases of
+sampling (left out), effects that depend on amplitude (at rest) or on time (at one moment). `Realised` contains the
+largest difference from `TableModel.response`, computed on a grid of frequencies.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
 from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 
-# Effects that act through rig parameters, sensors or drives, and on signals alone.
+# Effects that act through rig parameters, sensors, drives or the chassis; they need no addition.
 _ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
               "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay", "base_compliance"}
-# Effects that are nothing in a linear loop about rest.
+# Effects that vanish in a linear loop about rest.
 _AT_REST = {"cubic_stiffness": "linear at rest: left out", "actuator_saturation": "no effect below its limit: left out"}
 _NOTES = {"contact_friction": "motion far below slip: a spring at every motor",
           "structural_damping": "a ladder of passive branches, causal"}
@@ -39,17 +39,17 @@ _NOTES = {"contact_friction": "motion far below slip: a spring at every motor",
 
 @dataclass(frozen=True, eq=False)
 class Realised:
-    """A realisation and its distance from the model.
+    """A realisation and its error.
 
     Attributes
     ----------
-    system : (actuators [V], "vx" "vy" "vz" floor [m/s]) to (velocity "COORD_dot" of each coordinate [m/s], rotations
-        at the edge, and the sensors in their own unit).
-    error : largest over `omega` (n,) [rad/s] of |G_realised - G| / |G|, Frobenius norms over the sensors and over the
-        actuators or the floor's axes, whichever is worse; G with delay and hold but without aliases, and without the
+    system : (actuators [V], "vx" "vy" "vz" floor [m/s]) to (velocity "COORD_dot" of each coordinate [m/s], rotations at
+        the edge, and the sensors in their own unit).
+    error : maximum over `omega` (n,) [rad/s] of |G_realised - G| / |G|, Frobenius norms over the sensors and over the
+        actuators or the floor's axes, whichever is larger; G with delay and hold but without aliases, and without the
         effects that depend on amplitude or time, which `TableModel.response` leaves out.
-    aliases : largest share of G that they add, in the same norm; zero for a model that is not sampled.
-    notes : what was approximated or left out.
+    aliases : largest relative contribution of aliases to G, in the same norm; zero for a model that is not sampled.
+    notes : approximations and omissions.
     """
 
     system: StateSpace
@@ -60,7 +60,7 @@ class Realised:
 
 
 def not_realised(model: TableModel) -> dict[str, str]:
-    """Labels of effects that the realisation does not contain, and why; its loops say nothing about them."""
+    """Effects that the realisation does not contain, by label, and why; a loop with the realisation ignores them."""
     found = {}
     for one in model.effects:
         name = one.effect.name
@@ -72,7 +72,7 @@ def not_realised(model: TableModel) -> dict[str, str]:
 
 
 def notes_on(model: TableModel) -> tuple[str, ...]:
-    """What a realisation of these effects approximates or leaves out."""
+    """Approximations and omissions in a realisation of a model's effects."""
     left_out, found = not_realised(model), []
     for one in model.effects:
         name = one.effect.name
@@ -87,22 +87,22 @@ def notes_on(model: TableModel) -> tuple[str, ...]:
 
 
 def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: float = 0.0) -> StateSpace:
-    """A rig's state space with a model's effects around it.
+    """The state space of a rig with the effects of a model.
 
     Parameters
     ----------
-    rig : of `uncertain_rig` for the same rig (`model.effective.rig`) and coordinates; perturbations stay.
-    when : moment of the campaign at which what drifts is taken, -0.5 .. 0.5 from begin to end.
+    rig : from `uncertain_rig` for the same rig (`model.effective.rig`) and coordinates; its perturbations are kept.
+    when : time at which drifting parameters are evaluated, -0.5 .. 0.5 from the start to the end of the campaign.
 
     Returns
     -------
     StateSpace : inputs of the rig (w, actuators, floor and forces); outputs z, COORD_rel, COORD_dot, COORD_ddot, and
-        for every sensor "deviation_NAME", the velocity that it sees beyond the nominal row times COORD_dot, and
-        "tilt_NAME" [m/s^3], the rate of what gravity adds to its acceleration.
+        for every sensor "deviation_NAME", the velocity that it measures minus the nominal row times COORD_dot, and
+        "tilt_NAME" [m/s^3], the rate of the gravity component of its acceleration.
 
     Raises
     ------
-    InputError : values that no system has (a chassis without mass).
+    InputError : impossible values (a chassis without mass).
     """
     table = ReducedTable(model, tuple(keep), when)
     names = [edge_name(name) for name in keep]
@@ -126,7 +126,8 @@ def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: 
 
 
 def _rig_part(rig: StateSpace, names: list[str], actuators: list[str]) -> StateSpace:
-    """The rig reads the chassis in the place of the floor, acting volts and all forces; other drives stay."""
+    """The rig with chassis motion in place of floor motion, acting volts and total forces as inputs; other drives are
+    unchanged."""
     new = {f"floor_{a}_dot": f"chassis_{a}_dot" for a in names} | {f"force_{a}": f"total_{a}" for a in names}
     new |= {name: f"acting_{name}" for name in actuators}
     outputs = [n for n in rig.outputs if n.startswith("z:")] + [f"{a}_{k}" for k in ("rel", "dot", "ddot")
@@ -146,7 +147,7 @@ def _additions(table: ReducedTable, names: list[str]) -> StateSpace:
 
 
 def _drives(model: TableModel) -> list[StateSpace]:
-    """Volts commanded to volts that act, one system an actuator; the first lag and all delay belong to the loop."""
+    """Commanded to acting volts, one system per actuator; the first lag and all delay are part of the loop."""
     factors = dict.fromkeys(model.actuators, 1.0)
     first = model.amplifier_corner_Hz is None
     found = [gain([[1.0]])] * len(model.actuators)
@@ -164,7 +165,8 @@ def _drives(model: TableModel) -> list[StateSpace]:
 
 
 def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
-    """(velocities, what bends) -> what each sensor sees beyond its nominal row, and its share of gravity's rate."""
+    """(velocities, modal velocities) -> difference of each sensor from its nominal row, and rate of its gravity
+    component."""
     model, n, n_y = table.model, table.n, table.n_y
     ops = _changed_by(model, "sensor_gain", "sensor_misalignment")
     nominal, seen = table.rows(table.matrices.R), table.rows(ops.rows[0].real)
@@ -182,7 +184,7 @@ def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
 
 
 def _changed_by(model: TableModel, *names: str) -> Operators:
-    """The table at 1 rad/s as some of the model's effects change it; for what does not depend on frequency."""
+    """The table at 1 rad/s with some of the model's effects, for quantities that do not depend on frequency."""
     ops = Operators(model.effective, np.ones(1))
     for one in model.effects:
         if one.effect.name in names:
@@ -191,7 +193,7 @@ def _changed_by(model: TableModel, *names: str) -> Operators:
 
 
 def _tilt_rows(table: ReducedTable) -> np.ndarray:
-    """(n_y, n) what gravity adds to the rate of each sensor's acceleration, by the velocities."""
+    """(n_y, n) rate of the gravity component of each sensor's acceleration per velocity."""
     model, of_q = table.model, np.zeros((table.n_y, len(COORDINATES)))
     strength = sum(one.by_name["gravity_m_per_s2"] for one in model.effects if one.effect.name == "tilt_coupling")
     axes = model.rig.sensor_axes()
@@ -202,7 +204,7 @@ def _tilt_rows(table: ReducedTable) -> np.ndarray:
 
 
 def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
-    """Of each sensor over the nominal one: gain, and the corner that its filter does not undo."""
+    """Each sensor relative to the nominal one: gain, and the corner that its filter does not cancel."""
     found = [gain([[float(factor)]]) for factor in factors]
     sensors = model.base.sensors
     for k, (assumed, own) in enumerate(zip(sensors.assumed, sensors.suspensions, strict=False)):
@@ -218,14 +220,14 @@ def _sensor_filters(model: TableModel, factors: np.ndarray) -> list[StateSpace]:
 
 
 def realise(model: TableModel, pade_order: int | None = None, when: float = 0.0) -> Realised:
-    """One state space of a model, drives and sensors included.
+    """One state-space system of a model, including drives and sensors.
 
-    pade_order : of delay and hold (1-10); by default what keeps the delay's error below 1e-3 up to the highest of the
-    settings' `check_Hz`, or 10. when : as in `with_effects`.
+    pade_order : of delay and hold (1-10); by default the order that keeps the delay's error below 1e-3 up to the
+        highest frequency of the settings' `check_Hz`, or 10. when : as in `with_effects`.
 
     Raises
     ------
-    InputError : sensors that read a displacement or acceleration; mounts whose chassis points are not the payload's.
+    InputError : sensors of displacement or acceleration; mounts whose chassis points differ from the payload's.
     """
     if model.sensors.motion != "velocity":
         raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
@@ -256,12 +258,13 @@ def realise(model: TableModel, pade_order: int | None = None, when: float = 0.0)
 def sufficient_order(delay_s: float, omega: float, tolerance: float, largest: int, least: int = 2) -> tuple[int, float]:
     """Lowest order of a delay's Pade approximant with an error below the tolerance up to omega [rad/s], and its error.
 
-    The largest order where none is; all-pass, so that the error is of phase alone and grows with frequency.
+    The largest order if none is sufficient. The approximant is all-pass: the error is a phase error that grows with
+    frequency.
     """
     error = 0.0
     for order in range(least, largest + 1):
         made = pade_delay(delay_s, order).frequency_response(np.array([omega]))[0, 0, 0]
-        # The phase of the approximant falls short of the delay's by less than a turn where it is of any use.
+        # Where the approximant is useful, its phase differs from that of the delay by less than one turn.
         error = float(abs(made - np.exp(-1j * omega * delay_s)))
         if error < tolerance and omega * delay_s < np.pi * order:
             return order, error
@@ -269,13 +272,13 @@ def sufficient_order(delay_s: float, omega: float, tolerance: float, largest: in
 
 
 def loop_lag(model: TableModel) -> tuple[float, float | None]:
-    """Delay [s] and first amplifier corner [Hz] of a model, its effects included."""
+    """Delay [s] and first amplifier corner [Hz] of a model, including its effects."""
     ops = _changed_by(model, "actuator_lag", "loop_delay")
     return ops.delay_s, ops.amplifier_corner_Hz
 
 
 def _loop(model: TableModel, order: int) -> StateSpace:
-    """Command of the digital side to volts: hold, delay, amplifier."""
+    """Digital command to volts: hold, delay, amplifier."""
     delay, corner = loop_lag(model)
     one = pade_delay(delay, order)
     if model.period_s:
@@ -286,7 +289,7 @@ def _loop(model: TableModel, order: int) -> StateSpace:
 
 
 def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
-    """Velocities, deviations and gravity's share to the sensors' own unit; the two zeros at rest cancel s^-2."""
+    """Velocities, differences and gravity rates to the sensors' own unit; the two zeros at the origin cancel s^-2."""
     model, n_y = table.model, table.n_y
     nominal, chain = table.rows(table.matrices.R), model.sensors.chain
     if chain is None and np.any(_tilt_rows(table)):
@@ -296,7 +299,7 @@ def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
     if chain is None:
         chain = gain([[1.0]])
     else:
-        # Without the zeros at rest: from the rate of acceleration to what the chain makes of it.
+        # Without the zeros at the origin: from the rate of acceleration to the output of the chain.
         tilt = cascade([], list(np.roots(model.sensors.transient_poles[::-1])),
                        float(np.prod(np.abs(model.sensors.low_pass))))
     motion = append(*[chain] * n_y).scaled(S, np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
@@ -307,7 +310,7 @@ def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
 
 
 def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:
-    """The response with the hold but nothing folded back."""
+    """The response with the hold but without aliases."""
     if not model.period_s:
         return model.response(omega)
     G = replace(model, base=replace(model.base, period_s=0.0)).response(omega)

@@ -1,4 +1,4 @@
-"""A record in time for effects that depend on amplitude or time: its voltages, and the motion at the mounts."""
+"""A record in time for effects that depend on amplitude or time: voltages and deflections of the mounts."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import scipy.fft
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """Of spectra of a record's motion.
+    """Settings of the spectra of a record's motion.
 
-    kept_bytes : of the spectra kept for each record; those that have not been used for longest go first. Enough for a
-        step of a fit with several effects; ten records of it are a fifth of the memory that a search may take.
-    node_ratio : ratio of the values between which spectra are interpolated [1]. Of a contact's friction over its
-        slip, cubic interpolation is then exact to a part in ten thousand, and its derivative to a part in five
-        hundred.
+    kept_bytes : maximum size of the spectra cached for each record; the least recently used go first. Enough for a step
+        of a fit with several effects; ten such records take a fifth of the memory allowed for a search.
+    node_ratio : ratio of the values between which spectra are interpolated [1]. For the friction of a contact as a
+        function of its slip, cubic interpolation is then accurate to 1e-4, and its derivative to 2e-3.
     """
 
     kept_bytes: int = 32_000_000
@@ -29,14 +28,14 @@ SETTINGS = MotionSettings()
 
 
 class Kept:
-    """Arrays by key, up to so many bytes; those that have not been used for longest go first."""
+    """Cache of arrays by key with a maximum size in bytes; the least recently used go first."""
 
     def __init__(self, most_bytes: int):
         self.most_bytes, self.bytes = most_bytes, 0
         self.arrays: dict[tuple, np.ndarray] = {}
 
     def of(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The array of a key, made where it is not kept."""
+        """The array of a key, computed if it is not cached."""
         found = self.arrays.pop(key, None)
         if found is None:
             found = make()
@@ -49,21 +48,22 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class RecordMotion:
-    """A record, or the part of one that a block holds.
+    """A record, or the part of it that a block contains.
 
     Attributes
     ----------
-    name : of the block. sample_rate_Hz, start_s : of the first sample, on the campaign's clock.
+    name : of the block. sample_rate_Hz, start_s : sample rate, and time of the block's first sample on the campaign's
+        clock.
     campaign_s : (first, last) time of the campaign.
     volts : (samples, n_u) commanded, in the model's order.
-    deflection : (samples, n_g) of each mount along each axis, payload less chassis [m], in the order of
-        `MountGeometry.names`. rows : (n_g, 6) from q to it. stiffness : (n_g,) N/m of each.
-    vertical : (n_g,) which are along z. driven_rows : (n_u,) which row each motor acts along.
-    before : samples of the record before the block's first one, held in all arrays; cut off by `spectrum`.
+    deflection : (samples, n_g) of each mount along each axis, payload minus chassis [m], in the order of
+        `MountGeometry.names`. rows : (n_g, 6) from q to deflection. stiffness : (n_g,) N/m of each.
+    vertical : (n_g,) mask of the rows along z. driven_rows : (n_u,) row along which each motor acts.
+    before : number of samples before the block's first one, included in all arrays; removed by `spectrum`.
     large_force, turned_force, turned_reading : (samples, 6), (samples, 6) N and N m, (samples, n_y) m/s^2: second-order
-        terms of large rotations (`effects.large_motion`), empty where they were not asked for.
-    actuators, sensors : names of the columns of volts and y. y : (samples, n_y) measured, empty where not every sensor
-        of the model was.
+        terms of large rotations (`effects.large_motion`), empty if not computed.
+    actuators, sensors : names of the columns of volts and y. y : (samples, n_y) measured, empty unless every sensor of
+        the model was measured.
     """
 
     name: str
@@ -87,21 +87,21 @@ class RecordMotion:
 
     @cached_property
     def time_s(self) -> np.ndarray:
-        """(samples,) on the campaign's clock."""
+        """(samples,) time on the campaign's clock."""
         return self.start_s + (np.arange(len(self.volts)) - self.before) / self.sample_rate_Hz
 
     @cached_property
     def largest_volts(self) -> float:
-        """Largest r.m.s. of a drive's voltage, V."""
+        """Largest r.m.s. voltage of a drive [V]."""
         return float(np.sqrt(np.mean(self.volts ** 2, axis=0)).max())
 
     @cached_property
     def rms_deflections(self) -> np.ndarray:
-        """(n_g,) m, r.m.s. over the record."""
+        """(n_g,) r.m.s. over the record [m]."""
         return np.sqrt(np.mean(self.deflection ** 2, axis=0))
 
     def spectrum(self, samples: np.ndarray, omega: np.ndarray) -> np.ndarray:
-        """(n, channels) of (samples, channels) on the block's lines, scaled as a `SpectralBlock` is."""
+        """(n, channels) spectrum of (samples, channels) on the block's lines, scaled like a `SpectralBlock`."""
         own = samples[self.before:]
         if not len(own):
             return np.zeros((len(omega), samples.shape[1]), complex)
@@ -109,15 +109,15 @@ class RecordMotion:
         return scipy.fft.rfft(own, axis=0)[lines] / np.sqrt(len(own))
 
     def kept(self, key: str, omega: np.ndarray, samples: Callable[[], np.ndarray]) -> np.ndarray:
-        """`spectrum` of samples that never change, under a key: computed once for each set of lines."""
+        """`spectrum` of samples that never change, cached under a key for each set of lines."""
         where = (key, len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega)))
         return self._spectra.of(where, lambda: self.spectrum(samples(), omega))
 
     def interpolated(self, key: str, value: float, omega: np.ndarray, samples: Callable[[float], np.ndarray]
                      ) -> np.ndarray:
-        """`spectrum` of samples(value), value > 0: cubic interpolation over log(value) between spectra that are kept.
+        """`spectrum` of samples(value), value > 0, by cubic interpolation over log(value) between cached spectra.
 
-        A fit asks for many values near each other, and for differences between them.
+        A fit needs many closely spaced values, and differences between them.
         """
         at = np.log(value) / np.log(SETTINGS.node_ratio)
         nodes = np.floor(at) + np.arange(-1, 3)

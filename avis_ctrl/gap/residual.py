@@ -1,4 +1,4 @@
-"""What a model leaves of records that no fit has seen: how much, in which bands and channels, at which level."""
+"""Residual of a model on held-out records: how large it is, in which bands and channels, at which level."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 
 @dataclass(frozen=True)
 class ResidualSettings:
-    """Of where and how much a model leaves.
+    """Settings of the location and size of the residual.
 
-    place_alarm : significance of a place of the gap over all places together [1].
-    most_places : places that are reported, the largest first.
-    bands_per_octave : bands to the octave of these places.
-    shown_lines : lines of each record from which its place in level and time, and the fractions of power, are told:
-        for a figure, not for a fit.
+    place_alarm : significance level of a place of the gap, over all places together [1].
+    most_places : maximum number of places reported, the largest first.
+    bands_per_octave : bands per octave of these places.
+    shown_lines : lines of each record from which its residual and the fractions of power are computed: for a figure,
+        not for a fit.
     """
 
     place_alarm: float = 0.01
@@ -41,7 +41,7 @@ SETTINGS = ResidualSettings()
 
 @dataclass(frozen=True, eq=False)
 class ModelResidual:
-    """What a model leaves of held-out blocks; names of its outputs and inputs."""
+    """Residual of a model on held-out blocks; names of its outputs and inputs."""
 
     errors: tuple[PredictionError, ...]
     outputs: tuple[str, ...]
@@ -58,12 +58,12 @@ class ModelResidual:
 
     @property
     def nrmse(self) -> float:
-        """R.m.s. over channels of error over y, in the band."""
+        """Error over y in the band, r.m.s. over channels."""
         return _relative(np.sum([np.sum(np.abs(e.error) ** 2, axis=(0, 2)) for e in self.errors], axis=0), self.errors)
 
     @property
     def noise_nrmse(self) -> float:
-        """What noise alone would leave."""
+        """The `nrmse` expected from noise alone."""
         return _relative(np.sum([e.noise_share() for e in self.errors], axis=0), self.errors)
 
 
@@ -73,7 +73,7 @@ def _relative(power: np.ndarray, errors: Sequence[PredictionError]) -> float:
 
 
 def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:
-    """Bands in Hz, `bands_per_octave` of them."""
+    """Band edges [Hz], `bands_per_octave`."""
     low = min(float(e.block.omega[0]) for e in errors) / (2 * np.pi)
     high = max(float(e.block.omega[-1]) for e in errors) / (2 * np.pi)
     count = max(int(np.ceil(SETTINGS.bands_per_octave * np.log2(high / low))), 1)
@@ -82,7 +82,7 @@ def edges_of(errors: Sequence[PredictionError]) -> np.ndarray:
 
 def _banded(e: PredictionError, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """By band, over the noise: power (n_bands, n_y) of a record's residual, number of lines (n_bands, 1), and the part
-    of the power that goes with each input (n_bands, n_y, n_in)."""
+    of the power that is coherent with each input (n_bands, n_y, n_in)."""
     assert e.block.noise is not None
     white, U = e.error[:, :, 0] / np.sqrt(np.real(np.einsum("nkk->nk", e.block.noise[:, 0]))), e.block.U[:, :, 0]
     inside = (np.digitize(e.block.omega / (2 * np.pi), edges) - 1)[:, None] == np.arange(len(edges) - 1)
@@ -93,7 +93,7 @@ def _banded(e: PredictionError, edges: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def places(left: ModelResidual) -> tuple[Where, ...]:
-    """Bands, outputs and the input that goes with each, where the residual exceeds the noise significantly."""
+    """Bands and outputs where the residual exceeds the noise significantly, each with the most coherent input."""
     edges = edges_of(left.errors)
     power, lines, found = (np.sum(parts, axis=0) for parts in zip(*(_banded(e, edges) for e in left.errors),
                                                                   strict=True))
@@ -102,7 +102,8 @@ def places(left: ModelResidual) -> tuple[Where, ...]:
     made = []
     for b, (low, high) in enumerate(pairwise(edges.tolist())):
         n = int(lines[b, 0])
-        # At most a third of the records is held out: the noise of a band is known from twice as many lines or more.
+        # At most a third of the records is held out: the noise of a band is estimated from at least twice as many
+        # lines.
         known = min(dof * max(n / 60, 1), max(dof, 2 * n))
         for k, output in enumerate(left.outputs if n else ()):
             p = count * float(stats.f.sf(power[b, k] / n, 2 * n, 2 * known) if np.isfinite(dof)
@@ -128,8 +129,8 @@ def heat_map(before: ModelResidual, after: ModelResidual) -> HeatMap:
 
 def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
            ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
-    """What the models leave of each record, fitted ones too, and what accounts for the outputs' power;
-    on `shown_lines` of each record."""
+    """Residual of the models in each record, including fitted ones, and decomposition of the outputs' power; on
+    `shown_lines` of each record."""
     held = {block.name for block in prepared.held_out}
     blocks = [thinned(block, SETTINGS.shown_lines) for block in (*prepared.fitted, *prepared.held_out)]
     headers = {r.header.name: r.header for r in (*prepared.halves.fitted.records, *prepared.halves.held_out.records)}

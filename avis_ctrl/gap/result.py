@@ -1,4 +1,4 @@
-"""The result of `gap`: verdict, named effects, stages, residual, and what to measure next."""
+"""The result of `gap`: verdict, named effects, stages, residual, and the next measurement."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ VERDICTS: tuple[str, ...] = get_args(Verdict)
 
 
 def spoken(name: str, unit: str) -> str:
-    """A parameter's name without its unit, which stands behind the number."""
+    """A parameter's name without its unit, which follows the number."""
     tail = "".join(sign for sign in unit if sign not in " ^()").replace("/", "_per_").removeprefix("1").lstrip("_")
     return (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
 
 
 @dataclass(frozen=True, eq=False)
 class NamedEffect:
-    """An effect that the data call for.
+    """An effect that is supported by the data.
 
     name, location : of the contract. title : in words. parameters : with standard deviations.
-    probability : of this effect among the candidates that were refitted in its place, given the data, equal beforehand;
-    of one that acts on the signals alone, what its finder states. indistinguishable_from : names that this data cannot
-    tell from it.
-    share : by how much the held-out residual power rises without it, over the baseline's in excess of the noise.
-    label : of the active effect in the updated model; empty for one that acts on the signals alone (hum, converter,
-    ground motion). confirmation : in words, how it was found.
+    probability : of this effect among the candidates fitted in its place, given the data, with equal prior
+        probabilities within the library; for an effect on the signals alone, the confidence of its detector.
+        indistinguishable_from : names of effects that these data cannot distinguish from it.
+    share : increase of the held-out residual power without the effect, over the baseline's power in excess of the
+        noise.
+    label : of the active effect in the updated model; empty for an effect on the signals alone (hum, converter, ground
+        motion). confirmation : a sentence on how it was found.
     """
 
     name: str
@@ -46,7 +47,7 @@ class NamedEffect:
     share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As the contract has it."""
+        """As defined in the contract."""
         return {"name": self.name, "location": self.location,
                 "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
                                for key, p in self.parameters.items()},
@@ -54,8 +55,8 @@ class NamedEffect:
                 **({} if self.share is None else {"share": self.share})}
 
     def in_words(self) -> str:
-        """With its place, probability, and its first parameters that differ from zero by two standard deviations; how
-        single mounts differ stands in the table alone."""
+        """Title with place, probability, and the first parameters that differ from zero by two standard deviations;
+        differences between single mounts appear only in the table."""
         own = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")]
         certain = [(name, p) for name, p in own if not (p.std or 0.0) > abs(p.value) / 2]
         sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in (certain or own)[:3])
@@ -72,10 +73,11 @@ def missed(told: Sequence[NamedEffect]) -> str:
 
 @dataclass(frozen=True)
 class Remainder:
-    """What the updated model leaves of held-out records.
+    """Residual of the updated model on held-out records.
 
-    nrmse : over y, r.m.s. over_noise : over what noise alone leaves. share : of its power beyond noise over that of the
-    baseline. grows_with_level : whether it grows faster than the drives; None where the records do not tell.
+    nrmse : over y, r.m.s. over_noise : over the residual expected from noise alone. share : power beyond noise over
+        that of the baseline. grows_with_level : whether it grows faster than the drives; None if the records do not
+        show it.
     """
 
     nrmse: float
@@ -86,7 +88,8 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the search, on held-out data: r.m.s. of what the model leaves over that of y, and chi-square."""
+    """A stage of the search, on held-out data: r.m.s. residual over r.m.s. y, and chi-square over degrees of freedom.
+    """
 
     name: str
     nrmse: float
@@ -95,9 +98,10 @@ class Stage:
 
 @dataclass(frozen=True)
 class Where:
-    """A band and path that holds a share of the excess of the residual over the noise. input "" for none in particular.
+    """A band and path with a fraction of the residual power in excess of the noise. input "" for no particular input.
 
-    excess : power of the residual over that of the noise. p_value : of as much by chance, family-wise over all places.
+    excess : power of the residual over that of the noise. p_value : of this excess by noise alone, family-wise over all
+        places.
     """
 
     from_Hz: float
@@ -111,7 +115,7 @@ class Where:
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """A candidate that was refitted: held-out chi-square per degree of freedom and why it was not named."""
+    """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named."""
 
     name: str
     location: str
@@ -123,8 +127,9 @@ class Considered:
 
 @dataclass(frozen=True)
 class Detectable:
-    """A parameter of an absent effect, and the departure from none that is five standard deviations of a fit to the
-    fitted records. The search asks for more before it names. Infinite where re-identification would absorb it."""
+    """Detection limit of a parameter of an absent effect: the difference from its value without the effect, five
+    standard deviations in a fit to the fitted records. The search requires more than this for a name. Infinite if
+    re-identification would absorb the parameter."""
 
     name: str
     location: str
@@ -148,18 +153,19 @@ class HeatMap:
 
 @dataclass(frozen=True, eq=False)
 class PowerShares:
-    """What accounts for the power of each output on the lines that the drives excite, in the records of one level.
+    """Decomposition of the power of each output on the lines that the drives excite, in the records of one level.
 
     Attributes
     ----------
     level_V : mean over the records. excitation, records : of the group. bands_Hz : (n_bands + 1,) edges.
-    outputs : names. shares : (n_bands, n_y) by part, which add up to one: "model" follows the measured inputs as the
-        updated model has it; "missing" follows them linearly, but not as the model has it; "nonlinear" depends on
-        amplitude or time; "unmeasured" is motion from inputs that are not measured, and all noise where that of the
-        sensors is not known; "sensors" their own noise, absent where it is not known.
-    whole : (n_y,) by part, of the power of all bands together.
-    how : noise was told from nonlinearity on lines where the drives are "silent", by several "levels", or not at all:
-        "one level", where "nonlinear" holds the model's own terms only, and "unmeasured" whatever else is not linear.
+    outputs : names. shares : (n_bands, n_y) by part, which add up to one: "model" is the linear response to the
+        measured inputs as the updated model predicts it; "missing" is linear in these inputs, but not predicted by the
+        model; "nonlinear" depends on amplitude or time; "unmeasured" is motion from inputs that are not measured, and
+        all noise if the sensor noise is not known; "sensors" is sensor noise, absent if it is not known.
+    whole : (n_y,) by part, for the power of all bands together.
+    how : noise was separated from nonlinearity on lines where the drives are "silent", by several "levels", or not at
+        all: with "one level", "nonlinear" contains only the model's own terms, and "unmeasured" everything else that is
+        not linear.
     """
 
     level_V: float
@@ -174,10 +180,10 @@ class PowerShares:
 
 @dataclass(frozen=True, eq=False)
 class RecordGap:
-    """What the models leave of one record, r.m.s. over that of the noise, on lines drawn for all records alike.
+    """Residual of the models in one record, r.m.s. over that of the noise, on lines drawn alike for all records.
 
-    start_s : on the campaign's clock. held_out : no fit has seen it. kind : how it was driven, whether its floor was
-    measured; residual over noise compares among records of one kind.
+    start_s : on the campaign's clock. held_out : not used in any fit. kind : excitation, and whether the floor was
+        measured; residual over noise can be compared among records of one kind.
     """
 
     name: str
@@ -191,22 +197,23 @@ class RecordGap:
 
 @dataclass(frozen=True, eq=False)
 class Gap:
-    """Everything that was found.
+    """The complete result.
 
     Attributes
     ----------
-    verdict : one of VERDICTS. effects : named. stages : on held-out data, "nominal", "re-identified", then one for each
-        effect. where : of the gap after re-identification. remaining : the same after the named effects.
-    noise_nrmse : what noise alone would leave of the held-out records. next_experiment : None or a sentence.
-    baseline, updated : models (updated is the baseline where nothing was named).
+    verdict : one of VERDICTS. effects : named. stages : on held-out data, "nominal", "re-identified", "tolerances",
+        then one for each effect. where : location of the gap after re-identification. remaining : the same after the
+        named effects.
+    noise_nrmse : residual of the held-out records expected from noise alone. next_experiment : None or a sentence.
+    baseline, updated : models (without named effects, updated is the baseline with all tolerances fitted).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
-    held_out : what no fit has seen, and why. seed, seconds.
+    held_out : the held-out data and the reason for their choice. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.
-    detectable : where the verdict is none, sizes of five standard deviations of absent effects; else empty.
-    shares : what accounts for the outputs' power, by level, the lowest first. records : what each record leaves.
-    raised : sensors whose own noise is all that has no name; `remaining` then holds these.
-    traces : effects that are there, each below 1 % of the gap. left : what remains, in figures. tolerances : of the
-    updated model, the most moved first.
+    detectable : if the verdict is none, detection limits of absent effects (five standard deviations); otherwise empty.
+    shares : decomposition of the outputs' power by level, the lowest first. records : residual of each record.
+    raised : sensors with raised noise, if nothing else is left unexplained; `remaining` then contains these.
+    traces : effects that are present, each below 1 % of the gap. left : size of the residual. tolerances : of the
+        updated model, the largest shift first.
     """
 
     verdict: Verdict

@@ -1,13 +1,13 @@
-"""Score test: what a small effect would take off the residual that no re-identification can take.
+"""Score test: the reduction of the residual by a small effect, beyond any re-identification.
 
-At the fitted model the whitened residual e and the derivative J by the rig's parameters are known, with the transients
-of the records projected out. An effect that changes the response by c delta along directions delta (whitened) lowers
-chi2 by at most
+At the fitted model, the whitened residual e and its derivative J with respect to the rig's parameters are known, with
+the transients of the records projected out. An effect that changes the response by c delta along directions delta
+(whitened) lowers chi2 by at most
 
     b^T inv(A) b,   A = delta P delta^T,   b = delta P e,    P = I - J^T inv(J J^T) J
 
-(Rao's efficient score; C. R. Rao 1948, W. K. Newey 1985): of noise alone a chi-square of as many degrees of freedom as
-there are directions.
+(Rao's efficient score; C. R. Rao 1948, W. K. Newey 1985). For noise alone this is chi-square distributed with as many
+degrees of freedom as there are directions.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from avis_ctrl.identification.weights import with_distortion
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """Of the score test and of what it can detect.
+    """Settings of the score test and of the detection limits.
 
-    step : step of a linear parameter at which its direction is taken, in units of its size [1]: small beside any
-        curvature, large beside round-off.
-    least_left : fraction of a direction that must be left when what re-identification absorbs is taken out [1]:
-        below, it is round-off.
-    least_singular : singular value of the parameters' directions over the largest, below which they determine
-        nothing [1].
+    step : step of a linear parameter for the difference quotient of its direction, in units of its size [1]: small
+        compared with any curvature, large compared with round-off.
+    least_left : minimum fraction of a direction that must remain after projecting out what re-identification absorbs
+        [1]: a smaller remainder is round-off.
+    least_singular : singular value of the parameters' directions over the largest, below which they determine nothing
+        [1].
     least_direction : eigenvalue of the scaled Gram matrix of directions over the largest, below which the data do not
         determine a combination [1]: a step along it would be round-off.
-    least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which there is only
-        round-off, 1e-16 of it [1].
-    detected : standard deviations from which an effect is detected [1]: a parameter gains the evidence that a name
-        needs at between four and five.
+    least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which it is round-off, which is
+        about 1e-16 of the largest [1].
+    detected : standard deviations from which an effect is detected [1]: a parameter reaches the evidence required for a
+        name at between four and five.
     """
 
     step: float = 1e-3
@@ -66,7 +66,8 @@ SYMMETRIC = tuple((i, j) for i in range(N_Q) for j in range(i, N_Q))
 
 @dataclass(frozen=True)
 class Reduction:
-    """Of chi2 by a set of directions: how much, how many directions the data determine, and their coefficients."""
+    """Reduction of chi2 by a set of directions: its size, the number of directions that the data determine, and
+    coefficients."""
 
     chi2: float
     rank: int
@@ -74,7 +75,7 @@ class Reduction:
 
 
 def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
-    """b^T inv(G) b over what G determines."""
+    """b^T inv(G) b in the subspace that G determines."""
     size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(G / np.outer(size, size))
     known = values > SETTINGS.least_direction * max(values[-1], 1e-300)
@@ -84,16 +85,16 @@ def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
 
 
 def symmetric_coordinates(S: np.ndarray) -> np.ndarray:
-    """(..., 21) of symmetric matrices (..., 6, 6): coefficients of the unit matrices e_i e_j^T + e_j e_i^T."""
+    """(..., 21) coefficients of symmetric matrices (..., 6, 6) in the unit matrices e_i e_j^T + e_j e_i^T."""
     rows, columns = np.array(SYMMETRIC).T
     return S[..., rows, columns]
 
 
 class Part:
-    """One block at the model: response pieces, and the projection of its transient.
+    """One block at the model: its response, and the projection that removes its transient.
 
-    body : (n, 12, 1) impulses and steps of the transient as the data have it; an effect changes what they do, too.
-    inner : (m,) what the states inside start with, for derivatives by the model's own parameters.
+    body : (n, 12, 1) impulses and steps of the transient in the data; an effect changes the response to them, too.
+    inner : (m,) initial internal states, for derivatives with respect to the model's own parameters.
     """
 
     def __init__(self, model: TableModel, block: SpectralBlock):
@@ -123,18 +124,18 @@ class Part:
         return self.response.s
 
     def real(self, dY: np.ndarray) -> np.ndarray:
-        """(k, n, n_y, m) of y to (k, N), whitened, free of the transient."""
+        """(k, n, n_y, m) of y to (k, N) real numbers, whitened, transient projected out."""
         out = whitened_real(self.L, dY)
         if self.transient.size:
             out -= (self.transient @ (self.transient.T @ out.T)).T
         return out
 
     def side(self, model: TableModel) -> AtMotion:
-        """What a model near by misses of the motion of this one."""
+        """A nearby model at the motion of this model."""
         return AtMotion(Assembled(model.operators(self.block.omega)), self._acting(model), self.response.x)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
-        """(21, n, n_y, m): y by each symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
+        """(21, n, n_y, m): y per symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
         q, left = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
         out = []
         for i, j in SYMMETRIC:
@@ -146,9 +147,9 @@ class Part:
 
 
 class Score:
-    """The model at its fit, ready to weigh directions; its free parameters and the transients are projected out.
+    """The fitted model, prepared to score directions; its free parameters and the transients are projected out.
 
-    model : fitted. blocks : with noise. kept : what effects computed and may ask for again.
+    model : fitted. blocks : with noise. kept : results that effects cache.
     """
 
     def __init__(self, model: TableModel, blocks: Sequence[SpectralBlock]):
@@ -173,14 +174,15 @@ class Score:
         return len(self.e) - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
-        """(k, N) of one (k, n, n_y, m) a block, projected."""
+        """(k, N) projected directions from changes of y, one (k, n, n_y, m) per block."""
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
         left = A - (A @ self.basis.T) @ self.basis
         left[np.linalg.norm(left, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
         return left
 
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
-        """(k, N): by each linear parameter of an effect without strength, or its whole change where it has none."""
+        """(k, N): directions of the linear parameters of an effect at zero strength; without such parameters, the
+        change of y by the whole effect."""
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
             added = self.model.with_effect(effect)
@@ -203,19 +205,19 @@ class Score:
         return self.directions(columns)
 
     def reduction(self, A: np.ndarray) -> Reduction:
-        """Of chi2 by directions (k, N)."""
+        """Reduction of chi2 by directions (k, N)."""
         return reduction(A @ A.T, A @ self.e)
 
 
 class EvidenceScore(Score):
     """`Score` with path errors integrated out and normal priors on all parameters.
 
-    Priors are rows of their own below the residuals: e = (e, -z), J = (J, I). A direction of an effect has zeros there.
+    The priors are additional rows below the residuals: e = (e, -z), J = (J, I). A direction of an effect is zero there.
     """
 
     def __init__(self, fitted: Fitted, data: Data, settings: FitSettings = FIT_SETTINGS):
         full = fitted.model
-        # What an effect fits by itself, to find where to begin, leaves the tolerances where they are.
+        # Fits by which an effect finds its own starting values keep the tolerances fixed.
         rig = tuple(name for name in full.base.names if name in default_parameters(full.rig))
         nominal = full.nominal and replace(full.nominal, names=rig)
         self.model, self.kept = replace(full, base=replace(full.base, names=rig), nominal=nominal), {}
@@ -227,8 +229,8 @@ class EvidenceScore(Score):
 
     @cached_property
     def plain(self) -> Score:
-        """The same against noise and distortion alone, for effects that look for their beginning by fits of their own:
-        there what has no name is not taken out."""
+        """The score weighted by noise and distortion alone, for effects that find their starting values by their own
+        fits: unexplained path errors are not removed there."""
         return Score(self.model, [part.block for part in self.parts])
 
     def directions(self, dY):

@@ -1,11 +1,11 @@
-"""Which effects the data ask for: score tests, refits, evidence; one effect after the other.
+"""Forward selection of effects by score tests, fits and model evidence.
 
     evidence of a model = p(records | model), parameters and path errors integrated out (`likelihood`)
 
-At each step the effects that promise most by the score test are fitted, each beside what is there already with all
-parameters of the rig and all tolerances. The one of the largest evidence is taken if it beats the present model by more
-than the number of candidates explains. Effects that are not certain are compared with their rivals again, beside what
-was found after them. If a rival replaces one, effects found later that no longer raise the evidence are removed.
+Each step fits the effects with the largest score statistics. Each of them is added to the current model and fitted
+together with all parameters of the rig and all tolerances. The effect with the largest evidence is accepted if the gain
+in evidence exceeds what the number of candidates explains. Uncertain effects are compared with their rivals again,
+given the effects found later. If a rival replaces one, later effects that no longer raise the evidence are removed.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An effect at a place, where its fit begins, and the fall of the sum of squares by the score test.
+    """An effect at a place with starting values, and the reduction of the sum of squares by the score test.
 
-    p_value : of as large a fall by noise alone, over all frequencies and other values that were tried there.
-    others : further values with which its fit may begin, the most promising first.
+    p_value : of as large a reduction by noise alone, over all frequencies and other values that were tried there.
+    others : further starting values, the most promising first.
     """
 
     effect: ActiveEffect
@@ -48,10 +48,11 @@ class Candidate:
 
 def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each = one_by_one
                ) -> list[Candidate]:
-    """Every effect at every place at its best seed, the largest fall first.
+    """Every effect at every place with its best seed, the largest reduction first.
 
-    Effects that add a resonance of many parameters take long to begin well. They are looked for only where a resonance
-    with a shape of its own on every path, which each of them is at least as well described by, takes its part.
+    Effects that add a resonance with many parameters take long to initialise. They are searched only if a resonance
+    with an arbitrary shape on every path gives a sufficient reduction; it describes the data at least as well as each
+    of them.
     """
     score = EvidenceScore(fitted, data, settings)
     model, taken = score.model, {name_of(label) for label in fitted.labels}
@@ -76,7 +77,7 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
 
 
 def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candidate]:
-    """Each effect at its best place, of those whose fall is no chance among so many."""
+    """Each effect at its best place, if the reduction is significant given the number of candidates."""
     chosen: dict[str, Candidate] = {}
     for one in found:
         if one.p_value * len(found) < math.exp(-settings.certain):
@@ -85,13 +86,14 @@ def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candida
 
 
 def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -> list[Candidate]:
-    """The same effect at the same place by its other laws, but for those that were fitted; all by their labels."""
+    """The same effect at the same place with its other laws, except those already fitted; `best` and `fitted` are
+    labels."""
     return [one for one in found if name_of(one.effect.label) == name_of(best) and one.effect.label not in fitted]
 
 
 def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
-    """Richer laws of the effects that were fitted last, each begun where a simpler one has ended. An effect with many
-    local minima is begun again with other values."""
+    """Richer laws of the effects that were fitted last, each starting from the fit of a simpler law. An effect with
+    many local minima starts again from other values."""
     found = []
     for one in fits:
         law = one.model.effects[-1].effect
@@ -108,7 +110,7 @@ def _priors_of(one: ActiveEffect, model: TableModel, settings: GapSettings) -> P
 
 
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
-    """The fit with one effect more; None where it came to no end."""
+    """The fit with one more effect; None if it fails."""
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
     z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
@@ -116,14 +118,15 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
 
 
 def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
-    """Standardised parameters of a fit where one of its effects begins: with what tolerances had to make up for."""
+    """Standardised parameters from which the fit with an added effect starts: tolerances that compensated for the
+    effect are reset to zero."""
     z = fitted.z.copy()
     z[tolerances_behind(one, fitted.priors.names)] = 0
     return z
 
 
 def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings) -> Fitted | None:
-    """The fit with one effect less."""
+    """The fit without one of the effects; None if it fails."""
     model = fitted.model.without(label)
     one = fitted.model.effect(label)
     rows = [fitted.priors.names.index(name) for name in model.names]
@@ -132,7 +135,7 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
 
 
 def _with_known(priors: Priors, known) -> Priors:
-    """With what an effect says of parameters that records need not determine (`Effect.priors`)."""
+    """Priors with those that an effect specifies for parameters that records need not determine (`Effect.priors`)."""
     rows = [priors.names.index(name) for name in known if name in priors.names]
     mean, sigma = priors.mean.copy(), priors.sigma.copy()
     for row in rows:
@@ -150,12 +153,12 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Each = one_by_one,
            enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
-    """Effects in the order in which they are found; last of all the values of the rig file that are beyond their
-    tolerance, which show in how far one of them had to move, and hardly in what remains.
+    """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
+    they show in how far one of them had to move, hardly in the residual.
 
-    base : the fit that it begins with; it may have effects already. enough : whether the search may end with a step,
-    because what it found takes next to nothing.
-    The last step has the fit with everything that was found.
+    base : the initial fit, which may already contain effects. enough : whether the search may end after a step because
+        its effect explains next to nothing.
+    The last step has the fit with all effects found.
     """
     steps: list[Step] = []
 
@@ -166,7 +169,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
             step = _step(now, data, effects, settings, each)
             if step is None:
                 return
-            if steps:  # residual and Jacobian of the last fit alone are of use
+            if steps:  # only the last fit needs residual and Jacobian
                 steps[-1] = replace(steps[-1], fitted=steps[-1].fitted.bare())
             steps.append(step)
             progress(f"  best model: {', '.join(step.fitted.labels)}")
@@ -185,10 +188,10 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
 
 def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
              progress: Progress = lambda text: None, each: Each = one_by_one) -> tuple[list[Step], Fitted]:
-    """Values of the rig file beyond their tolerance that stand out from the others, where these moved by much less than
+    """Values of the rig file beyond their tolerance that stand out because the other values moved by much less than
     their tolerances; and the last fit, with the tolerances as stated.
 
-    The priors are as narrow as the values are spread, before and with each effect alike.
+    The priors are as narrow as the spread of the values, both without and with each effect.
     """
     rows, size = spread(now, settings)
     if size > settings.narrow:
@@ -203,14 +206,15 @@ def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSe
 
 
 def _with_spread(fitted: Fitted, rows: Sequence[int], size: float, data: Data, settings: GapSettings) -> Fitted:
-    """The fit with the standard deviations of some priors times a factor."""
+    """The fit with the standard deviations of some priors multiplied by a factor."""
     priors = fitted.priors.scaled(rows, size)
     return fit(fitted.model, priors, priors.z(fitted.priors.values(fitted.z)), data, fitted.variances, settings)
 
 
 def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
-    """Compare effects that are not certain with their rivals again, beside what was found after them: until then
-    several may have stood for the same. Whether one of them was replaced; then what the others explain as well goes."""
+    """Compare uncertain effects with their rivals again, given the effects found later: before these, several effects
+    could explain the same data. If one is replaced, effects that become unnecessary are removed. Returns whether one
+    was replaced."""
     for k, step in enumerate(steps[:-1]):
         if probability_of(step, settings)[0] > settings.sure:
             continue
@@ -231,8 +235,8 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
 
 def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
                      ) -> tuple[list[Step], Fitted]:
-    """Leave out, one after the other, effects without which the evidence falls by less than a name needs. Returns the
-    steps that stay, and the fit."""
+    """Remove, one by one, effects whose removal lowers the evidence by less than a name requires. Returns the remaining
+    steps and the fit."""
     kept = []
     for step in steps:
         rest = without_effect(best, step.label, data, settings)
@@ -244,8 +248,8 @@ def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: 
 
 
 def is_weak(best: Fitted, label: str, settings: GapSettings) -> bool:
-    """Whether an effect's strength is hardly distinguishable from none: by Wald's test it raises the log-likelihood by
-    less than twice the gain that a name needs."""
+    """Whether an effect's strength is hardly distinguishable from zero: by Wald's test it raises the log-likelihood by
+    less than twice the gain required for a name."""
     one = best.model.effect(label)
     values = dict(zip(one.names, one.values, strict=True))
     names = [name for name in one.absent if name in best.priors.names]
@@ -256,8 +260,8 @@ def is_weak(best: Fitted, label: str, settings: GapSettings) -> bool:
 
 
 def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
-    """The choice of a step, beside what was found after it. A rival that was behind by more than all later effects
-    gained is not fitted again: it could not catch up."""
+    """Repeat the choice of a step, given the effects found later. A rival that was behind by more than the total gain
+    of all later effects is not fitted again: it could not catch up."""
     rest = without_effect(best, step.label, data, settings)
     if rest is None:
         return step
@@ -275,7 +279,7 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
 
 
 def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
-    """The effect of the largest evidence; None where none beats the present model."""
+    """The effect with the largest evidence; None if no effect improves the current model enough."""
     begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, settings, each)
     tried = _tried(begun, shortlist(found, settings), data, settings, each)
@@ -299,7 +303,7 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
 
 @dataclass(frozen=True, eq=False)
 class _Begun:
-    """An effect by a fit of its own parameters: gain of log evidence, and fall of the sum of squares."""
+    """An effect after a fit of its own parameters alone: gain of log evidence, and reduction of the sum of squares."""
 
     effect: ActiveEffect
     gain: float
@@ -308,9 +312,9 @@ class _Begun:
 
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
            ) -> dict[str, Fitted]:
-    """Fits of candidates by label: at first of each effect's own parameters, the others moving along to first order;
-    then of all parameters, for those that are not far behind. Left out are those that come to no end, to values that
-    physics forbids, or to one within its tolerance."""
+    """Fits of candidates by label. First the parameters of each effect alone are fitted, the others following to first
+    order; then, for candidates that are not far behind, all parameters. Excluded are fits that fail, that end at values
+    which physics forbids, or that end within a tolerance."""
     if not chosen:
         return {}
     profile = Profile(now, data, settings)
@@ -339,8 +343,8 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     made = each(begun, chosen)
     most = max((end.gain for _, end in made if end is not None), default=0.0)
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
-    # Where the other parameters must move by more than to first order, as beside a heavy sprung mass, only a fit of all
-    # parameters shows what an effect can do.
+    # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
+    # shows what an effect can achieve.
     near += [one.effect for one, end in made if at_full_strength(one.effect)
              or (one.fall >= 2 * settings.not_far_behind * most
              and (end is None or end.fall < settings.least_promised * one.fall))]
@@ -351,7 +355,7 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
 
 
 def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:
-    """Of fits by the label of their last effect, the one of the largest evidence; of equal ones the first."""
+    """For each label of the last effect, the fit with the largest evidence; the first of equal ones."""
     found: dict[str, Fitted] = {}
     for one in fits:
         known = found.get(one.labels[-1])
@@ -361,19 +365,18 @@ def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:
 
 
 def _likeliest(fits: Mapping[str, Fitted]) -> str:
-    """Label of the fit of the largest evidence."""
+    """Label of the fit with the largest evidence."""
     return max(fits, key=lambda label: fits[label].log_evidence)
 
 
 def at_full_strength(one: ActiveEffect) -> bool:
-    """Whether an effect adds a resonance that has no strength that may be small. Mass and stiffness that the fit
-    without it has found must move by more than to first order, so that nothing is known before they are fitted
-    together."""
+    """Whether an effect adds a resonance without a strength that can be small. Mass and stiffness found without it must
+    move beyond first order, so that only a joint fit shows its value."""
     return one.effect.resonant and not one.absent
 
 
 def _small(found: Fitted | None) -> Fitted | None:
-    """Without what takes room on the way back from another process, the motion of the records first of all."""
+    """The fit without its large data, mainly the motion of the records, for the transfer from another process."""
     return found and replace(found.bare(), model=replace(found.model, motion={}))
 
 
@@ -382,12 +385,12 @@ def _whole(found: Fitted, like: Fitted) -> Fitted:
 
 
 def implausible(fitted: Fitted) -> str:
-    """Why physics forbids the values of some effect; empty where it does not."""
+    """Why physics forbids the values of some effect; empty if it does not."""
     return next((reason for one in fitted.model.effects if (reason := forbidden(fitted, one))), "")
 
 
 def forbidden(fitted: Fitted, one: ActiveEffect) -> str:
-    """Why physics forbids the values of an effect; empty where it does not."""
+    """Why physics forbids the values of an effect; empty if it does not."""
     std = np.sqrt(np.maximum(np.diag(fitted.covariance_of(one.names)), 0))
     values = dict(zip((p.name for p in one.parameters), std, strict=True))
     if np.any(shares(one.by_name) <= 0):
@@ -396,7 +399,8 @@ def forbidden(fitted: Fitted, one: ActiveEffect) -> str:
 
 
 def at_the_edge(effect: ActiveEffect) -> str:
-    """A shape parameter that ran to the end of what physics allows: the effect has turned into something else."""
+    """Describe a shape parameter that ended at its physical bound, where the effect has turned into a different one;
+    empty if there is none."""
     for parameter, value in zip(effect.parameters, effect.values, strict=True):
         span = parameter.high - parameter.low
         if not parameter.linear and not parameter.optional and (value > parameter.high - 1e-6 * span

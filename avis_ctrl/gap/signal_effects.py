@@ -1,6 +1,6 @@
-"""Effects that act on the signals alone: recognised in the records themselves, not by refits of the table.
+"""Effects on the signals alone: detected in the records themselves, not by fits of the table.
 
-They are no classes of the library (`effects.library`) and have no part in a score.
+They are not classes of the library (`effects.library`) and have no score.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class SignalFaults:
-    """What the signals themselves show."""
+    """Faults found in the signals themselves."""
 
     converter: tuple[ConverterFinding, ...] = ()
     hum: HumFinding | None = None
@@ -40,7 +40,7 @@ class SignalFaults:
 
     @property
     def raised(self) -> tuple[str, ...]:
-        """Sensors whose own noise is above ambient, for which the library has no name."""
+        """Sensors with noise above ambient that no converter fault explains; the library has no name for it."""
         if self.noise is None:
             return ()
         known = {one.channel for one in self.converter}
@@ -48,12 +48,12 @@ class SignalFaults:
 
 
 def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:
-    """Converters coarser, or clipping lower, than the rig file says; none where y is not in V."""
+    """Converters that are coarser, or clip lower, than stated in the rig file; none if y is not in V."""
     return inspect_converter(campaign, rig) if campaign.y_unit == "V" and rig.acquisition is not None else ()
 
 
 def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> dict[str, np.ndarray]:
-    """(samples, n_y) that the model reads in every record, from rest."""
+    """(samples, n_y) sensor signals predicted by the model in every record, from rest."""
     clock = clock_of(campaign)
 
     def read(record: RecordSource) -> np.ndarray:
@@ -64,13 +64,13 @@ def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) ->
 
 
 def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[RecordResidual, ...]:
-    """What the model leaves of every record in time."""
+    """Residual of the model in every record, in time."""
     return record_residuals(campaign, predicted(campaign, model, each))
 
 
 def levels(left: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding | None,
            converter: tuple[ConverterFinding, ...]) -> NoiseLevels | None:
-    """Noise of floor and sensors; None where the records or the rig file do not allow it."""
+    """Noise of floor and sensors; None if the records or the rig file do not allow an estimate."""
     n_u, steps = len(model.actuators), SignalFaults(converter).resolution_V
     try:
         return noise_levels(left, lambda omega: model.response(omega)[:, :, n_u:], model.rig, hum, steps)
@@ -79,7 +79,7 @@ def levels(left: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding 
 
 
 def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual, ...]) -> Campaign:
-    """The campaign with the hum's sines taken out of every record."""
+    """The campaign with the sines of the hum subtracted from every record."""
     of, records = {one.header.name: one for one in left}, []
     for source in campaign.records:
         record = source.load()
@@ -90,7 +90,7 @@ def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual,
 
 
 def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
-    """Effects of the library that the signals show."""
+    """Effects found in the signals, with the names of the contract."""
     rows: list[tuple[str, str, str, ConverterFinding | HumFinding | FloorLevel]] = [
         ("sensor_quantisation", one.channel, f"the converter of {one.channel} is coarser than the rig file says"
          if one.kind == "resolution" else f"the converter of {one.channel} clips below its nominal range", one)

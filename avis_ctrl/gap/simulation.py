@@ -1,11 +1,11 @@
-"""Simulation in time of a table with effects: what its sensors read in a record, from u and floor alone.
+"""Time simulation of a table with effects: the sensor signals in a record, from u and floor alone.
 
-The linear part acts on the lines of the padded record (`line_response`). Forces that depend on amplitude or time are
-found from sample to sample (`time_stepping`) and then act on the same lines. A band of 500 Hz, or half the sample
-rate, is kept: a table moves above by its mass alone.
+The linear part is computed on the lines of the padded record (`line_response`). Forces that depend on amplitude or time
+are computed from sample to sample (`time_stepping`) and then act on the same lines. The bandwidth is 500 Hz, or half
+the sample rate: above it only the inertia of a table matters.
 
-Limits: a record starts at rest, with nothing before it. Volts that an effect changes by the motion see the motion
-without them. Records of more than `RecordLineSettings.most_samples` samples are refused.
+Limits: a record starts at rest, with nothing before it. Effects that change the volts depending on the motion use the
+motion without this change. Records of more than `RecordLineSettings.most_samples` samples are refused.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from avis_ctrl.identification.response import N_Q
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """Of forces that act over a whole record.
+    """Settings of forces that act over a whole record.
 
-    defect : what the equation of motion may leave of the deflection, r.m.s. [1]: far below any sensor's noise.
-    most_passes : passes over the record before it counts as one that does not settle.
+    defect : maximum residual of the equation of motion over the deflection, r.m.s. [1]: far below any sensor's noise.
+    most_passes : maximum number of passes over the record before the simulation counts as not converging.
     """
 
     defect: float = 1e-5
@@ -54,18 +54,18 @@ class Simulated:
 
 def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_rate_Hz: float, *,
              start_s: float = 0.0, campaign_s: tuple[float, float] = (0.0, 1.0)) -> Simulated:
-    """What the sensors read, before the converter: nothing is rounded or clipped.
+    """The sensor signals before the converter: without rounding or clipping.
 
     Parameters
     ----------
     u : (samples, n_u) V, clipped here to the rig's drive limit. floor : (samples, 3) m/s, None for a floor at rest.
-    start_s : of the first sample on the campaign's clock. campaign_s : (first, last) time of the campaign, for effects
-        that depend on time.
+    start_s : time of the first sample on the campaign's clock. campaign_s : (first, last) time of the campaign, for
+        effects that depend on time.
 
     Raises
     ------
-    InputError : arrays of other shapes, numbers that are not finite, a rate that is not the rig's, a record too long.
-    ComputationError : a motion that grows without bound, or a response that does not settle.
+    InputError : arrays of wrong shape, non-finite numbers, a sample rate other than the rig's, or a record too long.
+    ComputationError : a motion that grows without bound, or a response that does not converge.
     """
     u, floor = _checked(model, u, floor)
     lines = line_response(model.linear, len(u), sample_rate_Hz)
@@ -78,7 +78,7 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
         y, deflection = lines.answer(acting, floor)
         record = replace(record, volts=acting, deflection=deflection)
     pushing = [one for one in effects if one.effect.force(record, one.place, one.by_name) is not None]
-    if not pushing or not deflection.size:  # a rig without mounts of its own has no motion by which forces could act
+    if not pushing or not deflection.size:  # without individual mounts there is no deflection for forces to act on
         return Simulated(y, deflection)
     return _with_forces(model, lines, record, floor, pushing)
 
@@ -101,14 +101,14 @@ def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tupl
 
 def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, floor: np.ndarray | None,
                  effects: Sequence[ActiveEffect]) -> Simulated:
-    """March, then let the forces act over the whole record. What enters the next pass: what a response before its
-    cause leaves (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
+    """Step through time, then apply the forces to the whole record. Two residuals enter the next pass: non-causal parts
+    of the response (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
     weak = next((one for one in effects if isinstance(one.effect, LargeMotion)), None)
     if "forces" not in lines.kept:
         lines.kept["forces"] = ForceResponse(lines)
     by_force = lines.kept["forces"]
-    # Free motion in coordinates of the response: any that give the deflection.
+    # Free motion in the coordinates of the force response; any values with the same deflection will do.
     to_z, n = np.linalg.pinv(by_force.shape), len(record.volts)
     defect, reading = float("nan"), None
     slow, correction, size = np.zeros((n, N_Q)), np.zeros((n, by_force.shape.shape[1])), 0.0

@@ -1,4 +1,4 @@
-"""Where the fit of an effect begins, and by how much it promises to lower the sum of squares."""
+"""Starting values of the fit of an effect, and the predicted reduction of the sum of squares."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from avis_ctrl.gap.table_model import ActiveEffect
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Of the search for starting values.
+    """Settings of the search for starting values.
 
     places_m : lowest and highest place along x, y, z, from the geometric centre [m], and number of places: over and
         around a table.
-    halvings : how often the step between places is halved about the best: to some 2 cm.
-    polar, around : rows and columns of a half-sphere of directions, about 16 degrees apart.
-    surge_Hz : lowest and highest frequency of a resonance inside the mounts [Hz], and number of those searched.
-    least_surge_damping : damping ratio with which the fit of such a resonance begins at least [1]: from a narrow one
-        at the wrong frequency no fit finds the right one.
-    peak_step, peak_reach : steps of the logarithm of frequency in which the residual's power is averaged [1], and steps
-        on either side whose median it is compared with.
+    halvings : how often the step between places is halved around the best one: down to about 2 cm.
+    polar, around : rows and columns of a hemisphere of directions, about 16 degrees apart.
+    surge_Hz : lowest and highest frequency of a resonance inside the mounts [Hz], and number of frequencies searched.
+    least_surge_damping : minimum damping ratio from which the fit of such a resonance starts [1]: a fit that starts
+        with a narrow resonance at the wrong frequency does not converge to the right one.
+    peak_step, peak_reach : step of the logarithm of frequency over which the residual's power is averaged [1], and
+        number of steps on either side for the median with which it is compared.
     peak_height : power over that median from which a step is a peak [1].
-    peaks_apart : logarithm of the ratio of two peaks' frequencies, at least [1]: some half widths.
-    most_peaks : peaks that are searched, the highest first.
-    attached_Hz : lowest and highest frequency of a sprung mass [Hz], and number of those searched: from the lowest
-        resonance of a suspension to the end of the band of most records.
-    dampings : damping ratios at which a sprung mass, or one inside the mounts, is searched [1]: one narrow, one broad
+    peaks_apart : minimum logarithm of the ratio of two peaks' frequencies [1]: some half widths.
+    most_peaks : maximum number of peaks searched, the highest first.
+    attached_Hz : lowest and highest frequency of a sprung mass [Hz], and number of frequencies searched: from the
+        lowest resonance of a suspension to the end of the band of most records.
+    dampings : damping ratios searched for a sprung mass, or a mass inside the mounts [1]: a narrow and a broad
         resonance.
     peak_dampings : the same at the peaks of the residual [1], whose frequency is known better.
-    followed_places : places at which three frequencies are searched on a finer grid, the best first.
-    narrowest : least damping ratio for which the frequency grid of a sprung mass is made [1]; a smaller one would need
-        more frequencies than a search can afford.
+    followed_places : number of places at which three frequencies are searched on a finer grid, the best first.
+    narrowest : minimum damping ratio for the frequency grid of a sprung mass [1]; a smaller one would need more
+        frequencies than a search can afford.
     stiff_Hz : frequency of a sprung mass along an axis in which it shows no resonance [Hz]: above the band.
-    mode_Hz : lowest and highest frequency of a mode of the payload [Hz], and number of those searched.
-    modes_apart : logarithm of the ratio of two modes' frequencies, at least [1]: some half widths.
-    smallest_shape : prior standard deviation, at least, of a mode shape where no channel shows it [1/sqrt(kg)].
+    mode_Hz : lowest and highest frequency of a mode of the payload [Hz], and number of frequencies searched.
+    modes_apart : minimum logarithm of the ratio of two modes' frequencies [1]: some half widths.
+    smallest_shape : minimum prior standard deviation of a mode shape where no channel shows it [1/sqrt(kg)].
     """
 
     places_m: tuple[tuple[float, float, int], ...] = ((-0.6, 0.6, 7), (-0.5, 0.5, 6), (-0.3, 0.4, 4))
@@ -70,11 +70,11 @@ SETTINGS = StartSettings()
 
 @dataclass(frozen=True)
 class Seed:
-    """Where a refit may begin: values of all parameters, and by how much chi2 falls there to first order.
+    """Starting point of a fit: values of all parameters, and the reduction of chi2 there to first order.
 
-    directions : along how many the data could have made it fall. looks : at how many frequencies, or other values of
-    what shapes the effect, the best was sought. seen : the fall by which its significance is judged, where that is not
-    chi2 (on fewer data).
+    directions : number of directions along which the data could have reduced it. looks : number of frequencies, or
+        other shape values, among which the best was selected. seen : the reduction for the test of significance, if it
+        is not chi2 (from fewer data).
     """
 
     values: tuple[float, ...]
@@ -85,33 +85,34 @@ class Seed:
 
     @property
     def p_value(self) -> float:
-        """Probability of as large a fall by noise alone."""
+        """Probability of as large a reduction by noise alone."""
         fall = self.chi2 if self.seen is None else self.seen
         return min(1.0, self.looks * float(stats.chi2.sf(fall, self.directions)))
 
 
 @runtime_checkable
 class FindsItsStart(Protocol):
-    """An effect that searches its starting values by a method of its own."""
+    """An effect with its own search for starting values."""
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Where refits may begin, the most promising first."""
+        """Starting points of fits, the most promising first."""
 
 
 @runtime_checkable
 class HasRicherLaws(Protocol):
-    """An effect with laws that begin best where a simpler one was fitted: a second mode, a mass along three axes; or
-    with other local minima near the one that was found."""
+    """An effect with richer laws that start best from the fit of a simpler one (a second mode, a mass along three
+    axes), or with other local minima near the one that was found."""
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """Places (with their law) and values where a fit with a richer law may begin; score : of the fit with `one`."""
+        """Places (with their law) and values from which a fit with a richer law may start; score : of the fit with
+        `one`."""
 
 
 def seeds(effect: Effect, score: Score, place: str) -> list[Seed]:
-    """Where refits of an effect may begin, the most promising first.
+    """Starting points of fits of an effect, the most promising first.
 
-    By default the score test at every point of `Effect.starts`; the linear parameters are as large as it says, within
-    what physics allows.
+    By default, the score test is computed at every point of `Effect.starts`; it gives the linear parameters, limited to
+    their physical bounds.
     """
     if isinstance(effect, FindsItsStart):
         return effect.seeds(score, place)
@@ -122,7 +123,7 @@ def seeds(effect: Effect, score: Score, place: str) -> list[Seed]:
         begun = ActiveEffect(effect, place, parameters, tuple(float(v) for v in point))
         A = score.of_effect(begun)
         if not linear:
-            # It acts at full strength or not at all.
+            # The effect acts at full strength or not at all.
             fall = float(2 * A[0] @ score.e - A[0] @ A[0])
             if fall > 0:
                 found.append(Seed(begun.values, fall, len(parameters), len(starts)))

@@ -1,11 +1,12 @@
-"""Effects on the table's motion as state-space systems beside the rig, in any of its coordinates.
+"""Effects on the table's motion as state-space systems added to the rig, in any of its coordinates.
 
     (r, v, v_c, u)  ->  (f, d)
 
-r displacement of the payload against the chassis, v and v_c velocities of payload and chassis in the kept coordinates
-(rotations as displacements of the edge), u the volts that act; f the force that the effect adds, d what it adds to the
-velocity along each sensor. All parts are passive impedances or poles and zeros of the effects' own formulas
-(`gap.effects`), but for the loss that is independent of frequency, which is fitted by a ladder of Maxwell branches.
+r is the displacement of the payload relative to the chassis, v and v_c are the velocities of payload and chassis in the
+kept coordinates (rotations as displacements of the edge), and u the acting volts; f is the force that the effect adds,
+d its contribution to the velocity along each sensor. All parts are passive impedances or poles and zeros of the
+effects' own formulas (`gap.effects`), except the loss independent of frequency, which is approximated by a ladder of
+Maxwell branches.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from avis_ctrl.rigs.rigid_body import COORDINATES, point_map
 
 @dataclass(frozen=True)
 class RealisationSettings:
-    """Of effects as state-space systems.
+    """Settings of effects as state-space systems.
 
-    ladder_Hz : band in which the ladder of Maxwell branches follows the power of s [Hz], wider than that of a
+    ladder_Hz : band in which the ladder of Maxwell branches approximates the power of s [Hz], wider than that of a
         controller.
-    ladder_error : its largest relative error there [1]: small beside what is known of any loss factor.
-    check_Hz : lowest and highest frequency [Hz], and number of those at which a realisation is compared with the
+    ladder_error : its largest relative error there [1]: small compared with the uncertainty of any loss factor.
+    check_Hz : lowest and highest frequency [Hz], and number of frequencies at which a realisation is compared with the
         model's response.
     """
 
@@ -52,11 +53,11 @@ SETTINGS = RealisationSettings()
 
 
 class ReducedTable:
-    """What an addition needs to know of a model in its kept coordinates.
+    """The quantities of a model that an addition needs, in its kept coordinates.
 
-    model : with its effects. keep : coordinates that move. when : -0.5 .. 0.5 through the campaign.
+    model : with its effects. keep : coordinates that move. when : time, -0.5 .. 0.5 through the campaign.
     G (n_g, n) deflection of every mount; inertia (n, n) mass matrix; r, v, v_c, u : columns of the inputs of an
-    addition; shape : its outputs and inputs.
+    addition; shape : numbers of its outputs and inputs.
     """
 
     def __init__(self, model: TableModel, keep: tuple[str, ...], when: float = 0.0):
@@ -69,7 +70,7 @@ class ReducedTable:
         self.G, self.inertia = self.rows(self.mounts.payload), self.rows(self.rows(self.matrices.M).T)
 
     def rows(self, of_q: np.ndarray) -> np.ndarray:
-        """(m, n) rows by kept coordinates, rotations as displacements of the edge [m], from rows (m, 6) by q."""
+        """(m, n) rows in the kept coordinates, rotations as displacements of the edge [m], from rows (m, 6) in q."""
         scale = [1 / self.model.rig.edge_m if name.startswith("phi") else 1.0 for name in self.keep]
         return np.atleast_2d(of_q)[:, [COORDINATES.index(name) for name in self.keep]] * scale
 
@@ -78,9 +79,9 @@ Addition = Callable[[ReducedTable, str, Values], StateSpace]
 
 
 def addition(table: ReducedTable, one: ActiveEffect) -> StateSpace | None:
-    """An effect's part of the motion; None where it has none (it acts on rig parameters, sensors or drives).
+    """An effect's contribution to the motion; None if it has none (it acts on rig parameters, sensors or drives).
 
-    An effect of the user's own gives it as a method `addition(table, place, values)`.
+    A user-defined effect provides it as a method `addition(table, place, values)`.
     """
     made: Addition | None = _MADE.get(one.effect.name) or getattr(one.effect, "addition", None)
     return None if made is None else made(table, one.place, one.by_name)
@@ -91,7 +92,8 @@ def has_addition(one: ActiveEffect) -> bool:
 
 
 def impedance(table: ReducedTable, K: np.ndarray, h: StateSpace, of: str = "r") -> StateSpace:
-    """Force -K h(s) by displacement ("r") or absolute velocity ("v"), K (n, n) symmetric; states as few as its rank."""
+    """Force -K h(s) times displacement ("r") or absolute velocity ("v"), K (n, n) symmetric; the rank of K sets the
+    number of states."""
     sizes, V = np.linalg.eigh(K)
     felt = np.abs(sizes) > 1e-12 * max(np.abs(sizes).max(), 1e-300)
     V, sizes = V[:, felt], sizes[felt]
@@ -120,7 +122,7 @@ def _relaxation(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 
 def _structural(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """The causal law, for the complex constant too: no causal system has that."""
+    """The causal law, also in place of the constant complex stiffness, which no causal system has."""
     G, k = table.G, table.mounts.stiffness
     rest, corners, ratios = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
     # rest - 1 + sum of ratio s/(s + w) = rest - 1 + sum(ratio) - sum of ratio w/(s + w)
@@ -132,8 +134,8 @@ def _structural(table: ReducedTable, place: str, values: Values) -> StateSpace:
 def ladder(power: float) -> tuple[float, np.ndarray, np.ndarray]:
     """(s/w_ref)^power as rest + sum of ratio s/(s + w), all ratios positive: (rest, w (n,), ratio (n,)).
 
-    As few branches, evenly spaced in log w within and beyond the band, as keep the error below `ladder_error` in
-    `ladder_Hz`. Positive ratios make it passive.
+    The smallest number of branches, evenly spaced in log w within and beyond the band, that keeps the error below
+    `ladder_error` in `ladder_Hz`. Positive ratios make it passive.
     """
     f = np.geomspace(*SETTINGS.ladder_Hz, 200)
     s = 2j * np.pi * f
@@ -151,10 +153,10 @@ def ladder(power: float) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _surge(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """A mass in every vertical mount: r_m = its displacement against the chassis, v_m its velocity.
+    """A mass in every vertical mount: r_m its displacement relative to the chassis, v_m its velocity.
 
-    r_m' = v_m - v_c,  m v_m' = a k (r - r_m) + a c (v - v_m) - b k r_m - b c (v_m - v_c), and beside the mount itself
-    f = -(a - 1) k r + a k r_m - a c (v - v_m), with the springs' own c and 1/a + 1/b = 1.
+    r_m' = v_m - v_c,  m v_m' = a k (r - r_m) + a c (v - v_m) - b k r_m - b c (v_m - v_c), and in addition to the mount
+    itself f = -(a - 1) k r + a k r_m - a c (v - v_m), with c of the springs and 1/a + 1/b = 1.
     """
     up = table.mounts.along("z")
     G, stiffness = table.G[up], table.mounts.stiffness[up]
@@ -177,7 +179,7 @@ def _surge(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 
 def _leveling(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """Payload against chassis, as the valves feel it."""
+    """Payload relative to chassis, as measured by the valves."""
     own = np.flatnonzero(table.mounts.along("z"))[:LIBRARY.leveled]
     G, k = table.G[own], table.mounts.stiffness[own] * shares(values)
     poles, size = [0.0], 2 * np.pi * values["rate_Hz"]
@@ -188,7 +190,7 @@ def _leveling(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 
 def _friction(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """Far below the slip: a spring at every motor."""
+    """Motion far below the slip: a spring at every motor."""
     at_actuators, _ = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
     G = at_actuators @ table.G
     return _static(table, G.T @ (contacts(values)[:, None] * G))
@@ -200,7 +202,7 @@ def _drift(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 
 def drift_at(model: TableModel, values: Values, when: float) -> float:
-    """Change of stiffness over that of the model's rig at a moment -0.5 .. 0.5 of the campaign, by a drift's law."""
+    """Change of stiffness over that of the model's rig at a time -0.5 .. 0.5 of the campaign, by a drift's law."""
     begin, end = campaign_clock(model)
     through = float(drifted(np.array(when + 0.5), values.get("time_constant_s", 0.0) / (end - begin)))
     return values["relative_change"] * drift_over_stiffness(model) * through
@@ -213,7 +215,7 @@ def _cable(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 
 def _oscillator(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity of its place, along each of its directions."""
+    """m s (2 z w s + w^2)/(s^2 + 2 z w s + w^2) on the velocity at its place, along each of its directions."""
     total, zeta = gain(np.zeros(table.shape)), values["damping"]
     for row, mass, frequency in elements(place, values):
         w, g = 2 * np.pi * frequency, table.rows(row)
@@ -224,7 +226,8 @@ def _oscillator(table: ReducedTable, place: str, values: Values) -> StateSpace:
 
 
 def _flexible(table: ReducedTable, place: str, values: Values) -> StateSpace:
-    """Coordinates e of the modes and their velocities; the mounts and motors push them, and they deflect the mounts."""
+    """The states are coordinates e of the modes and their velocities; mounts and motors excite the modes, which deflect
+    the mounts."""
     own = [mode for mode in modes(values) if np.any(mode[2])]
     if not own:
         return gain(np.zeros(table.shape))
@@ -251,14 +254,14 @@ _MADE: dict[str, Addition] = {
 
 def chassis(table: ReducedTable, values: Values, floor: list[str], accelerations: list[str],
             moves: list[str]) -> StateSpace:
-    """Velocity of a chassis on a soft base, from that of the floor and the acceleration of the payload.
+    """Velocity of a chassis on a soft base, from the velocity of the floor and the acceleration of the payload.
 
-    M_c v_c' = -K_b x - C_b (v_c - v_f) - M a,  x' = v_c - v_f, with M the payload's: of the coordinates that are kept
-    and in which the chassis moves. In the others it goes with the floor.
+    M_c v_c' = -K_b x - C_b (v_c - v_f) - M a,  x' = v_c - v_f, with M the payload's mass matrix, in the kept
+    coordinates in which the chassis moves. In the others it moves with the floor.
 
     Raises
     ------
-    InputError : nothing to stand on.
+    InputError : a chassis without mass.
     """
     if values["mass_kg"] <= 0:
         raise InputError("expected a chassis with a mass", field="base_compliance.mass_kg", value=values["mass_kg"])

@@ -1,4 +1,4 @@
-"""A rig with effects added: the model that `gap` fits, with the interface of `identification.ResponseModel`."""
+"""A rig with effects: the model that `gap` fits, with the interface of `identification.ResponseModel`."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """Of a model's derivatives and of its sensors' transients.
+    """Settings of a model's derivatives and of its sensors' transients.
 
-    step : step of differences by an effect's parameters, in units of their size [1].
-    probed_Hz : lowest and highest frequency [Hz], and number of those at which the chains of sensors are compared with
+    step : step of finite differences in an effect's parameters, in units of their size [1].
+    probed_Hz : lowest and highest frequency [Hz], and number of frequencies at which sensor chains are compared with
         the rig's.
-    unchanged : a sensor's chain is another one where its ratio to the rig's varies over these by more than this
-        [1]: round-off.
+    unchanged : maximum variation over these frequencies of the ratio of a sensor's chain to the rig's, for the chain to
+        count as the same [1]: round-off.
     """
 
     step: float = 1e-4
@@ -62,7 +62,7 @@ class ActiveEffect:
 
     @property
     def absent(self) -> dict[str, float]:
-        """Values of its linear parameters, by their names in a model, at which it does not act."""
+        """Values of its linear parameters at which it does not act, by their names in a model."""
         return {name: p.none for name, p in zip(self.names, self.parameters, strict=True) if p.linear}
 
     def at(self, values: Sequence[float]) -> ActiveEffect:
@@ -70,7 +70,7 @@ class ActiveEffect:
 
 
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
-    """An effect at a place of a model, without strength where no values are given."""
+    """An effect at a place of a model; at zero strength if no values are given."""
     parameters = effect.parameters(model, place)
     values = effect.starts(model, place)[0].tolist() if values is None else list(values)
     if len(values) != len(parameters):
@@ -83,11 +83,11 @@ class TableModel:
     """`ResponseModel` with effects.
 
     base : the rig and its free parameters. effects : added, all their parameters free.
-    motion : records in time by name, which effects that depend on amplitude or time need.
-    nominal : the rig as its file has it, which sizes the steps of a fit: a parameter that a wrong model has driven to
-        nothing must find its way back. None for the base itself.
+    motion : records in time by name, required by effects that depend on amplitude or time.
+    nominal : the rig as in its file, which sets the step sizes of a fit: a parameter that a wrong model has driven to
+        zero must be able to recover. None for the base itself.
     corners_differ : no filter cancels a geophone's suspension exactly (`sensor_transients`).
-    held : labels of effects whose parameters are not free.
+    held : labels of effects whose parameters are fixed.
     """
 
     base: ResponseModel
@@ -97,7 +97,7 @@ class TableModel:
     corners_differ: bool = False
     held: frozenset[str] = frozenset()
 
-    # What a fit and its blocks ask of a model.
+    # Interface used by a fit and its blocks.
     @property
     def rig(self) -> Rig:
         return self.base.rig
@@ -157,20 +157,20 @@ class TableModel:
         return np.concatenate([(self.nominal or self.base).scales(), own])
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_p,) relative units by which a parameter may go down or up in one step of a fit: half of itself, and one of
-        an effect at least half of its size, up to twice its value."""
+        """(n_p,) maximum decrease and increase of each parameter in one step of a fit, in relative units: half of its
+        value; for an effect at least half of its size, and upwards up to its full value."""
         known, sizes = self.base.reach()[0], np.array([self.effects[k].parameters[j].size for k, j in self._free])
         own = np.abs([self.effects[k].values[j] for k, j in self._free]) / sizes
         return (np.concatenate([known, np.maximum(0.5, 0.5 * own)]), np.concatenate([known, np.maximum(0.5, own)]))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_p,) lowest and highest values that physics allows."""
+        """(n_p,) lowest and highest physically possible values."""
         low, high = (self.nominal or self.base).bounds()
         own = [self.effects[k].parameters[j] for k, j in self._free]
         return np.concatenate([low, [one.low for one in own]]), np.concatenate([high, [one.high for one in own]])
 
     def at(self, theta: Sequence[float] | np.ndarray) -> TableModel:
-        """The model with its free parameters at theta. Raises InputError where no rig has them."""
+        """The model with its free parameters set to theta. Raises InputError for impossible values."""
         theta = np.asarray(theta, float)
         n = len(self.base.names)
         values = [list(one.values) for one in self.effects]
@@ -180,18 +180,18 @@ class TableModel:
         return replace(self, base=self.base.at(theta[:n]), effects=moved)
 
     def _with_effect_parameter(self, index: int, value: float) -> TableModel:
-        """One free parameter of an effect elsewhere; the rig as it is."""
+        """The model with another value of one free parameter of an effect; the rig is unchanged."""
         k, j = self._free[index]
         values = list(self.effects[k].values)
         values[j] = value
         return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
 
     def with_effect(self, effect: ActiveEffect) -> TableModel:
-        """The model with one effect more, the last."""
+        """The model with one more effect, which comes last."""
         return replace(self, effects=(*self.effects, effect))
 
     def only(self, effect: ActiveEffect) -> TableModel:
-        """The model with one effect more, whose parameters alone are free."""
+        """The model with one more effect; only the parameters of this effect are free."""
         return replace(self, base=replace(self.base, names=()), nominal=replace(self.nominal or self.base, names=()),
                        effects=(*self.effects, effect), held=frozenset(one.label for one in self.effects))
 
@@ -203,7 +203,7 @@ class TableModel:
 
     @cached_property
     def effective(self) -> ResponseModel:
-        """The base with what effects set of the rig's parameters."""
+        """The base with the rig parameters that effects set."""
         changes: dict[str, float] = {}
         for one in self.effects:
             changes |= one.effect.rig_changes(self, one.place, one.by_name)
@@ -215,13 +215,14 @@ class TableModel:
 
     @cached_property
     def derivative_matrices(self) -> Matrices:
-        """Of the rig's free parameters; zero for stiffness and damping of mounts, which effects may change."""
+        """Derivatives with respect to the rig's free parameters; zero for stiffness and damping of mounts, which
+        effects may change."""
         others = np.array([not MOUNT.fullmatch(name) for name in self.base.names], bool)
         return Matrices(*(slopes * others[:, None, None] for slopes in self.effective.derivative_matrices))
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the effects, but for the second-order terms."""
+        """Labels of the effects except the second-order terms."""
         return tuple(one.label for one in self.effects if not isinstance(one.effect, LargeMotion))
 
     @property
@@ -241,21 +242,22 @@ class TableModel:
 
     @kept_lines
     def assembled(self, omega: np.ndarray) -> Assembled:
-        """On lines omega."""
+        """The assembled table on lines omega."""
         return Assembled(self.operators(omega))
 
     def response(self, omega: np.ndarray) -> np.ndarray:
-        """G, (n, n_y, n_u + 3), as `ResponseModel.response`; effects that depend on amplitude left out."""
+        """G, (n, n_y, n_u + 3), as `ResponseModel.response`, without effects that depend on amplitude or time."""
         n, n_in = len(omega), len(self.inputs)
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), False).Y
 
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
         """As `ResponseModel.sensor_transients`, with the states that effects add to a sensor's chain.
 
-        Where they make r(s) times what the chain was, r a ratio of polynomials, r and s r are the transients of the
-        poles of r beside a constant and a slope, and r^2 and s r^2 what a small change of these poles makes of it: a
-        fit's gradient need not know of them then. Where the corners of geophones have tolerances, no filter cancels a
-        suspension exactly, and each rings, whatever the effects: 1/p and s/p, p its polynomial, take their place.
+        If effects multiply the chain by r(s), a ratio of polynomials, the transients of the poles of r are r and s r,
+        together with a constant and a slope. r^2 and s r^2 represent a small change of these poles, so that a fit's
+        gradient need not include it. If the corners of geophones have tolerances, no filter cancels a suspension
+        exactly and each suspension rings, with or without effects: 1/p and s/p, with p its polynomial, are then used
+        instead.
         """
         own, s = self.base.chains_ring(omega), 1j * omega
         if self.corners_differ:
@@ -272,7 +274,8 @@ class TableModel:
 
     @cached_property
     def _changed_sensors(self) -> np.ndarray:
-        """Indices of the sensors whose chain effects change by more than a factor, whatever lines are asked for."""
+        """Indices of the sensors whose chain effects change by more than a constant factor, independent of the
+        requested lines."""
         r = self._chain_ratio(2 * np.pi * np.geomspace(*SETTINGS.probed_Hz))
         level = np.mean(r, axis=0)
         return np.flatnonzero(np.max(np.abs(r - level), axis=0) > SETTINGS.unchanged * np.abs(level))
@@ -282,9 +285,9 @@ class TableModel:
         return self.assembled(omega).ops.sense / Operators(self.effective, omega).sense
 
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, n_t): y by unit initial states of what effects hold inside: modes, masses in mounts, a chassis.
+        """(n, n_y, n_t): y per unit initial internal state of effects: modes, masses in mounts, a chassis.
 
-        Of a lightly damped one much of what it holds at the ends of a record stays to be seen.
+        If such a state is lightly damped, much of its value at the ends of a record remains visible.
         """
         n_y = len(self.sensors.names)
         if not any(one.effect.holds_states for one in self.effects):
@@ -293,13 +296,14 @@ class TableModel:
         return made.left @ made.forces_of_states
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
-        """As `ResponseModel.driven`: y by spectra of the inputs, and its derivative by the free parameters."""
+        """As `ResponseModel.driven`: y from spectra of the inputs, and its derivative with respect to the free
+        parameters."""
         return self._driven(np.asarray(omega, float), U, None, derivative)
 
     def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
                inner: np.ndarray | None = None) -> Driven:
-        """As `ResponseModel.answer`: of a record, with what depends on its motion in time; inner (n_t,): what the
-        states of `inner_transients` start with."""
+        """As `ResponseModel.answer`: response of a record, including effects that depend on its motion in time; inner
+        (n_t,): initial values of the states of `inner_transients`."""
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
         return self._driven(block.omega, U, block if self.nonlinear else None, derivative, inner)
 
@@ -314,7 +318,7 @@ class TableModel:
         return Driven(response.Y, dY)
 
     def acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
-        """Inputs with the volts that act, and what effects that depend on the record add."""
+        """Inputs with the acting volts, and the contributions of effects that depend on the record."""
         if block is None:
             return Acting(U, inner=inner)
         record = self.motion.get(block.name)
@@ -329,8 +333,9 @@ class TableModel:
         return Acting(U, force, reading, output, inner)
 
     def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
-        """Central differences by the effects' parameters: of what an effect adds to a record, which the response is
-        linear in; of the whole response where it changes the table."""
+        """Central differences with respect to the effects' parameters. For an effect that depends on the record they
+        are taken of its contribution, in which the response is linear; for an effect that changes the table, of the
+        whole response."""
         n = len(self.base.names)
         for row, (effect, others, width, tables) in enumerate(self._beside(omega), n):
             if effect.nonlinear:
@@ -351,13 +356,13 @@ class TableModel:
 
     @partial(kept_lines, most=1)
     def _beside(self, omega: np.ndarray) -> list[tuple[Effect, list[ActiveEffect], float, list[Assembled]]]:
-        """For every free parameter of the effects: its effect, that effect on either side, the step between the two,
-        and the table there, not inverted, of one that changes the table."""
+        """For every free parameter of the effects: its effect, the effect with the parameter stepped up and down, the
+        difference between the two values, and, if the effect changes the table, the two tables (not inverted)."""
         n, theta, (low, high), found = len(self.base.names), self.values, self.bounds(), []
         scale = self.scales()
         for row in range(n, len(theta)):
             step = SETTINGS.step * scale[row]
-            # A bound that goes with the payload's mass may have moved past the value.
+            # A bound that depends on the payload's mass may have moved past the value.
             lowest, highest = min(low[row], theta[row]), max(high[row], theta[row])
             ends = [min(max(theta[row] + sign * step, lowest), highest) for sign in (1, -1)]
             others, k = [self._with_effect_parameter(row - n, end) for end in ends], self._free[row - n][0]
@@ -368,8 +373,8 @@ class TableModel:
 
 
 def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
-    """Groups of the rig's free parameters that its equations determine as combinations only (two springs in one line):
-    a fit leaves how they share where it was, and their own standard deviations do not tell of that."""
+    """Groups of the rig's free parameters of which its equations determine only combinations (two collinear springs): a
+    fit keeps their initial ratio, and their standard deviations do not show this."""
     base = model.effective
     if not base.names:
         return ()
@@ -378,7 +383,7 @@ def inseparable_parameters(model: TableModel) -> tuple[tuple[str, ...], ...]:
 
 
 def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> Added:
-    """What an effect adds to a record on its lines, (n, channels, 1) each; of readings the displacement."""
+    """Contribution of an effect to a record on its lines, (n, channels, 1) each; readings as displacement."""
     if not one.effect.nonlinear:
         return Added()
     found = one.effect.spectra(record, one.place, one.by_name, omega)

@@ -1,4 +1,4 @@
-"""Response of an assembled table to what acts on it, and its derivative by the rig's parameters."""
+"""Response of an assembled table to its inputs, and the derivative with respect to the rig's parameters."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.identification.response import N_Q, Matrices, Operands, ResponseModel
 
-# Names of the rig's stiffnesses and dampings of mounts.
+# Parameter names of mount stiffnesses and dampings.
 MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
 
 
 @dataclass(frozen=True, eq=False)
 class Acting:
-    """What acts on the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
-    sensors read beside the payload's own, what their outputs hold in addition (n, n_y, m), and what the states inside
-    start with (`TableModel.inner_transients`)."""
+    """Inputs of the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
+    sensors read in addition to the payload's, additional sensor output (n, n_y, m), and initial internal states
+    (`TableModel.inner_transients`)."""
 
     U: np.ndarray
     force: np.ndarray | None = None
@@ -29,7 +29,7 @@ class Acting:
 
 
 class DrivenTable:
-    """Forces (n, n_q, m) on an assembled table, and what it reads of a motion."""
+    """Forces (n, n_q, m) on an assembled table, and its sensor outputs for a given motion."""
 
     def __init__(self, made: Assembled, acting: Acting):
         self.made, self.acting, self.gain = made, acting, made.gain
@@ -52,7 +52,7 @@ class DrivenTable:
         self.total = total
 
     def read(self, x: np.ndarray) -> np.ndarray:
-        """(n, n_y, m) of a motion x; aliases pass the chain far above its corners."""
+        """(n, n_y, m) sensor outputs for a motion x; aliases pass the chain far above its corners."""
         mat = self.made.ops.base.matrices
         moved = self.made.rows @ x
         if np.any(against := self.made.ops.base.sensors.relative):
@@ -67,7 +67,7 @@ class DrivenTable:
 
 
 class AtMotion(DrivenTable):
-    """Y that an assembled table would read of a motion x, and the force that is missing for that motion."""
+    """Sensor outputs Y of an assembled table for a given motion x, and the applied minus the required force (push)."""
 
     def __init__(self, made: Assembled, acting: Acting, x: np.ndarray):
         super().__init__(made, acting)
@@ -84,12 +84,12 @@ class TableResponse(DrivenTable):
 
     @property
     def left(self) -> np.ndarray:
-        """(n, n_y, n_q) y by a force on the coordinates."""
+        """(n, n_y, n_q) y per force on the coordinates."""
         return self.made.left
 
     def by_rig(self, model: ResponseModel, d: Matrices, more: int) -> np.ndarray:
-        """(n_p + more, n, n_y, m) by the rig's free parameters, and zeros; d of all of them, zero for stiffness and
-        damping of mounts."""
+        """(n_p + more, n, n_y, m) derivative with respect to the rig's free parameters, followed by zeros; d :
+        derivatives of the matrices, zero for stiffness and damping of mounts."""
         if "loop_delay_s" in model.names:
             raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
                              value="loop_delay_s")

@@ -1,10 +1,10 @@
-"""Forces that depend on the motion that they make: d = d_0 + h * f(d), solved from sample to sample.
+"""Forces that depend on the motion that they cause: d = d_0 + h * f(d), solved from sample to sample.
 
-d_0 is the deflection without the forces, h the response of the linear part to a force that runs straight between
-samples. A fixed point over a whole record diverges wherever f is not small beside a lightly damped mount. Here time is
-cut into windows so short that within one the fixed point contracts, whatever f; what earlier windows leave for later
-ones is added in blocks that double in length (fast convolution of a sequence that is only known up to now: Hairer,
-Lubich and Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
+d_0 is the deflection without the forces, h the response of the linear part to a force that is linear between samples. A
+fixed-point iteration over a whole record diverges unless f is small compared with the force of a lightly damped mount.
+Here time is divided into windows short enough for the iteration to contract for any f. The effect of earlier windows on
+later ones is added in blocks that double in length (fast convolution of a sequence that is only known up to now:
+Hairer, Lubich and Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from avis_ctrl.identification.response import N_Q
 
 @dataclass(frozen=True)
 class MarchSettings:
-    """Of marching through windows of time.
+    """Settings of the solution in windows of time.
 
     window_s : length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
-    tolerance : a window is done when its deflection changes by less than this fraction of the largest one so far
+    tolerance : a window has converged when its deflection changes by less than this fraction of the largest one so far
         [1].
-    most_iterations : fixed-point iterations in a window before it is cut into more pieces.
-    pieces : into so many pieces a window is cut where it does not contract; 2^20 for single samples.
+    most_iterations : maximum fixed-point iterations in a window before it is divided into more pieces.
+    pieces : numbers of pieces of a window, tried in this order until the iteration contracts; 2^20 for single samples.
     """
 
     window_s: float = 0.05
@@ -45,11 +45,11 @@ SETTINGS = MarchSettings()
 
 
 class ForceResponse:
-    """Motion z (c,) by a force (6,) at the samples; z holds x, and the chassis where it recoils.
+    """Motion z (c,) per force (6,) at the samples; z contains x, and the chassis if it recoils.
 
-    shape : (n_g, c) deflection by z.
-    The force is a straight line between samples: sinc^2 of the continuous response, and what sampling folds, known in
-    closed form for the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in the place of 1/s^2.
+    shape : (n_g, c) deflection per z.
+    The force is linear between samples: sinc^2 times the continuous response, plus aliases, known in closed form for
+    the mass alone: T^2/6 (z + 4 + 1/z)/(z - 2 + 1/z) in place of 1/s^2.
     """
 
     def __init__(self, response: LineResponse):
@@ -74,43 +74,43 @@ class ForceResponse:
             length *= 2
 
     def whole(self, force: np.ndarray) -> np.ndarray:
-        """(n, c) spectrum of the motion by a force (samples, 6)."""
+        """(n, c) spectrum of the motion due to a force (samples, 6)."""
         return (self.by_force @ self.response.spectrum(force)[:, :, None])[:, :, 0]
 
     def after(self, force: np.ndarray, level: int) -> np.ndarray:
-        """(B, c) what a force over B = window 2^level samples leaves in the B samples after it."""
+        """(B, c) motion in the B samples after a force that lasts B = window 2^level samples."""
         B = self.window << level
         spectrum = scipy.fft.rfft(force, 2 * B, axis=0)
         return scipy.fft.irfft((self.levels[level] @ spectrum[:, :, None])[:, :, 0], 2 * B, axis=0)[B:]
 
     def within(self, force: np.ndarray, length: int) -> np.ndarray:
-        """(length, c) of a force at the first samples of a window, in it."""
+        """(length, c) motion within a window due to a force at its first samples."""
         spectrum = scipy.fft.rfft(force, 2 * self.window, axis=0)
         return scipy.fft.irfft((self.own @ spectrum[:, :, None])[:, :, 0], 2 * self.window, axis=0)[:length]
 
 
 def _by_force(table: Assembled, recoils: bool) -> np.ndarray:
-    """(n, c, 6) motion by a force on the payload: of the table, and of a chassis towards it."""
+    """(n, c, 6) motion per force on the payload: of the table and, with opposite sign, of a chassis that recoils."""
     x = table.inverse[:, :, :N_Q]
     return np.concatenate([x, -table.chassis(x, np.zeros((len(x), 3, N_Q)))], axis=1) if recoils else x
 
 
 def _folded(theta: np.ndarray) -> np.ndarray:
-    """(n,) sampled double integrator behind a straight-line hold less its continuous term, over T^2."""
+    """(n,) sampled double integrator with a linear hold minus its continuous term, over T^2."""
     safe = np.maximum(theta, 0.1)
     exact = -(4 + 2 * np.cos(safe)) / (12 * (1 - np.cos(safe))) + np.sinc(safe / (2 * np.pi)) ** 2 / safe ** 2
     return np.where(theta < 0.1, -theta ** 2 / 720, exact)
 
 
 class WindowForce:
-    """Force of an effect, window after window: of those samples alone, or with all that came before."""
+    """Force of an effect, window by window: from the samples of the window alone, or from all samples so far."""
 
     def __init__(self, one: ActiveEffect, record: RecordMotion):
         self.one, self.record = one, record
         self.local = self._is_local()
 
     def _is_local(self) -> bool:
-        """Whether the force at a sample depends on that sample alone: tried out on half a record."""
+        """Whether the force at a sample depends on that sample alone; tested on half a record."""
         whole = self._of(0, len(self.record.volts))
         half = len(whole) // 2
         return bool(np.allclose(whole[half:], self._of(half, len(whole)), 1e-9, 1e-12 * np.max(np.abs(whole))))
@@ -123,15 +123,15 @@ class WindowForce:
         return np.zeros((stop - start, N_Q)) if force is None else force
 
     def __call__(self, start: int, stop: int) -> np.ndarray:
-        """(stop - start, 6) by the deflection that the record holds now."""
+        """(stop - start, 6) force for the current deflection of the record."""
         return self._of(start, stop) if self.local else self._of(0, stop)[start:]
 
     def accept(self, start: int, stop: int) -> None:
-        """The deflection up to stop is final."""
+        """Accept the deflection up to stop as final."""
 
 
 class FrictionForce(WindowForce):
-    """Friction of contacts, their state kept from window to window."""
+    """Friction of contacts; their state is carried from window to window."""
 
     def __init__(self, one: ActiveEffect, record: RecordMotion):
         super().__init__(one, record)
@@ -149,12 +149,12 @@ class FrictionForce(WindowForce):
 
 def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
           beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """z (samples, c) of z = free + h * f(z) from rest, and the force (samples, 6) that it makes.
+    """Solve z = free + h * f(z) from rest: z (samples, c), and the force (samples, 6) that it causes.
 
     Parameters
     ----------
     free : (samples, c) motion without the forces of the effects. record : its deflection is overwritten.
-    beyond : (samples, n_g) deflection that no z has.
+    beyond : (samples, n_g) deflection that no z represents.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
     total, largest = np.zeros((samples, N_Q)), float(np.max(np.abs(record.deflection), initial=0.0))
 
     def forced(start: int, here: slice) -> np.ndarray:
-        """(samples, 6) of all effects; the state of one that is not local is that of the window's start."""
+        """(samples, 6) force of all effects; an effect with memory starts from its state at the start of the window."""
         found = np.zeros((here.stop - here.start, N_Q))
         for force in forces:
             found += (force(here.start, here.stop) if force.local else
@@ -173,7 +173,7 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
         return found
 
     def solved(start: int, stop: int, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """z and the force on it in a window, piece after piece; None where the fixed point does not contract."""
+        """z and its force in a window, piece by piece; None if the iteration does not contract."""
         push, moved = np.zeros((stop - start, N_Q)), z[start:stop]
         for a in range(0, stop - start, piece):
             b = min(a + piece, stop - start)

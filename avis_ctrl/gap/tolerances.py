@@ -1,4 +1,4 @@
-"""Effects within and beyond the tolerances of what the rig file states, and their priors."""
+"""Effects within and beyond the tolerances of values in the rig file, and their priors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.priors import Priors, Tolerance, re_identified
 from avis_ctrl.rigs.instruments import Tolerances
 
-# Effects that are one value of the rig file gone beyond its tolerance: the tolerance of each of their parameters, in
-# its unit (of a geophone's corner and damping ratio relative to them), and how the names of these tolerances begin.
+# Effects that represent one value of the rig file beyond its tolerance: the tolerance of each of their parameters, in
+# its unit (relative for a geophone's corner and damping ratio), and the prefixes of the names of these tolerances.
 BEYOND: Mapping[str, tuple[Callable[[Tolerances], tuple[float, ...]], tuple[str, ...]]] = {
     "sensor_gain": (lambda t: (t.sensor_gain_percent / 100,), ("sensor.{place}",)),
     "actuator_gain": (lambda t: (t.actuator_gain_percent / 100,), ("actuator.{place}",)),
@@ -28,26 +28,27 @@ BEYOND: Mapping[str, tuple[Callable[[Tolerances], tuple[float, ...]], tuple[str,
 
 
 def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
-    """(n,) of the parameters of an effect of `BEYOND`, in their units."""
+    """(n,) tolerances of the parameters of an effect of `BEYOND`, in their units."""
     relative = np.array(BEYOND[effect.effect.name][0](tolerances))
     of = np.array([p.none for p in effect.parameters]) if effect.effect.name == "geophone_corner" else 1.0
     return relative * of
 
 
 def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
-    """Indices of the tolerances of the values that an effect of `BEYOND` takes further."""
+    """Indices of the tolerances of the values that an effect of `BEYOND` represents."""
     _, starts = BEYOND.get(effect.effect.name, (None, ()))
     own = tuple(start.format(place=effect.place, product=PRODUCTS.get(effect.place)) for start in starts)
     return [k for k, name in enumerate(names) if name.startswith(own) and "@" not in name]
 
 
 def held(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
-    """Priors beside an effect of `BEYOND`, whose value is the effect's alone: the tolerances behind it hardly move."""
+    """Priors with an effect of `BEYOND`: the effect alone represents the value, and the tolerances behind it are nearly
+    fixed."""
     return priors.scaled(tolerances_behind(effect, priors.names), settings.held)
 
 
 def released(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
-    """Priors without an effect of `BEYOND`: the inverse of `held`."""
+    """Priors after an effect of `BEYOND` is removed: the inverse of `held`."""
     return priors.scaled(tolerances_behind(effect, priors.names), 1 / settings.held)
 
 
@@ -58,11 +59,11 @@ def with_tolerance(fitted: Fitted) -> list[str]:
 
 
 def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
-    """Indices of the values of the rig file that the data determine, and how far these have moved, in tolerances: root
-    of the sum of z^2 over the sum of what the data take from their prior variance (D. MacKay, Neural Computation 4
-    (1992) 415-447), at most 1.
+    """Indices of the values of the rig file that the data determine, and their spread in tolerances.
 
-    A table may be built better than its tolerances say. A value of three tolerances is an outlier there.
+    The spread is the root of the sum of z^2 over the sum of the fractions by which the data reduce their prior variance
+    (D. MacKay, Neural Computation 4 (1992) 415-447), at most 1. A table may be built more accurately than its
+    tolerances state; a value that is off by three tolerances is then an outlier.
     """
     own = {k for one in fitted.model.effects for k in tolerances_behind(one, fitted.priors.names)}
     determined = 1 - np.diag(fitted.covariance)
@@ -75,8 +76,8 @@ def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
 
 
 def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings: GapSettings) -> tuple[Tolerance, ...]:
-    """How far values of the rig file have moved, the furthest first; those beyond their tolerance as their effects have
-    it."""
+    """Shifts of values of the rig file in tolerances, the largest first; for values beyond their tolerance as estimated
+    by their effects."""
     found = {one.parameter: one for one in fitted.moved(names)}
     for effect in fitted.model.effects:
         behind = [fitted.priors.names[k] for k in tolerances_behind(effect, fitted.priors.names)]
@@ -87,7 +88,7 @@ def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings
         std = np.sqrt(np.diag(fitted.covariance_of(effect.names))) / size
         none = np.array([p.none for p in effect.parameters])
         away = np.array(effect.values) - none
-        # The logarithm of a positive value is normal.
+        # The logarithm of a positive value has the normal prior.
         z = np.array([none[k] * np.log1p(away[k] / none[k]) if priors.positive[k] else away[k]
                       for k in range(len(behind))]) / size
         values, slopes = priors.values(z), priors.slopes(z)
@@ -97,7 +98,7 @@ def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings
 
 
 def within_tolerance(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings) -> bool:
-    """Whether a value that may be beyond its tolerance is not."""
+    """Whether an effect of `BEYOND` has a value that is not beyond its tolerance."""
     if effect.effect.name not in BEYOND:
         return False
     away = np.array([value - p.none for value, p in zip(effect.values, effect.parameters, strict=True)])
@@ -105,9 +106,9 @@ def within_tolerance(effect: ActiveEffect, tolerances: Tolerances, settings: Gap
 
 
 def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings = SETTINGS) -> Priors:
-    """Broad normal priors of an effect's parameters: some tolerances wide for what is beyond its tolerance, about none
-    for the strength of others, about where its fit begins for what shapes it. Those of the second-order terms are
-    narrow: they are known but for what turns with the payload."""
+    """Broad normal priors of an effect's parameters: several tolerances wide for a value beyond its tolerance, centred
+    on zero strength for other linear parameters, and on the starting value for shape parameters. Those of the
+    second-order terms are narrow: these are known except for the part that turns with the payload."""
     if isinstance(effect.effect, LargeMotion):
         sigma = np.array([settings.second_order_percent, *[settings.turning_percent] * 2]) / 100
         return Priors(effect.names, np.array(effect.values), sigma, np.zeros(3, bool))

@@ -1,4 +1,4 @@
-"""Every tuning value of the search for missing effects, by the part it belongs to."""
+"""All tuning values of the search for missing effects, by part."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from avis_ctrl.identification import campaign_fit
 
 
 def tuning_values() -> dict[str, dict[str, Any]]:
-    """By part and name, as the provenance of a result has them."""
+    """Tuning values by part and name, for the provenance of a result."""
     parts: dict[str, Any] = {
         "search": settings.SETTINGS, "starting values": starting_values.SETTINGS, "score test": score.SETTINGS,
         "library": base.SETTINGS, "table model": table_model.SETTINGS, "silent lines": campaign_spectra.SETTINGS,

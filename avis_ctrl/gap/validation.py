@@ -1,4 +1,4 @@
-"""What records that no fit has seen say: the stages of the gap, each effect's share, and what remains."""
+"""Contribution of each effect on held-out records, and its parameters from halves of the data."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from avis_ctrl.identification.weights import Group
 
 @dataclass(frozen=True, eq=False)
 class Power:
-    """What models leave of held-out records, mean over the sensors of power over that of y; of noise alone, and of the
-    baseline."""
+    """Residual power of models on held-out records over the power of y, mean over the sensors: of noise alone, and of
+    the baseline."""
 
     noise: float
     baseline: float
 
     @property
     def excess(self) -> float:
-        """Of the baseline over noise; never quite zero."""
+        """Power of the baseline in excess of the noise; always above zero."""
         return max(self.baseline - self.noise, 1e-3 * self.noise, 1e-12)
 
     def share(self, power: float) -> float:
-        """A power over the baseline's excess, from 0 to 1."""
+        """A power over the baseline's excess, limited to 0 .. 1."""
         return float(np.clip(power / self.excess, 0.0, 1.0))
 
 
 def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], power: Power, with_it: float) -> float:
-    """By how much the held-out residual power rises when an effect alone is taken out, nothing refitted, over the
-    baseline's excess. with_it : the power that the whole model leaves."""
+    """Increase of the held-out residual power when one effect is removed without a new fit, over the baseline's excess.
+    with_it : the residual power of the whole model."""
     return power.share(ModelResidual.of(model.without(label), blocks).nrmse ** 2 - with_it)
 
 
 @dataclass(frozen=True)
 class Half:
-    """An effect's parameters by half of the data.
+    """An effect's parameters from half of the data.
 
-    words : the half. chi2, dof : of the difference from the whole, and its degrees of freedom. change : the largest
-    relative change of a parameter that differs significantly by itself, or the relative change of the effect's part of
-    the response where that is smaller; 0 without any.
+    words : name of the half. chi2, dof : of the difference from the whole, and its degrees of freedom. change : largest
+        relative change of a parameter that differs significantly by itself, or relative change of the effect's
+        contribution to the response if that is smaller; 0 if no parameter differs.
     """
 
     words: str
@@ -62,16 +62,16 @@ class Half:
 def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
            parts: Sequence[tuple[str, np.ndarray]] | None = None, absent: Mapping[str, float] | None = None
            ) -> list[Half]:
-    """An effect's parameters from halves of the data, one Gauss-Newton step from the whole: below and above the band's
-    middle by information, and at low and high level.
+    """An effect's parameters from halves of the data: lower and upper band, low and high levels.
 
-    A parameter that moves with the band or the level refutes its law. Of a true law the difference has the covariance
-    P_half - P (J. A. Hausman, Econometrica 46 (1978) 1251-1271). A parameter that hardly acts in a half (a quintic
-    stiffness at low level, a small difference between mounts) may move without changing the response there.
+    Each half gives one Gauss-Newton step from the fit to the whole. A parameter that changes with the band or the level
+    refutes its law. If the law is true, the difference has the covariance P_half - P (J. A. Hausman, Econometrica 46
+    (1978) 1251-1271). A parameter that hardly acts in a half (a quintic stiffness at low level, a small difference
+    between mounts) may move without changing the response there.
 
-    parts : other halves, in words and rows of the residual. absent : values at which linear parameters of the effect do
-    not act, by name: changes are relative to the departure from them, and the change of the response is compared with
-    the effect's own part of it.
+    parts : other halves, as name and rows of the residual. absent : values at which linear parameters of the effect do
+        not act, by name: changes are relative to the difference from these values, and the change of the response is
+        compared with the effect's own contribution.
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
     slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
@@ -87,7 +87,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
         J, e = fitted.J[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
         step = np.linalg.solve(root, (P @ (J @ e - fitted.z))[rows])
-        # Variances of the half over those of the whole; a half that hardly knows a direction says nothing of it.
+        # Variances of the half over those of the whole; directions that the half hardly determines are left out.
         half = np.linalg.solve(root, np.linalg.solve(root, P[np.ix_(rows, rows)]).T)
         size, V = np.linalg.eigh((half + half.T) / 2)
         known = (size > 1 + settings.least_difference) & (size < settings.most_of_half)
@@ -105,7 +105,7 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
 
 
 def _departure(fitted: Fitted, absent: Mapping[str, float]) -> np.ndarray:
-    """(n,) standardised parameters less those at which an effect does not act; empty where there are none."""
+    """(n,) standardised parameters minus those at which an effect does not act; empty if there are none."""
     rows = [fitted.priors.names.index(name) for name in absent if name in fitted.priors.names]
     values = fitted.priors.values(fitted.z)
     values[rows] = [value for name, value in absent.items() if name in fitted.priors.names]
@@ -114,7 +114,7 @@ def _departure(fitted: Fitted, absent: Mapping[str, float]) -> np.ndarray:
 
 
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
-    """Halves of the groups: by band, each with half of the information on the parameters, and by level."""
+    """Halves of the groups, by band and by level, each with about half of the information on the parameters."""
     information: dict[Group, float] = {group: float(np.sum(fitted.J[rows][:, at] ** 2))
                                        for group, at in fitted.rows.items()}
     found = []

@@ -1,4 +1,4 @@
-"""From a campaign to the most likely parameters: what to fit, what to hold out, which band, which weights."""
+"""Maximum-likelihood fit of a campaign: what to fit, what to hold out, which band, which weights."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ from avis_ctrl.rigs.instruments import Tolerances
 
 Progress = Callable[[str], None]
 Item = TypeVar("Item")
-# Records at levels within this factor are of one level.
+# Levels within this factor count as one level.
 SAME_LEVEL = 1.25
 
 
 @dataclass(frozen=True)
 class CampaignFitSettings:
     """longest_piece : samples; longer records are cut into pieces of this length, because the spectrum of the whole
-        would fill the memory and its finer lines add nothing.
-    most_lines : largest number of spectral lines fitted, all records together: their derivatives with respect to some
-        thirty parameters fit into memory (0.2 GB), and a rig of a few dozen parameters needs no more. Where there are
-        more, the lines without drive are left out first, and of the others a random selection is fitted; averaging them
-        into frequency responses would flatten the resonances.
+    would fill the memory and its finer lines add nothing.
+    most_lines : maximum number of spectral lines fitted, all records together: their derivatives with respect to some
+        thirty parameters fit into memory (0.2 GB), and a rig of a few dozen parameters needs no more. If there are
+        more, lines without drive are omitted first, and a random selection of the rest is fitted; averaging them into
+        frequency responses would flatten the resonances.
     silent_line : ratio of the drive's amplitude at a line to that at the record's strongest line, below which the line
         counts as silent: -60 dB, a millionth of the power.
-    least_excited : ratio of the power in the other records to that in a record, for each combination of drives that it
-        excites and as far as the others can separate it, above which the record may be held out: at a tenth of its
+    least_excited : minimum ratio of the power in the other records to that in a record, for each combination of drives
+        that it excites and as far as the others can separate it, if the record is to be held out: at a tenth of its
         amplitude they still determine the response to that combination.
-    quiet_band_Hz : band of the fit where no input shows what band is excited: the band of the floor velocity in a rig
+    quiet_band_Hz : band of the fit if no input shows what band is excited: the band of the floor velocity in a rig
         file.
-    tail : share of an input's power that may lie below the band of the fit, and above it; the noise of a generator has
-        a smaller share.
-    floor_tail : the same of a measured floor: up to a per cent or two of its power is its sensor's noise, at all
+    tail : fraction of an input's power that may lie below the band of the fit, and above it; the noise of a generator
+        has a smaller fraction.
+    floor_tail : the same for a measured floor: up to one or two per cent of its power is its sensor's noise, at all
         frequencies.
     """
 
@@ -67,7 +67,7 @@ SETTINGS = CampaignFitSettings()
 
 
 class Split(NamedTuple):
-    """What is fitted and what no fit sees, with a sentence how it was chosen."""
+    """Fitted records, held-out records that no fit uses, and a sentence on how they were chosen."""
 
     fitted: Campaign
     held_out: Campaign
@@ -75,15 +75,15 @@ class Split(NamedTuple):
 
 
 def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) -> Split:
-    """Hold out whole records, or the last third of each where the others would not excite everything.
+    """Hold out whole records, or the last third of each if the remaining records would not excite everything.
 
     Parameters
     ----------
-    hold_out : names of records; by default the last driven one whose inputs are all driven by the others too.
+    hold_out : names of records; by default the last driven record whose inputs are all driven by other records too.
 
     Raises
     ------
-    InputError : unknown names, nothing left to fit, records too short to divide.
+    InputError : unknown names, no records remaining for the fit, records too short to divide.
     """
     names = [record.header.name for record in campaign.records]
     if hold_out is not None:
@@ -98,7 +98,7 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
     active = {record.header.name: power for record in campaign.records if np.any(power := drive_power(record))}
     for name in reversed(active):
         others = [power for other, power in active.items() if other != name]
-        # The response to several inputs can seldom be separated with one record: never less than two are left.
+        # The response to several inputs can seldom be separated with one record: at least two must remain.
         if len(others) >= 2 and excites_as_well(np.sum(others, axis=0), active[name]):
             rest = tuple(other for other in names if other != name)
             return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
@@ -109,9 +109,9 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
 
 
 def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
-    """Items of one kind and level, within SAME_LEVEL of the lowest of a group, together; sorted by kind, then level.
+    """Group items of one kind and level, within SAME_LEVEL of the lowest in a group; sorted by kind, then level.
 
-    told : kind and level of an item.
+    told : function that returns kind and level of an item.
     """
     groups: list[list[Item]] = []
     for item in sorted(items, key=told):
@@ -125,7 +125,7 @@ def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]
 
 
 def levels_of(records: Sequence[RecordSource]) -> dict[str, float]:
-    """Level [V] by record: of the lowest one of a group that counts as one level."""
+    """Level [V] by record: the lowest level of the group that counts as one level."""
     groups = of_one_level([record.header for record in records], lambda header: ("", header.level_V))
     return {header.name: group[0].level_V for group in groups for header in group}
 
@@ -137,16 +137,18 @@ def drive_power(record: RecordSource) -> np.ndarray:
 
 
 def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
-    """Whether every combination of drives that one record excites, with power `one` (n_u, n_u), is excited by others.
+    """Whether the other records excite every combination of drives that one record excites, with power `one` (n_u,
+    n_u).
 
-    Records along the logical axes drive the same motors in other combinations: without the one that turns the table,
-    nothing is known of that turn. Least squares from the others would know the response to d, a combination, with the
-    variance d^T inv(others) d; from the record itself with d^T inv(one) d. The worst ratio decides.
+    Records along the logical axes drive the same motors in different combinations: without the record that rotates the
+    table, nothing is known about that rotation. Least squares from the others estimates the response to d, a
+    combination, with the variance d^T inv(others) d; from the record itself with d^T inv(one) d. The worst ratio
+    decides.
     """
     power, V = np.linalg.eigh(one)
     excited = power > SETTINGS.silent_line ** 2 * power[-1]
     root = V[:, excited] * np.sqrt(power[excited])
-    # What the others do not excite at all has a large variance, not an infinite one.
+    # A combination that the others do not excite at all gets a large, not an infinite variance.
     rest = others + SETTINGS.silent_line ** 2 * np.linalg.eigvalsh(others)[-1] * np.eye(len(others))
     ratio = np.linalg.eigvalsh(root.T @ np.linalg.solve(rest, root))[-1]
     return bool(ratio * SETTINGS.least_excited < 1)
@@ -159,7 +161,7 @@ def driven_inputs(record: RecordSource) -> set[str]:
 
 
 def divided(record: RecordSource) -> tuple[Portion, Portion]:
-    """The first two thirds of a record, whole periods of a periodic one, and the last third.
+    """The first two thirds of a record (whole periods of a periodic one), and the last third.
 
     Raises InputError for fewer than 300 samples.
     """
@@ -174,10 +176,10 @@ def divided(record: RecordSource) -> tuple[Portion, Portion]:
 
 
 def excited_band(campaign: Campaign) -> tuple[float, float]:
-    """Lowest and highest frequency [Hz] that some record drives, within 0.2 Hz and a quarter of the sample rate.
+    """Lowest and highest frequency [Hz] that some record drives, limited to 0.2 Hz and a quarter of the sample rate.
 
-    Of each record the band that holds its input's power but for a small share at either end: `tail` of the settings,
-    `floor_tail` where only the measured floor moves.
+    The band of each record contains its input's power except for a small fraction at either end: `tail` of the
+    settings, `floor_tail` if only the measured floor moves.
     """
     ends: list[tuple[float, float]] = []
     for record in campaign.records:
@@ -195,7 +197,7 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
 
 
 def _fewer(block: SpectralBlock, share: float, crowded: bool, rng: np.random.Generator) -> SpectralBlock:
-    """A share of a block's driven lines, drawn at random, where a campaign is `crowded`; else the block as it is."""
+    """A random fraction of a block's driven lines if a campaign is `crowded`; otherwise the block unchanged."""
     power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
     if not crowded or not np.any(power):
         return block
@@ -206,7 +208,7 @@ def _fewer(block: SpectralBlock, share: float, crowded: bool, rng: np.random.Gen
 
 def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]
                     ) -> tuple[list[SpectralBlock], list[str]]:
-    """Spectral blocks of every record, long ones in pieces, and sentences on what was left out."""
+    """Spectral blocks of all records, long ones in pieces, and sentences on what was omitted."""
     width = band_Hz[1] - band_Hz[0]
     lines = [record.header.duration_s * width for record in campaign.records]
     driven = [n / max(record.header.periods, 1) for n, record in zip(lines, campaign.records, strict=True)]
@@ -218,7 +220,7 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
                 blocks.append(_fewer(record_block(piece, model, band_Hz), share, crowded, rng))
     if not blocks:
         raise InputError("expected a band with more than 10 lines of a record", field="band_Hz", value=band_Hz)
-    # A record without input or measured floor says nothing of the response.
+    # A record without input or measured floor contains no information on the response.
     useful = [block for block in blocks if np.any(block.U)]
     if not useful:
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="records")
@@ -234,13 +236,14 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
 
 def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
              ) -> tuple[list[SpectralBlock], str, bool]:
-    """The blocks with the noise that a local model measures, whatever the rig's; a sentence, and whether it did."""
+    """The blocks with noise measured by a local model, independent of the rig's; a sentence, and whether it succeeded.
+    """
     known: dict[str, tuple[np.ndarray, SpectralBlock]] = {}
     try:
         found = []
         for block in blocks:
             if block.kind not in known:
-                # On the lines of all its kind at once: the local model is that of the whole campaign.
+                # On the lines of all blocks of this kind at once: the local model is that of the whole campaign.
                 omega = np.unique(np.concatenate([one.omega for one in blocks if one.kind == block.kind]))
                 known[block.kind] = omega, measured_noise(campaign, _lines_only(block, omega), band_Hz)
             omega, like = known[block.kind]
@@ -254,7 +257,7 @@ def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple
 
 
 def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
-    """A block of that kind on other lines, without data."""
+    """A block of the same kind on other lines, without data."""
     return replace(block, omega=omega, U=np.zeros((len(omega), block.U.shape[1], 1)),
                    Y=np.zeros((len(omega), block.Y.shape[1], 1)))
 
@@ -262,7 +265,7 @@ def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
 def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
     """A block with the noise covariance of a local polynomial model of the campaign's records of its kind.
 
-    Records at rest where there are some, otherwise all of them.
+    Records at rest are used if there are any, otherwise all records.
 
     Raises
     ------
@@ -270,7 +273,7 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
     """
     floor = block.kind == "floor measured"
     alike = [record.header for record in campaign.records if (len(record.header.floor_names) > 0) == floor]
-    # A record at rest holds the noise alone; any other one needs all its inputs told apart first.
+    # A record at rest contains noise alone; in any other record all inputs must be separated first.
     rest = [header for header in alike if header.excitation == "rest"]
     campaign = campaign.only(tuple(header.name for header in rest or alike))
     frequency = block.omega / (2 * np.pi)
@@ -285,13 +288,13 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
 class CampaignFit:
     """A fit to a campaign.
 
-    fit : with the noise of its own residuals. first : with the noise that was measured without a model of the rig,
-    where `measured`; its chi-square per degree of freedom is a rough figure then (0.85 to 0.95 for a right model,
-    for local models take some of the response's curvature for noise), and none otherwise. The held-out chi-square
-    judges.
+    fit : with the noise of its own residuals. first : with the noise measured without a model of the rig, if
+        `measured`; its chi-square per degree of freedom is then a rough figure (0.85 to 0.95 for a correct model,
+        because local models take some of the response's curvature for noise), and meaningless otherwise. The held-out
+        chi-square is the criterion.
     start : the model before the fit. notes : sentences.
-    tolerances : values of the rig file that were fitted within their tolerance, the most moved first; they are among
-    the parameters of `fit`, and `first` is the fit that takes them for exact. Empty where they were not free.
+    tolerances : values of the rig file that were fitted within their tolerance, those that moved most first; they are
+        among the parameters of `fit`, and `first` is the fit that takes them as exact. Empty if they were not free.
     """
 
     fit: LikelihoodFit[ResponseModel]
@@ -304,20 +307,21 @@ class CampaignFit:
 
     @property
     def model(self) -> ResponseModel:
-        """That of the fit with the identified parameters free, tolerances where the fit left them."""
+        """Model of the fit with the identified parameters free, and the tolerances at their fitted values."""
         return replace(self.fit.model, names=self.start.names)
 
     @property
     def structure(self) -> ResponseModel:
-        """What tells which combinations of the identified parameters can be determined: the geometry of the file."""
+        """Model that shows which combinations of the identified parameters can be determined: with the geometry of the
+        file."""
         return self.first.model if self.tolerances else self.model
 
     @cached_property
     def information(self) -> Information:
-        """Of the identified parameters, whatever the tolerances are.
+        """Information on the identified parameters, with the tolerances marginalised.
 
-        What the file's own geometry leaves undetermined (how a stiffness is shared between mounts) is not counted where
-        places moved by their tolerance tell it apart.
+        If the file's own geometry leaves something undetermined (how a stiffness is divided between mounts),
+        information from positions moved within their tolerance is not counted.
         """
         if not self.tolerances:
             return self.fit.information
@@ -329,8 +333,8 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
                  progress: Progress | None = None, tolerances: Tolerances | None = None) -> CampaignFit:
     """The most likely parameters, first with measured noise, then with the noise of the residuals.
 
-    tolerances : of the values of the rig file, which are fitted beside the parameters then; records of a rig whose
-        channels can be taken apart only.
+    tolerances : of the values of the rig file, which are then fitted together with the parameters; only for records of
+        a rig whose channels can be separated.
 
     Raises
     ------
@@ -349,7 +353,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     if within is not None:
         blocks = [thinned(block, FIT.residual_lines) for block in blocks]
         fitted = [thinned(block, FIT.lines) for block in blocks]
-    # The rig file is taken for exact first.
+    # First, the rig file is taken as exact.
     first = fit(model, fitted, priors, starts, seed=seed, progress=progress)
     turning, added = chosen_turning(campaign, blocks, first.model)
     turned = replace(first.model, turning=turning)
@@ -381,7 +385,7 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
 
 
 def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
-    """How large the second-order terms are against the outputs, in words."""
+    """Size of the second-order terms relative to the outputs, in words."""
     share = [np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2)) for block, one in
              zip(blocks, added, strict=True)]
     return f"they contribute up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"

@@ -1,13 +1,13 @@
-"""Standard deviations that hold where residuals are alike within an octave or a level (cluster-robust covariance).
+"""Standard deviations for residuals that are correlated within an octave or a level (cluster-robust covariance).
 
-A model that is not quite the real table leaves residuals that are alike over neighbouring lines and bands, or over the
-records of a level. With the residual e, its derivative J and the covariance P of all parameters at the estimate, a
-cluster c of data moves the estimate by
+A model that differs from the real table leaves residuals that are correlated over neighbouring lines and bands, or over
+the records of a level. With the residual e, its derivative J and the covariance P of all parameters at the estimate, a
+cluster c of data shifts the estimate by
 
     delta_c = P J_c (I - J_c^T P J_c)^(-1/2) e_c
 
-and V = P^2 + sum_c delta_c delta_c^T is P in the mean where the model holds, whatever the clusters; P^2 is of the
-priors (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002) 169-181, with priors).
+and V = P^2 + sum_c delta_c delta_c^T has the expectation P if the model is correct, for any clusters; P^2 is the
+contribution of the priors (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002) 169-181, with priors).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from avis_ctrl.identification.weights import Group
 
 def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray],
                   least_elsewhere: float = 0.0) -> np.ndarray:
-    """(n_c, n) delta of each cluster.
+    """(n_c, n) shift delta of each cluster.
 
     P : (n, n) covariance of standardised parameters, inv(J J^T + I). J : (n, N) negative derivative of e (N,).
-    clusters : entries of e of each. least_elsewhere : fraction of the information on a direction that is not of the
-    cluster, below which it does not count there: there is nothing to compare it with.
+    clusters : entries of e of each. least_elsewhere : minimum fraction of the information on a direction that lies
+        outside the cluster; below it the direction is not counted, because there is nothing to compare it with.
     """
     L, found = np.linalg.cholesky(P), []
     for at in clusters:
@@ -38,7 +38,7 @@ def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequenc
 
 
 def covering(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """(k, k) covariance of at least A and B in every direction; A positive definite."""
+    """(k, k) covariance at least as large as A and B in every direction; A positive definite."""
     L = np.linalg.cholesky(A)
     ratio, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, B).T))
     root = L @ (vectors * np.sqrt(np.maximum(ratio, 1.0)))
@@ -46,8 +46,7 @@ def covering(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 def clusterings(groups: Sequence[Group], bands_per_octave: int) -> tuple[list[list[list[Group]]], list[list[Group]]]:
-    """Groups (level, band) that belong together: by octave, once for each band that octaves may begin with; by level.
-    """
+    """Clusters of groups (level, band): by octave, once for each band at which octaves may begin; and by level."""
     by_octave, bands_per_octave = [], max(bands_per_octave, 1)
     for first in range(bands_per_octave):
         octaves: dict[int, list[Group]] = {}

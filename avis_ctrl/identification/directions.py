@@ -1,13 +1,13 @@
-r"""The few directions of correlated parameters that matter to a design, from the covariance of an identification.
+r"""The few directions of correlated parameters that affect a design most, from the covariance of an identification.
 
-The determined part of the covariance is S S^T, so that theta = theta_0 + S z with z standard normal in r numbers. Any
-rotation of z is standard normal too; the one taken here is that of the singular vectors of the response's sensitivity
-to z, so that z_1 changes the response most, z_2 most of what is left, and so on. The first q become bounded
-parameters, theta = theta_0 + sum_i k s_i delta_i with |delta_i| <= 1; of the rest, taken in a ball, the largest change
-of the response is stated and has to be covered by dynamic uncertainty.
+The determined part of the covariance is S S^T, so that theta = theta_0 + S z with r standard normal numbers z. Any
+rotation of z is standard normal too. The rotation used here is that of the singular vectors of the response's
+sensitivity to z: z_1 changes the response most, z_2 most of the remainder, and so on. The first q become bounded
+parameters, theta = theta_0 + sum_i k s_i delta_i with |delta_i| <= 1. For the rest, in a ball, the largest change of
+the response is stated, and must be covered by dynamic uncertainty.
 
 Coverage: a box of q numbers with P(|z_i| <= k)^q = p^(q/r) and a ball of r - q numbers with probability p^((r-q)/r)
-hold together with probability p exactly, where the errors are normal.
+have exactly the joint probability p if the errors are normal.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from scipy.stats import chi2, norm
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.rig import Rig
 
-# Directions that together change the response by less than this share of it, at every frequency, are not kept.
+# Directions that together change the response by less than this fraction, at every frequency, are not kept.
 NEGLIGIBLE = 1e-3
 KeptMatrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Bounded directions and what they leave.
+    """Bounded directions and the effect of the remaining ones.
 
     Attributes
     ----------
     names : (n_p) parameters of the rig.
-    changes : (q, n_p) what delta = 1 adds, in the parameters' units.
+    changes : (q, n_p) change at delta = 1, in the parameters' units.
     effect : (q,) largest relative change of the response by each at delta = 1.
-    rest : (n,) largest relative change of the actuators' response by what is not kept, at omega.
-    rest_floor : (n,) the same of the response to floor motion.
+    rest : (n,) largest relative change of the actuators' response by the directions not kept, at omega.
+    rest_floor : (n,) the same for the response to floor motion.
     omega : (n,) rad/s.
     box : k, half width of the box in standard deviations. ball : radius for the rest, likewise.
     coverage : p, of box and ball together.
@@ -55,18 +55,18 @@ class Directions:
 
 def directions_that_matter(rig: Rig, names: Sequence[str], factor: np.ndarray, keep: Sequence[str],
                            omega: np.ndarray, confidence: float = 0.95, negligible: float = NEGLIGIBLE) -> Directions:
-    """The fewest directions that leave less than `negligible` of the response in the kept coordinates.
+    """Minimum number of directions such that the rest changes the kept coordinates' response by less than `negligible`.
 
     Parameters
     ----------
     rig : at the identified values.
     names, factor : parameters of the rig, and S (n_p, r) with the covariance S S^T in their units.
     keep : coordinates; the others are locked.
-    omega : (n,) rad/s where the response counts.
+    omega : (n,) rad/s at which the response is considered.
 
     Raises
     ------
-    InputError : shapes that do not belong together, parameters that the rig does not have, a confidence outside 0..1.
+    InputError : shapes that do not fit together, parameters that the rig does not have, a confidence outside 0..1.
     """
     factor = np.asarray(factor, float)
     if factor.ndim != 2 or len(factor) != len(names) or not np.all(np.isfinite(factor)):
@@ -94,7 +94,7 @@ def directions_that_matter(rig: Rig, names: Sequence[str], factor: np.ndarray, k
 
 
 def half_widths(q: int, r: int, confidence: float) -> tuple[float, float]:
-    """Half width k of a box of q standard normal numbers and radius of a ball of r - q that hold together."""
+    """Half width k of a box of q standard normal numbers and radius of a ball of r - q, with that joint confidence."""
     if r == 0:
         return 0.0, 0.0
     each = confidence ** (1 / r)
@@ -107,7 +107,7 @@ def relative_sensitivity(rig: Rig, names: Sequence[str], keep: Sequence[str], om
 
     With B = K + jw C - w^2 M and F = K + jw C: inv(G) dG = -dB inv(B) of the response to forces, input-multiplicative,
     and inv(T) dT = inv(F) (dF - dB inv(B) F) of the response to the floor. A change of the actuators' constants dT_u
-    counts as dT_u A, with A the allocation.
+    enters as dT_u A, with A the allocation.
     """
     return relative_changes(kept_matrices(rig, keep), matrix_slopes(rig, names, keep), omega)
 
@@ -128,7 +128,7 @@ def matrix_slopes(rig: Rig, names: Sequence[str], keep: Sequence[str]) -> list[K
 
 def relative_changes(base: KeptMatrices, changes: Sequence[KeptMatrices], omega: np.ndarray,
                      allocation: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """As `relative_sensitivity`, by changes of M, C, K, T; allocation (n_u, k): A, by default the inverse of T."""
+    """`relative_sensitivity` for changes of M, C, K, T; allocation (n_u, k): A, by default the inverse of T."""
     (M, C, K, T), s = base, 1j * np.asarray(omega, float)[:, None, None]
     allocation, F = np.linalg.pinv(T) if allocation is None else allocation, K + s * C
     inverse = np.linalg.inv(F + s ** 2 * M)
@@ -143,8 +143,8 @@ def relative_changes(base: KeptMatrices, changes: Sequence[KeptMatrices], omega:
 
 
 def kept_matrices(rig: Rig, keep: Sequence[str], edge_m: float | None = None) -> KeptMatrices:
-    """M, C, K, T of the kept coordinates, rotations as displacement of the edge: by default the rig's own, which moves
-    where its isolators do."""
+    """M, C, K, T of the kept coordinates, rotations as displacement of the edge: by default the rig's own edge, which
+    moves with its isolators."""
     eom = rig.equations_of_motion()
     kept = [eom.coordinates.index(name) for name in keep]
     S = np.diag([1 / (edge_m or rig.edge_m) if name.startswith("phi") else 1.0 for name in keep])
@@ -158,5 +158,5 @@ def _ball_gain(parts: np.ndarray) -> np.ndarray:
     if m == 0:
         return np.zeros(n)
     flat = np.moveaxis(parts, 0, -1).reshape(n, -1, m)
-    # The Frobenius norm bounds the largest singular value; its largest value over the ball is one of a real matrix.
+    # The Frobenius norm bounds the largest singular value; its maximum over the ball is a real matrix's spectral norm.
     return np.linalg.norm(np.concatenate([flat.real, flat.imag], axis=1), ord=2, axis=(1, 2))

@@ -1,7 +1,7 @@
 """Continuous-discrete extended Kalman filter for a rig's parameters (Rademakers, TU/e 2005, chapter 3).
 
 States are (q, q', theta) of eq. 3.3, with theta' = 0; measurements are velocities along the sensors, prefiltered
-(section 3.2). Records are filtered one after another, parameters handed on.
+(section 3.2). Records are filtered one after another; the parameters carry over.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(eq=False)
 class ParameterFilter:
-    """The filter between records: where its parameters are and how well they are known, both over the starting values.
+    """The filter between records: its parameters and their covariance, both relative to the starting values.
 
-    model : its `values` are the start. R : (n_y,). period_s : of the samples. floor, rig : floor motion as a
-    disturbance, and the rig whose parameters say how it comes through.
+    model : its `values` are the start. R : (n_y,). period_s : sample period. floor, rig : floor motion as a
+        disturbance, and the rig whose parameters determine its transmission.
     """
 
     model: LinearModel
@@ -56,11 +56,11 @@ class ParameterFilter:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(n_p + n_x square) of (theta over its start, q, q')."""
+        """(n_p + n_x square) covariance of (theta over its start, x)."""
         return self.state.W.T @ self.state.W
 
     def forget(self) -> None:
-        """The prior covariance about the present estimate."""
+        """Reset to the prior covariance about the present estimate."""
         n_p = len(self.model.names)
         self.state.W[:] = 0.0
         self.state.W[:n_p, :n_p] = self.settings.prior_share * np.eye(n_p)
@@ -78,7 +78,7 @@ class ParameterFilter:
         self.state.x[n_q:2 * n_q] = np.linalg.pinv(self.model.H[:, n_q:]) @ y0
 
     def filter(self, u: np.ndarray, y: np.ndarray, keep: int) -> tuple[Trace, int]:
-        """One record from its state at hand: what happened, and how many samples were filtered before it failed."""
+        """Filter one record from the present state: its trace, and how many samples were filtered before a failure."""
         n, n_p, n_x, kept = len(y), len(self.model.names), len(self.state.x), -(-len(y) // keep)
         trace = Trace(np.zeros((n, y.shape[1])), np.zeros((kept, n_p)), np.zeros((kept, n_p)), np.zeros((kept, n_x)))
         plant, A, noise = self._shaped()
@@ -89,8 +89,8 @@ class ParameterFilter:
     def _shaped(self) -> tuple[Plant, np.ndarray, np.ndarray]:
         """Model with its disturbance, and A and the density of the noise on (q, q', f), at the present parameters.
 
-        How the floor comes through is taken from the parameters at the start of a record and kept for its length: it
-        colours the noise, and is no source of knowledge about the parameters.
+        The transmission of the floor motion is computed from the parameters at the start of a record and kept for its
+        length: it colours the noise, and is not used as information about the parameters.
         """
         model, n_q, n_x, n_f = self.model, self.model.n_q, 2 * self.model.n_q, self.n_f
         A, noise, G, decay = np.zeros((n_x + n_f,) * 2), np.zeros((n_x + n_f,) * 2), np.zeros((n_q, n_f)), 1.0
@@ -111,12 +111,12 @@ class ParameterFilter:
 def noise_root(A: np.ndarray, noise: np.ndarray, h: float) -> np.ndarray:
     """Upper triangular W_Q with W_Q^T W_Q = integral over h of e^(A t) noise e^(A^T t) (Van Loan 1978), all (n_x, n_x).
 
-    The filter computes it once for a record, with the parameters at its start: over a sample they hardly move it.
+    The filter computes it once per record, with the parameters at its start, which hardly affect it over one sample.
     """
     n_x = len(A)
     power = la.expm(np.block([[-A, noise], [np.zeros((n_x, n_x)), A.T]]) * h)
     covariance = power[n_x:, n_x:].T @ power[:n_x, n_x:]
-    # Displacements are smaller than velocities by h; the root is taken of what has a unit diagonal.
+    # Displacements are smaller than velocities by h: scale to a unit diagonal before taking the root.
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size[size == 0] = 1.0
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2 / np.outer(size, size))
@@ -137,8 +137,8 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
     Raises
     ------
     InputError : records that differ in channels, unit or rate, or that are not of this rig; parameters that the filter
-        cannot take; settings out of range.
-    ComputationError : the filter diverged; it names record and time.
+        cannot estimate; settings out of range.
+    ComputationError : the filter diverged; the message gives record and time.
     """
     campaign = records if isinstance(records, Campaign) else Campaign(rig0.name, tuple(records))
     header = campaign.records[0].header
@@ -173,7 +173,7 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
 
 
 def _through(kalman: ParameterFilter, source: RecordSource, inverse: SensorInverse, delay_s: float, keep: int) -> Trace:
-    """One record, prefiltered."""
+    """Prefilter and filter one record."""
     settings, names = kalman.settings, kalman.model.names
     u, y = prefilter(source.load(), inverse, delay_s, settings.highpass_Hz, settings.highpass_order)
     kalman.begin(y[0])

@@ -1,18 +1,18 @@
-"""The compiled inner loop of the extended Kalman filter: flow of a sample with its derivatives, square-root covariance.
+"""Compiled inner loop of the extended Kalman filter: flow over a sample with its derivatives, square-root covariance.
 
-Order of the augmented state: parameters s (n_p), which do not move, then x = (q, q', f) with f (n_f, often none) a
-coloured disturbance that accelerates the table by G f.
+Order of the augmented state: constant parameters s (n_p), then x = (q, q', f) with f (n_f, often none) a coloured
+disturbance that accelerates the table by G f.
 
-The flow over a sample is the Taylor polynomial of fourth order at fixed parameters, which for a linear system is
-Runge and Kutta's; its error at 5 Hz and 1 kHz is (omega h)^4 / 120 = 8e-9 of the step's change. Phi and Psi are its
+The flow over a sample is the Taylor polynomial of fourth order at fixed parameters, which for a linear system equals
+the Runge-Kutta step; its error at 5 Hz and 1 kHz is (omega h)^4 / 120 = 8e-9 of the step's change. Phi and Psi are its
 exact derivatives. P = W^T W with W upper triangular is symmetric and positive semidefinite by construction:
 
     x+ = Phi x + Psi s + w,   s+ = s      ->      W+ = qr [ W_ss   W_sx Phi^T + W_ss Psi^T ]
                                                           [ 0      W_xx Phi^T              ]
                                                           [ 0      W_Q                     ]
 
-and only the last two block rows have to be made triangular again: n_x columns, whatever n_p. Measurements are taken
-one by one (diagonal R) by Carlson's triangular update (AIAA Journal 11 (1973), 1259).
+and only the last two block rows have to be made triangular again: n_x columns, regardless of n_p. Measurements are
+processed one by one (diagonal R) by Carlson's triangular update (AIAA Journal 11 (1973), 1259).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Plant(NamedTuple):
 
     T (n_q, n_u); H (n_y, n_x) on (q, q', f).
 
-    G (n_q, n_f) : acceleration by the disturbance, which is held over a sample. decay : what a sample leaves of f.
-    lowest : s is held there or above.
+    G (n_q, n_f) : acceleration by the disturbance, which is held over a sample. decay : factor on f over a sample.
+    lowest : lower limit of s.
     """
 
     constant: np.ndarray
@@ -45,7 +45,8 @@ class Plant(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """What the loop changes: s (n_p,), x (n_x,), W (n_p + n_x square, upper triangular), guard counts (n_p,)."""
+    """State that the loop modifies: s (n_p,), x (n_x,), W (n_p + n_x square, upper triangular), counts of limited s
+    (n_p,)."""
 
     s: np.ndarray
     x: np.ndarray
@@ -54,8 +55,8 @@ class Filter(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What the loop writes: (n, n_y) innovations over their predicted standard deviation, and every `keep` samples
-    s (m, n_p), its covariance's diagonal (m, n_p) and x (m, n_x)."""
+    """Output of the loop: (n, n_y) innovations over their predicted standard deviation, and every `keep` samples s (m,
+    n_p), its covariance's diagonal (m, n_p) and x (m, n_x)."""
 
     innovation: np.ndarray
     s: np.ndarray
@@ -67,7 +68,7 @@ class Trace(NamedTuple):
 def flow(plant, s, x, u, h):
     """x after a sample of h seconds at held volts u (n_u,), Phi (n_x, n_x) and Psi (n_x, n_p).
 
-    Terms (A h)^k / k! of the state, of its derivatives and of the transition together. x is not a number where a
+    The terms (A h)^k / k! of the state, of its derivatives and of the transition are computed together. x is NaN if a
     mass or an inertia is not positive.
     """
     n_p, n_q, n_x = s.shape[0], plant.T.shape[0], x.shape[0]
@@ -102,7 +103,7 @@ def flow(plant, s, x, u, h):
 
 @njit(cache=True, fastmath=FAST)
 def _forces(plant, slope, term):
-    """(n_q, n_p) dM q'' + dC q' + dK q by each s, of a term (q, q') and its derivative by time."""
+    """(n_q, n_p) dM q'' + dC q' + dK q by each s, for a term (q, q') and its time derivative."""
     n_q, n_p = plant.T.shape[0], plant.reference.shape[0]
     out = np.zeros((n_q, n_p))
     for i in range(n_q):
@@ -117,7 +118,7 @@ def _forces(plant, slope, term):
 
 @njit(cache=True)
 def propagate(W, Phi, Psi, W_Q):
-    """W over a sample, in place; W_Q (n_x, n_x) with W_Q^T W_Q the process noise of the sample."""
+    """Propagate W over a sample, in place; W_Q (n_x, n_x) with W_Q^T W_Q the process noise of the sample."""
     n_p = Psi.shape[1]
     F_t = np.ascontiguousarray(np.concatenate((Psi, Phi), axis=1).T)
     moved = np.dot(W, F_t)
@@ -151,7 +152,7 @@ def update(W, h, r, gain):
 
 @njit(cache=True)
 def _measure(plant, state, y, R, gain, innovation):
-    """All measurements of one sample, one by one; False where an innovation is not finite."""
+    """Process all measurements of one sample, one by one; False if an innovation is not finite."""
     n_p = state.s.shape[0]
     for i in range(y.shape[0]):
         e = y[i] - np.dot(plant.H[i], state.x)
@@ -169,7 +170,8 @@ def _measure(plant, state, y, R, gain, innovation):
 
 @njit(cache=True)
 def run(plant, state, W_Q, R, u, y, h, keep, trace):
-    """Filters a record: measure, then go to the next sample. Returns the samples done; fewer than all is a failure.
+    """Filter a record: measurement update, then propagation to the next sample. Returns the number of samples
+    processed; fewer than all means failure.
 
     u : (n, n_u) volts held from each sample to the next. y : (n, n_y). R : (n_y,) variances. keep : decimation.
     """

@@ -16,15 +16,16 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig import Rig
 
-# What of a matrix may differ from a straight line over a change of all parameters by a fifth: round-off.
+# Relative nonlinearity of a matrix, when all parameters change by a fifth, that counts as round-off.
 LINEARITY = 1e-9
 
 
 class LinearModel(NamedTuple):
-    """The matrices by parameter.
+    """The matrices as linear functions of the parameters.
 
-    names, values : n_p parameters and where they start. constant : (3, n_q, n_q), of M, C and K what the parameters do
-    not act on. slopes : (3, n_q, n_q, n_p). T : (n_q, n_u), N/V and N m/V. H : (n_y, 2 n_q), measurements of (q, q').
+    names, values : n_p parameters and their starting values. constant : (3, n_q, n_q), the parts of M, C and K that do
+        not depend on them. slopes : (3, n_q, n_q, n_p). T : (n_q, n_u), N/V and N m/V. H : (n_y, 2 n_q), measurements
+        of (q, q').
     """
 
     names: tuple[str, ...]
@@ -50,12 +51,12 @@ class LinearModel(NamedTuple):
 
 
 def source_parameters(rig: Rig) -> tuple[str, ...]:
-    """The parameters of eq. 3.11 by our names: mass, principal inertias, and every c and k of the isolators except
-    those of isolator 1 along x (26 with four isolators).
+    """The parameters of eq. 3.11 by their names here: mass, principal inertias, and every c and k of the isolators
+    except those of isolator 1 along x (26 with four isolators).
 
     Raises
     ------
-    InputError : a rig that does not name its parameters so.
+    InputError : a rig without parameters of these names.
     """
     known = rig.parameters()
     isolators = range(1, 1 + sum(name.endswith(".k_x") for name in known))
@@ -79,12 +80,12 @@ def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | N
     Raises
     ------
     InputError : unknown or repeated names; a parameter on which M, C or K do not depend linearly, or not at all, or
-        which also moves the actuators or sensors; a start that is not positive.
+        which also affects the actuators or sensors; a starting value that is not positive.
     """
     names = tuple(names)
     if len(set(names)) < len(names):
         raise InputError("expected each parameter once", field="names", value=list(names))
-    rig.with_parameters(dict.fromkeys(set(names) - set(rig.parameters()), 1.0))  # refuses, with the nearest name
+    rig.with_parameters(dict.fromkeys(set(names) - set(rig.parameters()), 1.0))  # raises with the nearest name
     model = ResponseModel.of(rig, names, "m/s", measurements, actuators)
     known, slopes, theta = model.matrices, model.derivative_matrices, model.values
     for name, value, *of in zip(names, theta, *slopes, strict=True):

@@ -1,4 +1,4 @@
-"""What the extended Kalman filter found, and whether its innovations agree with its covariance."""
+"""Result of the extended Kalman filter, and the consistency of its innovations with its covariance."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ LAGS = 50
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Innovations of one record over their predicted standard deviations: white and of unit variance if all is well.
+    """Innovations of one record over their predicted standard deviations: white with unit variance for a consistent
+    filter.
 
     Attributes
     ----------
     nis : mean over time of the normalised innovation squared e^T S^-1 e; expected n_y.
-    nis_interval : where 99.9 % of such means lie (chi-square of n n_y degrees of freedom).
-    autocorrelation : (LAGS, n_y) at 1, 2, .. samples, each output by itself.
+    nis_interval : interval that contains 99.9 % of such means (chi-square of n n_y degrees of freedom).
+    autocorrelation : (LAGS, n_y) at 1, 2, .. samples, each output separately.
     bound : 1.96 / sqrt(n), within which 95 % of the autocorrelations of white noise lie.
     """
 
@@ -35,20 +36,21 @@ class Innovations:
 
     @property
     def outside(self) -> float:
-        """Share of the autocorrelations beyond the bound; 0.05 for white innovations."""
+        """Fraction of the autocorrelations beyond the bound; 0.05 for white innovations."""
         return float(np.mean(np.abs(self.autocorrelation) > self.bound))
 
     @property
     def consistent(self) -> bool:
-        """The mean normalised innovation squared lies in its interval, and at most 10 % of the lags stand out."""
+        """The mean normalised innovation squared lies in its interval, and at most 10 % of the lags exceed the bound.
+        """
         low, high = self.nis_interval
         return low <= self.nis <= high and self.outside <= 0.10
 
 
 def innovation_statistics(innovation: np.ndarray) -> Innovations:
-    """Of (n, n_y) innovations, each over its predicted standard deviation given the outputs before it.
+    """Statistics of (n, n_y) innovations, each over its predicted standard deviation given the outputs before it.
 
-    Taken one by one, their squares sum to e^T S^-1 e of the whole sample.
+    For outputs processed one by one, the squares sum to e^T S^-1 e of the whole sample.
     """
     n, n_y = innovation.shape
     low, high = chi2.ppf((0.0005, 0.9995), n * n_y) / n
@@ -73,14 +75,14 @@ class EkfHistory:
 
 @dataclass(frozen=True, eq=False)
 class EkfResult:
-    """Parameters as the filter left them.
+    """Parameters estimated by the filter.
 
     Attributes
     ----------
     names, units, initial, values : n_p.
     scaled_covariance : (n_p, n_p) of theta / initial.
-    history : decimated. innovations : one a record.
-    guarded : (n_p,) at how many samples the guard held a parameter.
+    history : decimated. innovations : one per record.
+    guarded : (n_p,) number of samples at which the lower limit held a parameter.
     """
 
     names: tuple[str, ...]
@@ -104,15 +106,15 @@ class EkfResult:
 
     @property
     def undetermined(self) -> tuple[np.ndarray, np.ndarray]:
-        """Variance over the prior's (k,), and orthonormal combinations (n_p, k) in relative changes, of which the data
-        told so little that half of the prior's variance or more is left. With the source's reset it is the last
-        record's."""
+        """Posterior over prior variance (k,), and orthonormal combinations (n_p, k) in relative changes, for the
+        combinations that keep at least half of the prior variance. With the source's reset it refers to the last
+        record."""
         values, vectors = np.linalg.eigh(self.scaled_covariance / self.settings.prior_share ** 2)
         return values[values >= 0.5], vectors[:, values >= 0.5]
 
 
 def kinds(result: EkfResult) -> dict[str, list[int]]:
-    """Parameters by figure, as figs. 3.1 to 3.3 have them: mass and inertia, damping, stiffness, others."""
+    """Parameters by figure, as in figs. 3.1 to 3.3: mass and inertia, damping, stiffness, others."""
     groups: dict[str, list[int]] = {"Mass and inertia": [], "Damping": [], "Stiffness": [], "Other parameters": []}
     for j, unit in enumerate(result.units):
         groups[{"kg": "Mass and inertia", "kg m^2": "Mass and inertia", "N s/m": "Damping", "N/m": "Stiffness",

@@ -1,4 +1,5 @@
-"""Settings of the filter: the source's (Rademakers, TU/e 2005, section 3.3), and honest ones."""
+"""Settings of the filter: those of the source (Rademakers, TU/e 2005, section 3.3), and settings from the actual noise.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +21,16 @@ class EkfSettings:
     """Tuning.
 
     q_sigma, v_sigma : standard deviation of q [m, rad] and q' [m/s, rad/s] at the start of a record (eqs. 3.12, 3.13).
-    prior_share : of a parameter, as a share of its starting value (eq. 3.14).
-    Q : spectral density of the acceleration noise of each coordinate, E[W(t) W(t')] = Q delta(t - t')
-        [(m/s^2)^2/Hz, two-sided] (eq. 3.16); None: the rig's ambient floor motion, as three more states.
+    prior_share : standard deviation of a parameter, as a fraction of its starting value (eq. 3.14).
+    Q : spectral density of the acceleration noise of each coordinate, E[W(t) W(t')] = Q delta(t - t') [(m/s^2)^2/Hz,
+        two-sided] (eq. 3.16); None: the rig's ambient floor motion, as three more states.
     R : variance of a measurement [(m/s)^2] (eq. 3.18); None: the rig's sensor noise and converter.
     highpass_Hz, highpass_order : prefilter of u and y (section 3.2).
     reset : start each record from the prior covariance about the last estimate (section 3.2); False keeps it.
-    warm_up : records filtered once beforehand, whose covariance is then forgotten: the filter proper starts from their
-        estimate, where its linearisation holds. Data count once all the same.
-    lowest : share of its starting value below which a parameter is not let.
-    history_s : spacing of the history.
+    warm_up : number of records filtered once beforehand. Their covariance is then discarded: the actual filter starts
+        from their estimate, where its linearisation is valid. The data still count only once.
+    lowest : lower limit of a parameter, as a fraction of its starting value.
+    history_s : time step of the history.
     """
 
     q_sigma: float = 2.5e-6
@@ -74,8 +75,8 @@ could not use does no harm here once the sensors' chain is undone."""
 def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str], unit: str) -> np.ndarray:
     """R's diagonal, (n_y,) [(m/s)^2, or m^2 for displacements].
 
-    From the rig: ambient noise and rounding in volts over the passband gain. Undoing the chain raises it near the
-    corner of the high-pass; that is 1 % of the band of 0-500 Hz and left out.
+    From the rig: ambient noise and rounding in volts over the passband gain. Inverting the chain raises it near the
+    corner of the high-pass; that affects 1 % of the band of 0-500 Hz and is neglected.
 
     Raises
     ------
@@ -94,28 +95,29 @@ def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str]
 
 @dataclass(frozen=True)
 class FloorNoise:
-    """Floor motion as a disturbance: f' = -rate f + w, with f the floor's displacement (3,) behind the high-pass.
+    """Floor motion as a disturbance: f' = -rate f + w, with f the floor's displacement (3,) after the high-pass.
 
-    density : of the white velocity w [(m/s)^2/Hz, two-sided], each direction. rate : [1/s], half the corner of the
-    high-pass, so that f wanders no further than the filtered floor does. The payload feels M^-1 (K_f f + C_f f').
+    density : of the white velocity w [(m/s)^2/Hz, two-sided], in each direction. rate : [1/s], half the corner of the
+        high-pass, so that f drifts no further than the filtered floor. The payload is accelerated by M^-1 (K_f f + C_f
+        f').
     """
 
     density: float
     rate: float
 
     def acceleration(self, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-        """Of the payload, by f (6, 3) and by w (6, 3)."""
+        """Acceleration of the payload by f (6, 3) and by w (6, 3)."""
         eom = rig.equations_of_motion()
         by_f = np.linalg.solve(eom.M, eom.K_floor[:, :3] - self.rate * eom.C_floor[:, :3])
         return by_f, np.linalg.solve(eom.M, eom.C_floor[:, :3])
 
 
 def floor_noise(settings: EkfSettings, rig: Rig) -> FloorNoise | None:
-    """Floor velocity of `rig.ambient` in each direction, flat over 0.5-60 Hz, where settings.Q is None; else None.
+    """Floor velocity of `rig.ambient` in each direction, flat over 0.5-60 Hz, if settings.Q is None; otherwise None.
 
     Raises
     ------
-    InputError : Q = None for a rig without ambient numbers, or without floor motion in them.
+    InputError : Q = None for a rig without ambient data, or without floor motion in them.
     """
     if settings.Q is not None:
         return None

@@ -1,4 +1,4 @@
-"""Which combinations of the drives a campaign excites: six logical axes of a table with eight drives leave two out.
+"""Combinations of the drives that a campaign excites: six logical axes of a table with eight drives omit two.
 
 A parametric fit does not need the response to each drive separately. The combinations that are not excited are
 reported, because the parameters that depend on them (a single force constant, say) are taken as known.
@@ -16,7 +16,7 @@ from avis_ctrl.identification.sparse_space import sparse_rows, whole_numbers
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS
 
-# Samples that are read at once.
+# Samples read at once.
 PIECE = 1 << 18
 
 
@@ -25,7 +25,7 @@ class ExcitedSpace:
     """The excited combinations of the drives (n_u) in a band.
 
     names : of the drives. driven : those that some record excites. unplayed : (d, k) combinations of the k driven ones
-    that no record excites, sparse, in whole numbers where they are.
+        that no record excites, sparse, in whole numbers if possible.
     """
 
     names: tuple[str, ...]
@@ -34,12 +34,12 @@ class ExcitedSpace:
 
     @property
     def full(self) -> bool:
-        """Whether all combinations of the driven ones are excited."""
+        """Whether all combinations of the driven inputs are excited."""
         return not len(self.unplayed)
 
     @property
     def sentence(self) -> str:
-        """What is not excited, in words; empty if everything is."""
+        """Combinations that are not excited, in words; empty if everything is."""
         said = []
         if silent := [name for name in self.names if name not in self.driven]:
             its, it = ("their", "them") if len(silent) > 1 else ("its", "it")
@@ -72,6 +72,6 @@ def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSp
     size = size[driven]
     values, vectors = np.linalg.eigh(gram[np.ix_(driven, driven)] / np.outer(size, size))
     missing = vectors[:, values < SETTINGS.span_tolerance ** 2]
-    # w with w^T u = 0: in volts the entries are over the sizes.
+    # w with w^T u = 0: in volts the entries are divided by the sizes.
     rows = [whole_numbers(row) for row in sparse_rows(missing / size[:, None], 1e-4)] if missing.size else []
     return ExcitedSpace(names, tuple(names[j] for j in driven), np.reshape(rows, (-1, len(driven))))

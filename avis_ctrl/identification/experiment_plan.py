@@ -1,4 +1,4 @@
-"""Candidate experiments, ranked by what they would determine, and the fewest of them that determine everything."""
+"""Candidate experiments, ranked by what they would determine, and a minimum set that determines everything."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ CAUTION = ("These predictions include noise only: added masses, changed position
 class Experiment:
     """A further record or bench measurement.
 
-    words : what to do, as an order. drive : the record, None for none. change : of the rig that it is taken on, as
-    `experiments.changed` has it. bench : relative standard deviations of parameters measured by themselves.
+    words : what to do, as an instruction. drive : the record, None for none. change : of the rig on which it is taken,
+        as arguments of `experiments.changed`. bench : relative standard deviations of parameters measured individually.
     """
 
     words: str
@@ -42,7 +42,7 @@ class Experiment:
     bench: Mapping[str, float] = field(default_factory=dict)
 
     def information(self, model: ResponseModel, noise: Noise) -> Information:
-        """What it would add for the model's free parameters."""
+        """Information that it would add on the model's free parameters."""
         n = len(model.names)
         found = Information(model.names, model.values, model.units, np.zeros((n, n)), size_of(model.values))
         if self.drive is not None:
@@ -56,8 +56,9 @@ class Experiment:
 class Outcome:
     """An experiment added to the present information.
 
-    gained : further combinations determined. alone : parameters that become known by themselves, with their predicted
-    relative standard deviation. tighter : median over what was known before of old over new standard deviation.
+    gained : further combinations determined. alone : parameters that become determined individually, with their
+        predicted relative standard deviation. tighter : ratio of old to new standard deviation, median over what was
+        known before.
     """
 
     experiment: Experiment
@@ -90,11 +91,11 @@ Predictions = list[tuple[Experiment, Information]]
 
 
 def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
-    """What can usually be done with a table; `drive` is the present record.
+    """Experiments that are usually possible with a table; `drive` is the present record.
 
-    Masses are 10 % of the payload, attachments move by 50 mm, the floor is shaken with 0.1 mm/s r.m.s. and measured,
-    a single mount on a test bench is known to 2 %. Sensors and actuators are added on the payload: one on the chassis
-    measures the floor, which is a candidate of its own.
+    Masses are 10 % of the payload, attachments move by 50 mm, the floor is shaken with 0.1 mm/s r.m.s. and measured, a
+    single mount on a test bench is known to 2 %. Sensors and actuators are added on the payload: a sensor on the
+    chassis measures the floor, which is a separate candidate.
     """
     low, high = drive.band_Hz
     rate = 1 / model.period_s if model.period_s else 1000.0
@@ -150,7 +151,7 @@ def _more_channels(model: ResponseModel, drive: Drive) -> list[Experiment]:
 
 
 def _bench(model: ResponseModel) -> list[Experiment]:
-    """Single parameters that a bench or a balance can measure: of each group as many as make the rest known."""
+    """Single parameters that a bench or a balance can measure: from each group as many as determine the rest."""
     null = structural_null_space(model)
     structure = structure_of(null, model.values, model.units, model.names)
     picked = [model.names[j] for group in structure.groups for j in _independent(group.unseen)]
@@ -171,18 +172,18 @@ def _bench(model: ResponseModel) -> list[Experiment]:
 
 
 def _independent(rows: np.ndarray) -> list[int]:
-    """As many columns as there are rows, which a zero in makes any combination of the rows zero."""
+    """Columns, as many as rows, in which no combination of the rows vanishes except the zero combination."""
     scaled = rows / np.max(np.abs(rows), axis=1, keepdims=True)
     return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][:len(rows)].tolist())
 
 
 def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Predictions:
-    """Each experiment with what it would add."""
+    """Each experiment with the information that it would add."""
     return [(one, one.information(model, noise)) for one in experiments]
 
 
 def compared(information: Information, added: Predictions) -> tuple[Outcome, ...]:
-    """What each experiment would add by itself, the best first: most combinations, then the smallest errors."""
+    """Effect of each experiment by itself, the best first: most combinations, then the smallest errors."""
     def rank(one: Outcome) -> tuple[float, ...]:
         error = float(np.median(list(one.alone.values()))) if one.alone else np.inf
         return -one.gained, -len(one.alone), error, -one.tighter
@@ -202,7 +203,7 @@ def _outcome(before: Information, experiment: Experiment, added: Information) ->
 
 
 def planned(information: Information, added: Predictions) -> tuple[Outcome, ...]:
-    """Experiments one after the other, each the one that adds most to those before; ends when nothing is gained."""
+    """Sequence of experiments, each adding the most to those before it; ends when nothing is gained."""
     chosen: list[Outcome] = []
     now = information
     while now.rank < len(now.names):
@@ -217,7 +218,8 @@ def planned(information: Information, added: Predictions) -> tuple[Outcome, ...]
 def needed_experiment(information: Information, model: ResponseModel, drive: Drive, noise: Noise,
                       experiments: Sequence[Experiment] | None = None,
                       report: IdentifiabilityReport | None = None) -> tuple[str, ...]:
-    """Sentences: what determines what is missing, what does not, and the fewest experiments found for all of it."""
+    """Sentences: what determines the missing combinations, what does not, and the shortest sequence found for all of
+    them."""
     report = report or identifiability_report(information, model)
     missing = len(information.names) - information.rank
     if not missing:

@@ -1,15 +1,15 @@
-"""Which further record would determine what the present data do not, predicted from the model alone.
+"""Predicted information of a further record, from the model alone, to find what the present data do not determine.
 
 A record of duration T with the spectra U at the inputs adds the information
 
     H = 2 sum_k Re( dY_k^H inv(C_k) dY_k ),    dY_k = dG_k / dtheta U_k,
 
 with C_k the covariance of the noise on a line (Pintelon and Schoukens 2012, section 9.11). Lines are summed by an
-integral over frequency: a representative line stands for as many as the record has about it. The transient is left
-out, which matters for records of a few periods of the lowest mode.
+integral over frequency: a representative line counts as many times as the record has lines around it. The transient is
+neglected, which matters for records of a few periods of the lowest mode.
 
-A changed rig (a mass on the payload, an isolator moved) shares its parameters with the present one; what was changed
-counts as known exactly.
+A changed rig (a mass on the payload, an isolator moved) has the same parameters as the present one; the changes
+themselves are taken as known exactly.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Place = tuple[float, float, float]
 
 
 class Added(NamedTuple):
-    """Calibrated sensor of the rig's own kind, or actuator, at a place [m] of the payload along a direction.
+    """Calibrated sensor of the rig's own kind, or actuator, at a position [m] on the payload along a direction.
 
     force : N/V of an actuator.
     """
@@ -45,15 +45,15 @@ class Added(NamedTuple):
 
     @property
     def row(self) -> np.ndarray:
-        """(6,) displacement along it by q; of an actuator, generalised force by volts."""
+        """(6,) displacement along it by q; for an actuator, generalised force by volts."""
         return self.force * np.array(self.direction) @ point_map(self.place)
 
 
 @dataclass(frozen=True, eq=False)
 class ChangedModel(ResponseModel):
-    """A model with known masses, sensors and actuators added, and parameters moved by known amounts.
+    """A model with known masses, sensors and actuators added, and parameters changed by known amounts.
 
-    masses : (kg, place) each, a point mass. The parameters stay those of the rig without them.
+    masses : (kg, place) each, a point mass. The parameters remain those of the rig without them.
     """
 
     masses: tuple[tuple[float, Place], ...] = ()
@@ -61,7 +61,7 @@ class ChangedModel(ResponseModel):
     more_actuators: tuple[Added, ...] = ()
 
     def __post_init__(self) -> None:
-        self._own()  # refuses what the rig does not have
+        self._own()  # raises for names that the rig does not have
 
     def matrices_of(self, rig: Rig) -> Matrices:
         own = self._own().matrices_of(rig)
@@ -70,7 +70,7 @@ class ChangedModel(ResponseModel):
         return own._replace(M=M, R=R, T=np.column_stack([own.T, *(one.row for one in self.more_actuators)]))
 
     def _own(self) -> ResponseModel:
-        """With the rig's own channels and parameters alone."""
+        """The model with only the rig's own channels and parameters."""
         n_y, n_u = (len(all_) - len(more) for all_, more in ((self.sensors.names, self.more_sensors),
                                                              (self.actuators, self.more_actuators)))
         names = tuple(name for name in self.names if name in self.rig.parameters())
@@ -84,14 +84,14 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
     """The model of the changed rig, with the same free parameters.
 
     shifts : known changes of parameters of the rig, in their units (isolator1.p_z and so on). Raises InputError for
-    names that the rig does not have, and where no rig has the values.
+        names that the rig does not have, and if no rig has the values.
     """
     known = model.rig.parameters()
     if unknown := [name for name in (shifts or {}) if name not in known]:
         raise InputError(f"expected parameters of the rig {model.rig.name}", field="shifts", value=unknown)
     rig = model.rig.with_parameters({name: known[name].value + shift for name, shift in (shifts or {}).items()})
     own = len(model.sensors.names)
-    # Of the kind of the first, with the mean sensitivity of that kind.
+    # Added sensors are of the kind of the first one, with the mean sensitivity of that kind.
     gain = float(np.mean([value for value, motion in zip(model.sensors.sensitivity, model.sensors.motions, strict=True)
                           if motion == model.sensors.motions[0]]))
     bank = replace(model.sensors.picked([*range(own), *([0] * len(sensors))]),
@@ -109,7 +109,8 @@ class Noise(NamedTuple):
     covariance: np.ndarray
 
     def at(self, omega: np.ndarray, n_y: int) -> np.ndarray:
-        """(.., n_y, n_y) on the nearest lines; channels beyond the measured ones have the median power, independent."""
+        """(.., n_y, n_y) on the next line at or above omega; channels beyond the measured ones have the median power,
+        independent."""
         own = self.covariance[np.clip(np.searchsorted(self.omega, omega), 0, len(self.omega) - 1)]
         n_own = own.shape[1]
         middle = np.median(np.real(np.einsum("nii->ni", own)), axis=1)
@@ -119,9 +120,9 @@ class Noise(NamedTuple):
 
 
 def campaign_noise(blocks: Sequence[SpectralBlock]) -> Noise:
-    """What a fit estimated, of the record that has most lines.
+    """Noise that a fit estimated, of the record with the most lines.
 
-    Raises InputError where there is no noise estimate of records.
+    Raises InputError if there is no noise estimate of records.
     """
     records = [one for one in blocks if one.noise is not None and one.transient]
     if not records:
@@ -152,7 +153,7 @@ class Drive:
 
 
 def predicted_information(model: ResponseModel, drive: Drive, noise: Noise) -> Information:
-    """What a record would tell of the model's free parameters."""
+    """Information of a record on the model's free parameters."""
     rate = 1 / model.period_s if model.period_s else 1000.0
     low, high = drive.band_Hz[0], min(drive.band_Hz[1], 0.45 * rate)
     if low >= high:

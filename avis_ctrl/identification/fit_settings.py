@@ -1,4 +1,4 @@
-"""Every tuning value of a fit within priors, with its unit, its meaning and the reason for it."""
+"""All tuning values of a fit with priors, with unit, meaning and reason."""
 
 from __future__ import annotations
 
@@ -9,39 +9,41 @@ from dataclasses import dataclass
 class FitSettings:
     """Values that no data determine; all of them are part of a result's provenance.
 
-    stiffness_percent : prior standard deviation of mass, moments of inertia and stiffnesses [%]; a rig file is drawn
-        from scales and data sheets.
-    damping_percent : the same of dampings [%], which data sheets hardly state.
-    unknown_percent : standard deviation [%] about where a fit begins, of parameters of which nothing is stated: far
-        more than data leave open of what they determine, and little enough that the rest stays where it was (Levenberg
-        and Marquardt's damping, as a prior).
-    lines : spectral lines of a record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
-        twice as many make the estimate of the unexplained part precise.
-    residual_lines : lines of a record from whose residuals an identification estimates the noise. Not all of them are
-        fitted: path errors are independent from band to band in the model, unexplained effects are not, and with
-        all lines the fit moved tolerances by seven standard deviations instead of two.
-    final_rounds : `rounds` of the fit after the second-order terms were formed anew; it begins where the other ended.
-    bands_per_octave : bands over which the relative error of a path counts as constant; a third of an octave is what a
-        mode's flank takes to change by a factor of two.
-    least_error : relative error of every path that nobody can exclude [1], the scale of its prior: cables, threads and
+    stiffness_percent : prior standard deviation of mass, moments of inertia and stiffnesses [%]; a rig file is based on
+        scales and data sheets.
+    damping_percent : the same for dampings [%], which data sheets hardly state.
+    unknown_percent : standard deviation [%] about the start of a fit, for parameters without a stated prior: much
+        larger than the uncertainty of what the data determine, and small enough that the rest stays where it was
+        (Levenberg-Marquardt damping, as a prior).
+    lines : spectral lines per record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
+        twice as many give a precise estimate of the unexplained part.
+    residual_lines : lines per record from whose residuals an identification estimates the noise. Not all of them are
+        fitted: path errors are independent between bands in the model, unexplained effects are not, and with all lines
+        the fit moved tolerances by seven standard deviations instead of two.
+    final_rounds : `rounds` of the fit after the second-order terms were recomputed; it starts where the previous fit
+        ended.
+    bands_per_octave : bands over which the relative error of a path is taken as constant; over a third of an octave the
+        flank of a mode changes by a factor of two.
+    least_error : relative error that cannot be excluded for any path [1], the scale of its prior: cables, threads and
         glue change a response by 0.1 % from day to day.
-    error_weight : degrees of freedom of the priors of the variances; two, the least with a finite mean of the
+    error_weight : degrees of freedom of the priors of the variances; two, the minimum for a finite mean of the
         precision.
     first_error : relative error of the paths in the first fit [1], before any residual is known.
-    climbs : steps up the likelihood of the variances in each estimate.
-    rounds, settled : most estimates of the variances, each from the fit before it, and rise of the log-likelihood
-        [nats] below which they end: well below what decides between two effects.
+    climbs : ascent steps of the likelihood of the variances in each estimate.
+    rounds, settled : maximum number of estimates of the variances, each from the fit before it, and rise of the
+        log-likelihood [nats] below which they stop: well below what decides between two effects.
     iterations : Gauss-Newton steps between two estimates of the variances.
-    first_distortion : distortion in the first fit, over the square of `first_error` [1].
-    least_distortion : distortion that nobody can exclude, over the noise [1], the scale of its prior: the noise's own
-        estimate leaves as much open.
-    least_eigenvalue : of the path errors' covariance over that of the noise, below which a direction is left out [1].
-    least_elsewhere : fraction of the information on a combination of parameters that an octave or a level must leave
-        to others to be compared with them [1]: of what one octave alone determines, the others say nothing, and
-        round-off of the fit would count a hundredfold.
-    damping : factor between the dampings that are tried until a step descends [1].
-    shortest_step : part of a Gauss-Newton step, along what the data determine best, below which no shorter one is
-        tried [1].
+    first_distortion : distortion in the first fit, relative to the square of `first_error` [1].
+    least_distortion : distortion that cannot be excluded, relative to the noise [1], the scale of its prior: the
+        estimate of the noise has about this uncertainty.
+    least_eigenvalue : eigenvalue of the path errors' covariance, relative to the noise, below which a direction is
+        omitted [1].
+    least_elsewhere : minimum fraction of the information on a combination of parameters that must lie outside an octave
+        or a level for a comparison [1]: if one octave alone determines a combination, the others say nothing about it,
+        and round-off of the fit would count a hundredfold.
+    damping : factor between successive dampings that are tried until a step descends [1].
+    shortest_step : minimum length of a step that is tried, relative to the Gauss-Newton step, along the best determined
+        direction [1].
     converged : change of the penalised sum of squares, relative to the number of data, below which a fit has converged.
     """
 

@@ -1,4 +1,4 @@
-"""Which combinations of a rig's parameters the data determine, which they do not, in words."""
+"""Combinations of a rig's parameters that the data determine, and those that they do not, in words."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from avis_ctrl.identification.information import UNDETERMINED, Combination, Info
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.structure import Structure, size_of, structural_null_space, structure_of
 
-# A combination known to worse than this share of its value is called weak.
+# Relative standard deviation above which a combination is called weak.
 WEAK = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiabilityReport:
-    """What an information matrix says.
+    """Interpretation of an information matrix.
 
     Attributes
     ----------
     rank, condition : how many combinations are determined, conditioning of those.
-    combinations : as many as the structure leaves; their standard deviation may still be infinite, where the data are
-        too poor. unseen : what no such data show, in the parameters' units. sentences : all of it in words.
+    combinations : as many as the structure allows; their standard deviation may still be infinite if the data are too
+        poor. unseen : directions that no such data show, in the parameters' units. sentences : all of it in words.
     """
 
     information: Information
@@ -51,8 +51,8 @@ def identifiability_report(information: Information, model: ResponseModel | None
 
     Parameters
     ----------
-    model : separates what no data could show (exactly) from what these data show too poorly. Without it all that the
-        information leaves undetermined is taken for the former, with the precision of round-off.
+    model : separates what no data could show (exactly) from what these data show too poorly. Without it, everything
+        that the information leaves undetermined is taken as the former, with the precision of round-off.
     floor : whether a record with measured floor is part of the data.
     priors : standard deviations of parameters that are part of the information.
 
@@ -70,7 +70,7 @@ def identifiability_report(information: Information, model: ResponseModel | None
     else:
         own = _orthonormal(structural_null_space(model, floor) * (size_of(model.values) / information.scale)[:, None])
         null = _left_dark(information, own)
-        # Relative units of the structure are those of the values.
+        # The structure uses relative units of the values.
         structure = structure_of(_orthonormal(null * (information.scale / size_of(values))[:, None]), values, units,
                                  names)
     combinations = _combinations(information, structure)
@@ -87,7 +87,7 @@ def _orthonormal(basis: np.ndarray) -> np.ndarray:
 
 
 def _left_dark(information: Information, null: np.ndarray) -> np.ndarray:
-    """The directions of a null space of the equations on which priors bring no information either."""
+    """Directions of a null space of the equations on which priors give no information either."""
     if not null.shape[1]:
         return null
     inside = null.T @ information.relative @ null
@@ -103,7 +103,7 @@ def _combinations(information: Information, structure: Structure) -> tuple[Combi
 
 
 def _combination(information: Information, structure: Structure, row: np.ndarray) -> Combination:
-    """The sum row @ theta, multiplied by powers of the pins that make it blind to the scalings."""
+    """The sum row @ theta, multiplied by powers of the pins that make it invariant to the scalings."""
     values, units, names = information.values, information.units, information.names
     inside = np.flatnonzero(row)
     value, gradient = float(row @ values), np.array(row, float)

@@ -1,4 +1,4 @@
-"""Sentences on what is determined, for a mechanical engineer."""
+"""Sentences on determined and undetermined parameters, for a mechanical engineer."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def combination_text(terms: Iterable[tuple[str, float]], powers: Sequence[tuple[str, float]] = ()) -> str:
-    """A weighted sum, times powers of other parameters; terms of weight zero are left out."""
+    """A weighted sum, times powers of other parameters; terms of weight zero are omitted."""
     text, terms = "", [(name, weight) for name, weight in terms if weight]
     for name, weight in terms:
         size = "" if abs(weight) == 1 else f"{abs(weight):.4g} "
@@ -73,7 +73,7 @@ def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
 
 
 def _coefficients(one: Combination) -> str:
-    """What stands in front of the names in a sum."""
+    """Coefficients of the names in a sum."""
     inner = one.words.partition(")")[0].removeprefix("(") if one.words.startswith("(") else one.words
     return "".join(term.strip().rpartition(" ")[0] for term in inner.split(" + "))
 
@@ -83,7 +83,7 @@ def _upper(text: str) -> str:
 
 
 def kinds(exponents: np.ndarray, information: Information, of: float) -> list[str]:
-    """Kinds of parameters with this exponent; single ones by name."""
+    """Kinds of parameters with this exponent; a single parameter by its name."""
     members: dict[str, list[str]] = {}
     for name, unit, exponent in zip(information.names, information.units, exponents, strict=True):
         if exponent == of:
@@ -122,7 +122,7 @@ def weak_sentence(one: Combination) -> str:
 
 
 def main_members(names: Sequence[str], direction: np.ndarray) -> list[tuple[str, float]]:
-    """The members that carry nine tenths of a unit vector, the largest first, in positive direction."""
+    """Members with nine tenths of a unit vector's squared length, the largest first, in positive direction."""
     order = np.argsort(-np.abs(direction))
     count = int(np.searchsorted(np.cumsum(direction[order] ** 2), 0.9)) + 1
     return [(names[j], float(np.sign(direction[order[0]]) * direction[j])) for j in order[:count]]

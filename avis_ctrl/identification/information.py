@@ -1,4 +1,4 @@
-"""The information that data hold of parameters, its rank, and the Cramer-Rao bound of what is determined."""
+"""Fisher information on parameters, its rank, and the Cramer-Rao bound of the determined combinations."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 
-# A direction known to worse than this, as a fraction of the parameters' own size, is not determined.
+# A direction with a larger standard deviation, relative to the parameters' size, is not determined.
 UNDETERMINED = 1.0
-# Share of a combination that may lie in directions without any information: what round-off turns them by.
+# Fraction of a combination that may lie in directions without any information: their rotation by round-off.
 ROUNDED = 1e-3
 
 
@@ -22,7 +22,7 @@ class Combination:
     """A combination of parameters.
 
     weights : derivative of its value by each parameter. value : of the expression, with its standard deviation
-    (infinite where it is not determined). words : the expression, such as "isolator1.k_x + isolator2.k_x".
+        (infinite if it is not determined). words : the expression, such as "isolator1.k_x + isolator2.k_x".
     """
 
     weights: Mapping[str, float]
@@ -46,13 +46,13 @@ class Information:
 
     Attributes
     ----------
-    names, units : n_p. values : (n_p,) where it was computed.
-    matrix : (n_p, n_p) J^T J of the whitened residuals, in the parameters' units; priors included where given.
-    scale : (n_p,) size of each parameter, which makes relative units.
+    names, units : n_p. values : (n_p,) at which it was computed.
+    matrix : (n_p, n_p) J^T J of the whitened residuals, in the parameters' units; priors included if given.
+    scale : (n_p,) size of each parameter, which defines relative units.
 
     Raises
     ------
-    InputError : shapes that do not belong together, numbers that are not finite, scales that are not positive.
+    InputError : shapes that do not fit together, numbers that are not finite, scales that are not positive.
     """
 
     names: tuple[str, ...]
@@ -81,10 +81,10 @@ class Information:
 
     @cached_property
     def directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Relative standard deviations (n_p,), best known first, and orthonormal directions (columns).
+        """Relative standard deviations (n_p,) in ascending order, and orthonormal directions (columns).
 
-        Infinite where the information is no more than round-off of its largest part: a data matrix without any
-        information on a direction looks like that, however precise the rest is.
+        Infinite where the information is no more than round-off of its largest eigenvalue: a direction without any
+        information in the data looks like that, however precise the rest is.
         """
         values, vectors = np.linalg.eigh((self.relative + self.relative.T) / 2)
         values, vectors = values[::-1], vectors[:, ::-1]
@@ -100,7 +100,7 @@ class Information:
 
     @cached_property
     def null_space(self) -> np.ndarray:
-        """(n_p, n_p - rank) orthonormal, relative: what the data do not determine."""
+        """(n_p, n_p - rank) orthonormal, relative: directions that the data do not determine."""
         return self.directions[1][:, ~self.determined]
 
     @property
@@ -109,7 +109,7 @@ class Information:
 
     @property
     def condition(self) -> float:
-        """Of the relative information on the determined directions."""
+        """Condition number of the relative information on the determined directions."""
         sigma = self.directions[0][self.determined]
         return float((sigma[-1] / sigma[0]) ** 2) if sigma.size else np.inf
 
@@ -122,18 +122,18 @@ class Information:
 
     @cached_property
     def known(self) -> np.ndarray:
-        """(n_p,) which single parameters are determined by themselves."""
+        """(n_p,) which parameters are determined individually."""
         return np.isfinite(self.standard_deviation)
 
     @cached_property
     def standard_deviation(self) -> np.ndarray:
-        """(n_p,) of each parameter by itself; infinite where only combinations of it are determined."""
+        """(n_p,) of each parameter individually; infinite if only combinations of it are determined."""
         return np.array([self.of(row)[1] for row in np.eye(len(self.names))])
 
     def of(self, weights: Sequence[float] | np.ndarray) -> tuple[float, float]:
-        """Value and standard deviation of a linear combination (n_p,); infinite where it is not determined.
+        """Value and standard deviation of a linear combination (n_p,); infinite if it is not determined.
 
-        A small share in a weakly known direction counts with that direction's whole uncertainty.
+        A small component in a weakly determined direction counts with that direction's whole uncertainty.
         """
         w = np.asarray(weights, float)
         if w.shape != (len(self.names),) or not np.any(w):
@@ -147,14 +147,14 @@ class Information:
         return float(w @ self.values), np.inf if lost else spread
 
     def plus(self, other: Information) -> Information:
-        """With independent data added."""
+        """The information with that of independent data added."""
         if other.names != self.names:
             raise InputError(f"expected the same parameters, {', '.join(self.names)}", field="information",
                              value=other.names)
         return replace(self, matrix=self.matrix + other.matrix)
 
     def with_priors(self, deviations: Mapping[str, float]) -> Information:
-        """With independent knowledge of single parameters: standard deviations in their units."""
+        """The information with independent knowledge of single parameters added: standard deviations in their units."""
         diagonal = np.zeros(len(self.names))
         for name, sigma in deviations.items():
             if name not in self.names:
@@ -164,7 +164,7 @@ class Information:
         return replace(self, matrix=self.matrix + np.diag(diagonal))
 
     def of_some(self, names: Sequence[str]) -> Information:
-        """Of some of the parameters, whatever the others are (Schur complement)."""
+        """Information on some of the parameters, with the others marginalised (Schur complement)."""
         keep = np.array([self.names.index(name) for name in names], int)
         rest = np.setdiff1d(np.arange(len(self.names)), keep)
         across = self.relative[np.ix_(keep, rest)]
@@ -174,7 +174,7 @@ class Information:
                            left / np.outer(scale, scale), scale)
 
     def along(self, other: Information) -> Information:
-        """Only on the directions that another information of the same parameters determines."""
+        """Information restricted to the directions that another information on the same parameters determines."""
         V = other.directions[1][:, other.determined]
         P = (V @ V.T) * np.outer(other.scale, 1 / other.scale)
         return replace(self, matrix=P.T @ self.matrix @ P)

@@ -1,8 +1,8 @@
-"""What large rotations add to the linear table: second-order terms that every table has.
+"""Second-order terms of large rotations, which every table has in addition to its linear model.
 
-The nonlinear table of Rademakers (eqs. 2.1-2.21, `rigs.nonlinear`) less its linearisation, as an acceleration of the
-payload. The source leaves open whether motors and sensors turn with the payload (its forces act along earth axes, its
-sensors sit on the payload): `Turning` states it for each.
+They are the nonlinear table of Rademakers (eqs. 2.1-2.21, `rigs.nonlinear`) minus its linearisation, as an acceleration
+of the payload. The source does not specify whether motors and sensors turn with the payload (its forces act along earth
+axes, its sensors are on the payload): `Turning` specifies it for each.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from avis_ctrl.rigs.rig import Rig
 
 
 class Turning(NamedTuple):
-    """Share of the payload's rotation that turns the axes of the motors, and those of the sensors: 0 for axes fixed in
-    space, as the simulator of this package has them, and 1 for axes fixed to the payload."""
+    """Fraction of the payload's rotation by which the axes of the motors and of the sensors turn: 0 for axes fixed in
+    space, as in the simulator of this package, and 1 for axes fixed to the payload."""
 
     motors: float = 0.0
     sensors: float = 0.0
 
     @property
     def sentence(self) -> str:
-        """In words."""
+        """Description in words."""
         def of(share: float) -> str:
             return "turn with the table" if share > 0.5 else "keep their direction in space"
         return (f"the model includes second-order terms of the table's rotations, in which the motors' axes "
@@ -36,7 +36,7 @@ AS_SIMULATED = Turning()
 
 
 def sensors_of(rig: Rig, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Places (n_y, 3) [m] and directions (n_y, 3) of the named sensors on the payload."""
+    """Positions (n_y, 3) [m] and directions (n_y, 3) of the named sensors on the payload."""
     axes = rig.sensor_axes()
     place, direction = (np.array([axes[name][k] for name in names], float).reshape(-1, 3) for k in (0, 1))
     return place, direction
@@ -44,8 +44,8 @@ def sensors_of(rig: Rig, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray
 
 def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sensors: tuple[str, ...]
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Second-order force of the table and of turned motors (samples, 6), and acceleration (samples, n_y) read by turned
-    sensors.
+    """Second-order force of the table (samples, 6), force added by turned motors (samples, 6), and acceleration
+    (samples, n_y) added to the readings of turned sensors.
 
     q, q_dot : (samples, 6) payload relative to the chassis. u : (samples, n_u) acting volts.
     """
@@ -60,7 +60,7 @@ def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sens
 
 @njit(cache=True)
 def _along(q, q_dot, u, arrays):
-    """Accelerations (n, 6), and forces (n, 6) of turned motors."""
+    """Accelerations (n, 6), and forces (n, 6) added by turned motors."""
     acceleration, turned = np.empty_like(q), np.empty_like(q)
     still = np.zeros(6)
     for k in range(len(q)):
@@ -79,7 +79,7 @@ def _turned_readings(q, q_dot, q_ddot, place, direction):
 
 @njit(cache=True)
 def turned_force(out, q, u, arrays):
-    """out (6,): what motors push beside their force when their axes turn by the payload's small rotation."""
+    """out (6,): force added by the motors when their axes turn by the payload's small rotation."""
     for i in range(6):
         out[i] = 0.0
     for k in range(u.shape[0]):
@@ -97,8 +97,8 @@ def turned_force(out, q, u, arrays):
 
 @njit(cache=True)
 def turned_reading(out, q, q_dot, q_ddot, place, direction):
-    """out (n_y,): acceleration that sensors read beside the linear one when they ride on the payload: their axes turn
-    by its rotation, and their places move with its square (3-2-1 angles, as `rigs.nonlinear` has them)."""
+    """out (n_y,): acceleration that sensors on the payload measure in addition to the linear one: their axes turn by
+    its rotation, and their positions move with its square (3-2-1 angles, as in `rigs.nonlinear`)."""
     a, v, w = q[3:], q_dot[3:], q_ddot[3:]
     # Second derivatives of the products of angles in the rotation matrix.
     s11, s22, s33 = 2 * (w[0] * a[0] + v[0] ** 2), 2 * (w[1] * a[1] + v[1] ** 2), 2 * (w[2] * a[2] + v[2] ** 2)
@@ -119,10 +119,10 @@ def turned_reading(out, q, q_dot, q_ddot, place, direction):
 class March(NamedTuple):
     """A sampled table with its second-order terms, from sample to sample.
 
-    Phi (N, N); held, ramp (N, 6 + n_y): what constant and rising accelerations of the payload, and beside those read
-    by the sensors, add in a period. body (6, 15), of volts (6, n_u), of floor velocity (6, 3): acceleration of the
-    linear table. amplifiers : index of the first of their states, -1 for none. order : (n_u,) of the model's actuators
-    among the body's. inverse (6, 6) of the mass matrix.
+    Phi (N, N); held, ramp (N, 6 + n_y): contributions over a period of constant and rising accelerations of the
+    payload, and of those added to the sensors' readings. body (6, 15), of_volts (6, n_u), of_floor (6, 3): acceleration
+    of the linear table. amplifiers : index of the first of their states, -1 for none. order : (n_u,) indices of the
+    model's actuators among the body's. inverse (6, 6) of the mass matrix.
     """
 
     Phi: np.ndarray
@@ -142,11 +142,12 @@ class March(NamedTuple):
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
 def march(drive, volts, floor, x, before, started, table, arrays, states, beside):
-    """Steps through a piece.
+    """Step through a piece of a record.
 
-    drive : (n, N) what inputs add to the state in a period. volts (n, n_u), floor (n, 3): acting at its start.
-    x : (N,) state at the start, changed. before : (6 + n_y,) second-order terms of the sample before, changed;
-    started : whether there is one. states (n, N), beside (n, 6 + n_y) : what comes out.
+    drive : (n, N) contribution of the inputs to the state over a period. volts (n, n_u), floor (n, 3): acting at its
+        start.
+    x : (N,) state at the start, modified. before : (6 + n_y,) second-order terms of the previous sample, modified;
+        started : whether there is one. states (n, N), beside (n, 6 + n_y), the second-order terms : outputs.
     """
     N, n_u, n_e = x.shape[0], volts.shape[1], before.shape[0]
     q, q_dot, floor_q, floor_v = np.empty(6), np.empty(6), np.zeros(6), np.zeros(6)
@@ -199,7 +200,7 @@ def march(drive, volts, floor, x, before, started, table, arrays, states, beside
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
 def march_linear(drive, x, Phi, states):
-    """As `march`, of the linear table."""
+    """`march` for the linear table."""
     N = x.shape[0]
     after = np.empty(N)
     for k in range(drive.shape[0]):

@@ -1,8 +1,8 @@
-"""Fit of a table to records by penalised least squares, with the evidence for the model (Laplace).
+"""Fit of a table to records by penalised least squares, with the model evidence by Laplace's approximation.
 
     -2 log p(y, z) = |e(z)|^2 + log det C + |z|^2,    evidence = p(y, z) / sqrt(det(J J^T + I))
 
-z are standardised parameters; the whitened residual e is free of the transients of the records.
+z are standardised parameters; the transients of the records are projected out of the whitened residual e.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Data:
 
     @staticmethod
     def of(blocks: Sequence[SpectralBlock], levels: Mapping[str, float], lines: int) -> Data:
-        """Some lines of each block; levels [V] by record. Equal lines are one array, so that models keep what they have
-        computed on them (`response.kept_lines`)."""
+        """Some lines of each block; levels [V] by record. Equal lines are one array, so that models can reuse what they
+        have computed on them (`response.kept_lines`)."""
         known: dict[bytes, np.ndarray] = {}
         few = [thinned(block, lines) for block in blocks]
         shared = (replace(block, omega=known.setdefault(block.omega.tobytes(), block.omega)) for block in few)
@@ -54,7 +54,8 @@ class Data:
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """e (N,) whitened residual, J (n, N) its negative derivative by z, left (n, n_y) a block in the unit of y."""
+    """e (N,) whitened residual, J (n, N) its negative derivative by z, left (n, n_y) residual per block in the unit of
+    y."""
 
     e: np.ndarray
     J: np.ndarray
@@ -65,10 +66,10 @@ class Evaluated:
 class Fitted:
     """The most probable parameters of a model.
 
-    model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of what is not explained.
-    log_evidence : Laplace. log_likelihoods : by level and band; what is in the evidence beside their sum is of priors.
+    model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of path errors and distortion.
+    log_evidence : Laplace. log_likelihoods : by level and band; the remainder of the evidence comes from the priors.
     iterations : Gauss-Newton steps. settings : of the fit. weights : of the data. white : residual and Jacobian,
-    whitened by noise and distortion; both empty once only the evidence is of interest (`bare`).
+        whitened by noise and distortion; both empty once only the evidence is needed (`bare`).
     """
 
     model: Any
@@ -84,12 +85,12 @@ class Fitted:
     white: Evaluated
 
     def bare(self) -> Fitted:
-        """Without residual, Jacobian and weights, which take most of the memory."""
+        """The fit without residual, Jacobian and weights, which take most of the memory."""
         return replace(self, weights=Weights((), (), {}, {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
 
     @cached_property
     def e(self) -> np.ndarray:
-        """(N,) residual, path errors integrated out."""
+        """(N,) residual, with the path errors integrated out."""
         return self.weights.flatten(self.white.e[None])[0]
 
     @cached_property
@@ -104,11 +105,11 @@ class Fitted:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Effects of the model but the second-order terms."""
+        """Effects of the model, except the second-order terms."""
         return tuple(self.model.labels)
 
     def moved(self, names: Sequence[str]) -> tuple[Tolerance, ...]:
-        """Of values of the rig file that have a tolerance, the most moved first."""
+        """Values of the rig file that have a tolerance, those that moved most first."""
         units = dict(zip(self.model.names, self.model.units, strict=True))
         at = [self.priors.names.index(name) for name in names]
         values, slopes = self.priors.values(self.z), self.priors.slopes(self.z)
@@ -118,9 +119,10 @@ class Fitted:
         return tuple(sorted(found, key=lambda one: -abs(one.moved)))
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
-        """(k, k) of some parameters in their units; zero for those that are not free.
+        """(k, k) of some parameters in their units; zero for parameters that are not free.
 
-        In every direction at least what the model says, and what octaves and levels differ by (`clusters`).
+        In every direction at least the covariance of the model and those from differences of octaves and levels
+        (`clusters`).
         """
         free = [k for k, name in enumerate(names) if name in self.priors.names]
         rows = [self.priors.names.index(names[k]) for k in free]
@@ -132,16 +134,16 @@ class Fitted:
         return found
 
     def whole_covariance(self) -> np.ndarray:
-        """(n, n) of all parameters in their units: that of the model times one factor, by how much more octaves or
-        levels differ than it expects. The factor is a mean over all directions, of which there are more than octaves.
-        """
+        """(n, n) of all parameters in their units: that of the model times one factor, by which octaves or levels
+        differ more than it predicts. The factor is a mean over all directions, because there are more directions than
+        octaves."""
         ratios = [float(np.mean(np.diag(np.linalg.solve(self.covariance, one)))) for one in self._by_clusters]
         slopes = self.priors.slopes(self.z)
         return np.asarray(max(1.0, *ratios) * self.covariance * slopes * slopes[:, None])
 
     @cached_property
     def _by_clusters(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, n) covariances of z by what octaves and what levels differ by; the model's own for a fit without its
+        """(n, n) covariances of z from the differences of octaves and of levels; the model's own for a fit without its
         residual, or with one cluster."""
         if not len(self.white.e):
             return self.covariance, self.covariance
@@ -157,7 +159,7 @@ class Fitted:
 
 
 def first_variances(data: Data, settings: FitSettings) -> Variances:
-    """Where nothing is known yet: a relative error of every path, and distortion as a part of it."""
+    """Initial variances: a relative error of every path, and distortion as a fraction of it."""
     path: dict[int, np.ndarray] = {}
     distortion: dict[Group, np.ndarray] = {}
     count: dict[Group, int] = {}
@@ -174,7 +176,7 @@ def first_variances(data: Data, settings: FitSettings) -> Variances:
 
 @dataclass(frozen=True, eq=False)
 class _Expansion:
-    """The penalised sum of squares about z (n,): cost + |z|^2 at z, H (n, n) and g (n,) of cost by a step."""
+    """Quadratic expansion of the penalised sum of squares at z (n,): cost + |z|^2, with H (n, n) and g (n,) of cost."""
 
     model: Any
     z: np.ndarray
@@ -190,19 +192,20 @@ class _Expansion:
 
 class _Expand(Protocol):
     def __call__(self, z: np.ndarray, derivative: bool = True) -> _Expansion:
-        """About z; without derivative the sum of squares alone. InputError where no rig has these values."""
+        """Expansion at z; without derivative only the sum of squares. Raises InputError if no rig has these values."""
 
 
 def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
             ) -> tuple[_Expansion, int]:
-    """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and how many steps
-    there were.
+    """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and the number of
+    steps.
 
-    No parameter leaves its bounds; where one has reached its bound, the others still find their optimum.
+    All parameters stay within their bounds; with a parameter at its bound, the remaining ones still reach their
+    optimum.
 
-    Damping shortens a step where the data say little, and leaves it where they say much. Along a combination that they
-    hardly determine, well determined ones bend more than an expansion shows; a step that is shortened as a whole
-    hardly corrects these, and descends in ever shorter ones.
+    Damping shortens a step along poorly determined directions and hardly changes it along well determined ones. Along a
+    poorly determined combination, the effect on well determined ones is more nonlinear than the expansion shows.
+    Shortening the step as a whole hardly corrects this, and leads to ever shorter steps.
     """
     needed, bounds = 0.0, priors.bounds
     at = expand(np.clip(z, *bounds))
@@ -213,14 +216,14 @@ def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, set
         for damping in _dampings(at.H, needed, settings):
             z = _bounded_step(at, damping, bounds) if damping else undamped
             try:
-                # Of a step that may well be refused the derivative is not needed yet.
+                # For a step that may be rejected, the derivative is not needed yet.
                 if not (damping or needed) or expand(z, derivative=False).whole < at.whole:
                     after = expand(z)
                     if after.whole < at.whole:
                         at, needed = after, damping
                         break
             except InputError:
-                pass  # no rig has these values: a shorter step
+                pass  # no rig has these values: try a shorter step
         else:
             return at, steps
     return at, iterations
@@ -229,8 +232,8 @@ def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, set
 def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """z (n,) after a damped Gauss-Newton step within bounds.
 
-    Parameters that would leave their bounds are moved to them, and the step of the others is solved again. A parameter
-    at its bound stays there while the sum of squares falls only beyond it.
+    Parameters that would leave their bounds are set to them, and the step of the remaining ones is solved again. A
+    parameter stays at its bound as long as the sum of squares decreases only beyond it.
     """
     slope, (low, high) = at.g - at.z, bounds
     M = at.H + (1 + damping) * np.eye(len(at.z))
@@ -249,8 +252,8 @@ def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.n
 
 
 def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[float]:
-    """Dampings to be tried: none; then from somewhat less than the last one needed on, to what leaves next to nothing
-    of a Gauss-Newton step."""
+    """Dampings to try: none; then increasing from somewhat below the last one needed, until almost nothing of a
+    Gauss-Newton step remains."""
     yield 0.0
     damping, most = max(last / settings.damping ** 2, 1.0), (1 + np.linalg.norm(H, 2)) / settings.shortest_step
     while damping < most:
@@ -286,18 +289,18 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     H = at.H + np.eye(len(at.z))
     log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
-    # By eigenvalues, because rounding leaves `inv` neither symmetric nor positive definite where the data say little.
+    # By eigenvalues: with poorly determined directions, round-off makes `inv` neither symmetric nor positive definite.
     size, vectors = np.linalg.eigh(H)
-    root = vectors / np.sqrt(np.maximum(size, 1.0))  # the priors' 1 is the least there can be
+    root = vectors / np.sqrt(np.maximum(size, 1.0))  # the priors contribute at least 1
     return Fitted(at.model, priors, at.z, root @ root.T, variances, float(log_evidence), by_group, steps,
                   settings, weights, at.now)
 
 
 def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:
-    """The fit with path errors at the least there are, so that distortion stands for what is not explained.
+    """The fit with minimum path errors, so that distortion represents everything that is not explained.
 
-    Path errors take what is missing from the model out of the residual, and with it what shows where a missing effect
-    lies. Its evidence does not compare with that of other fits.
+    Path errors remove missing effects from the residual, and with them the indication of where a missing effect lies.
+    The evidence is not comparable with that of other fits.
     """
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     path = {band: np.full_like(v, settings.least_error ** 2) for band, v in fitted.variances.path.items()}
@@ -309,15 +312,15 @@ def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETT
 
 
 def _price_of_ends(model: Any, data: Data) -> float:
-    """The states at the ends of a record have no prior; each costs what one with unit information would (Schwarz 1978).
-    """
+    """Cost of the states at the ends of records, which have no prior: that of a unit-information prior each (Schwarz
+    1978)."""
     return sum(0.5 * transient_unknowns(block, model) * np.log(2 * block.Y.size) for block in data.blocks)
 
 
 class Profile:
-    """A fit to which a few parameters are added: those of the fit move along to first order (profile likelihood).
+    """A fit to which a few parameters are added; those of the fit follow to first order (profile likelihood).
 
-    basis : (n, N + n) orthonormal rows that span its Jacobian, with the priors as rows of their own below the data.
+    basis : (n, N + n) orthonormal rows that span its Jacobian, with the priors appended to the data.
     """
 
     def __init__(self, fitted: Fitted, data: Data, settings: FitSettings = SETTINGS):
@@ -327,24 +330,25 @@ class Profile:
         self.e = self.free(fitted.white.e[None], -fitted.z)[0]
 
     def free(self, white: np.ndarray, prior: np.ndarray | float = 0.0) -> np.ndarray:
-        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), free of what the fit's parameters take."""
+        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), after projecting out the fit's parameters.
+        """
         rows = self.fitted.weights.flatten(white)
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
 
     @cached_property
     def _white_basis(self) -> np.ndarray:
-        """(N, n) products with `basis` of whitened rows."""
+        """(N, n) whose products with whitened rows are those of `basis` with the flattened rows."""
         return self.fitted.weights.flatten(self.basis[:, :-len(self.fitted.z)]).T.copy()
 
     def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
             ) -> tuple[np.ndarray, float, float]:
-        """z (k,) of the added parameters, the free ones of `model`; the gain of log evidence with them, and the fall of
-        the penalised sum of squares.
+        """z (k,) of the added parameters, the free ones of `model`; the gain of log evidence with them, and the
+        decrease of the penalised sum of squares.
 
         at : (n,) standardised parameters of the fit in `model`; where the fit ended by default.
 
-        Raises InputError where no table has the values that it begins with.
+        Raises InputError if no table has the initial values.
         """
         rest = -(self.fitted.z if at is None else at)
         weights = self.fitted.weights
@@ -352,7 +356,7 @@ class Profile:
         def expand(z: np.ndarray, derivative: bool = True) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, self.data, weights, derivative)
-            # The products of the rows that `free` would give.
+            # The products of the rows that `free` would return.
             H, g, cost = weights.normal_equations(now.J, now.e)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
             return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
@@ -364,12 +368,12 @@ class Profile:
 
 
 def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:
-    """Of records that no fit has seen, by level and band, by the fitted parameters and variances."""
+    """Log-likelihoods of records that were not fitted, by level and band, with the fitted parameters and variances."""
     return _by_group(*unseen(fitted, data, settings))
 
 
 def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tuple[Weights, np.ndarray]:
-    """Weights and (N,) residual of records that no fit has seen, as `Fitted.weights` and `Fitted.e`."""
+    """Weights and (N,) residual of records that were not fitted, as `Fitted.weights` and `Fitted.e`."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
     own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)

@@ -6,15 +6,15 @@ twice the log-likelihood is, up to a constant, the chi-square
     chi2(theta) = 2 sum_k e_k^H inv(C_k) e_k + sum_j (theta_j - prior_j)^2 / sigma_j^2
     e_k = Y_k - G_k(theta) U_k - t_k
 
-with t_k the transient of a record, linear in real unknowns x, which are projected out (variable projection of Golub
-and Pereyra 1973; the Jacobian contains the derivative of t_k at the best x, so that the step is that of the joint
-problem).
-Levenberg-Marquardt steps in relative parameters; the information matrix is J^T J at the end, its inverse the
-Cramer-Rao bound where C_k is known. Where C_k was estimated, weights that scatter cost precision, and the information
-is less by what they cost (`weight_cost`). Directions that the data do not determine keep their starting value.
-Parameters that physics keeps positive stop just above zero, and stay there while chi2 would fall further below zero
-(an active set); the other parameters then find their own optimum. A moment of inertia stops in the same way at the sum
-of the other two.
+with t_k the transient of a record, linear in real unknowns x, which are projected out (variable projection of Golub and
+Pereyra 1973; the Jacobian contains the derivative of t_k at the best x, so that the step is that of the joint problem).
+
+Levenberg-Marquardt steps are taken in relative parameters. The information matrix is J^T J at the end; its inverse is
+the Cramer-Rao bound if C_k is known. If C_k was estimated, the scatter of the weights costs precision, and the
+information is reduced accordingly (`weight_cost`). Directions that the data do not determine keep their starting value.
+Parameters that are positive for physical reasons stop just above zero, and stay there as long as chi2 would decrease
+only below zero (an active set); the remaining parameters then reach their own optimum. A moment of inertia stops in the
+same way at the sum of the other two.
 """
 
 from __future__ import annotations
@@ -41,11 +41,12 @@ Fitted = TypeVar("Fitted", bound=FrequencyModel)
 
 @dataclass(frozen=True)
 class LikelihoodSettings:
-    """few_lines : number of lines, all blocks together, below which threads cost more time than they save.
-    edge : distance that a moment of inertia keeps from the sum of the other two, relative to the sum of all three:
-        large enough that round-off takes it no further.
-    thin_lines, thin_by : lines of a block on which a start other than the first begins: so many, or one in so many.
-    at_once : lines that are whitened together: with some hundred parameters they stay in the processor's cache.
+    """few_lines : number of lines of all blocks together, below which threads cost more time than they save.
+    edge : distance that a moment of inertia keeps from the sum of the other two, relative to the sum of all three;
+        large enough to be safe against round-off.
+    thin_lines, thin_by : lines of a block on which a start other than the first begins: one in thin_by, at least
+        thin_lines.
+    at_once : lines that are whitened together: with about a hundred parameters they fit into the processor's cache.
     """
 
     few_lines: int = 4000
@@ -60,7 +61,8 @@ SETTINGS = LikelihoodSettings()
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """What a block leaves: e (n, n_y, m), the same whitened (unit variance E|e|^2), and the transient (n, n_y, m)."""
+    """Residual of a block: error e (n, n_y, m), white (the same with unit variance E|e|^2), and transient (n, n_y, m).
+    """
 
     block: SpectralBlock
     error: np.ndarray
@@ -75,15 +77,15 @@ class LikelihoodFit(Generic[Fitted]):
     Attributes
     ----------
     model : at the estimate.
-    information : of the estimate: the Cramer-Rao bound, less what estimated weights cost.
-    chi2, dof : sum of squares of what should be standard normal numbers, priors included, and how many are free: less
-        the transients' unknowns and the combinations of parameters that are determined.
+    information : of the estimate (inverse of the Cramer-Rao bound), reduced by the cost of estimated weights.
+    chi2, dof : sum of squares that should be standard normal, including priors, and its degrees of freedom: the
+        transients' unknowns and the determined combinations of parameters are subtracted.
     iterations, converged : of the best start. history : chi2 after each of its steps.
-    residuals : one a block.
-    starts : chi2 reached from each start, infinite where it failed.
-    priors : used, by name. held : parameters that ended at the smallest value that physics allows, and moments of
-        inertia that ended at the largest; for these, and for parameters correlated with them, the information describes
-        a normal distribution that is truncated there.
+    residuals : one per block.
+    starts : chi2 reached from each start, infinite if it failed.
+    priors : used, by name. held : parameters that ended at their smallest physical value, and moments of inertia that
+        ended at their largest; for these, and for parameters correlated with them, the information describes a normal
+        distribution that is truncated there.
     """
 
     model: Fitted
@@ -109,7 +111,8 @@ class LikelihoodFit(Generic[Fitted]):
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """chi2 and its expansion: g = -J^T e, H = J^T J in relative parameters; F the same less the weights' cost."""
+    """chi2 and its expansion in relative parameters: g = -J^T e, H = J^T J; F is H reduced by the cost of the weights.
+    """
 
     chi2: float
     gradient: np.ndarray
@@ -121,20 +124,20 @@ class _Quadratic:
 def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
         starts: int = 1, spread: float = 0.1, seed: int = 1, max_iterations: int = 60,
         progress: Callable[[str], None] | None = None, about: Fitted | None = None) -> LikelihoodFit[Fitted]:
-    """The most likely parameters of `model.names`, from its present values.
+    """The most likely parameters of `model.names`, starting from its present values.
 
     Parameters
     ----------
     blocks : data with the covariance of their noise.
     priors : (mean, standard deviation) of parameters, in their units.
-    starts : how many starting points; the first is the model itself, the others are `spread` (relative) about it.
-    about : the model whose values scale the steps and set the bounds, `model` by default. A fit that continues an
-        earlier one passes that one's start: a parameter that ended near zero would make a useless scale.
+    starts : number of starting points; the first is the model itself, the others are drawn within `spread` (relative).
+    about : model whose values scale the steps and set the bounds, `model` by default. A fit that continues an earlier
+        one passes the earlier start: a parameter that ended near zero would be useless as a scale.
 
     Raises
     ------
     InputError : no parameters, blocks without noise, priors of unknown parameters.
-    ComputationError : no start came to a finite chi-square.
+    ComputationError : no start reached a finite chi-square.
     """
     priors, about = dict(priors or {}), about or model
     _check(model, blocks, priors, starts)
@@ -170,7 +173,7 @@ def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Pri
 
 
 def _thinned_descent(begin: Fitted, blocks, priors, first: Fitted, max_iterations: int) -> Fitted:
-    """A first descent on some of the lines: from afar it leads to the same place, in less time."""
+    """A first descent on a subset of the lines: from a distant start it leads to the same minimum in less time."""
     few = [thinned(block, max(SETTINGS.thin_lines, len(block.omega) // SETTINGS.thin_by)) for block in blocks]
     descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
     descent.run(max_iterations)
@@ -189,12 +192,13 @@ class _Descent(Generic[Fitted]):
         self.iterations, self.converged = 0, False
 
     def evaluate(self, model: Fitted, derivative: bool = True, residuals: bool = False) -> _Quadratic:
-        """chi2 at a model, with its expansion if asked for."""
+        """chi2 at a model, with its expansion if requested."""
         n_p = len(model.names)
         chi2, g, H, F, kept = 0.0, np.zeros(n_p), np.zeros((n_p, n_p)), np.zeros((n_p, n_p)), []
-        _ = model.matrices, derivative and model.derivative_matrices  # formed once, before the threads ask for them
+        _ = model.matrices, derivative and model.derivative_matrices  # computed once, before the threads need them
         work = partial(block_residual, model, derivative=derivative)
-        # Large arrays in few calls, which leave the interpreter free: threads serve, and keep the order of the sums.
+        # Few calls on large arrays, which release the interpreter: threads are efficient, and the order of the sums is
+        # fixed.
         if sum(len(block.omega) for block in self.blocks) < SETTINGS.few_lines:
             parts = list(map(work, self.blocks, self.whiteners))
         else:
@@ -224,7 +228,7 @@ class _Descent(Generic[Fitted]):
         while self.iterations < max_iterations and not self.converged:
             step, promised = self._step(damping)
             if promised < 1e-6 * max(1.0, 1e-3 * self.now.chi2 / len(self.model.names)) + 1e-12 * self.now.chi2:
-                # Of a step that only damping makes small nothing is known.
+                # A step that is small only because of the damping does not show convergence.
                 self.converged = damping <= 1.0
                 break
             trial = self._try(step)
@@ -237,7 +241,7 @@ class _Descent(Generic[Fitted]):
             else:
                 damping *= 10
                 if damping > 1e8:
-                    # No smaller chi-square in any direction: the end of what arithmetic resolves.
+                    # No smaller chi-square in any direction: the limit of numerical resolution.
                     self.converged = promised < 1e-3
                     break
 
@@ -261,7 +265,7 @@ class _Descent(Generic[Fitted]):
     def _step_in(self, basis: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
         """The step in the space spanned by the columns of basis (n_p, k).
 
-        H is scaled to a unit diagonal before its eigenvalues decide what is determined.
+        H is scaled to a unit diagonal before its eigenvalues decide which directions are determined.
         """
         H, g = basis.T @ self.now.H @ basis, basis.T @ self.now.gradient
         if not g.size:
@@ -270,7 +274,7 @@ class _Descent(Generic[Fitted]):
         values, vectors = np.linalg.eigh(H / np.outer(size, size))
         along = vectors.T @ (g / size)
         known = values > 1e-11 * values[-1]
-        # No parameter by more than its reach at once: what the data hardly know is held back first.
+        # No parameter moves by more than its reach: damping first limits the poorly determined directions.
         down, up = self.model.reach()
         while True:
             y = np.where(known, -along / np.where(known, values + damping, 1.0), 0.0)
@@ -284,27 +288,27 @@ class _Descent(Generic[Fitted]):
         return step, float(-(2 * along @ y + y @ (values * y)))
 
     def at_edge(self) -> np.ndarray:
-        """(k,) whether each row's moment of inertia has reached the sum of the other two."""
+        """(k,) whether the moment of inertia of each row has reached the sum of the other two."""
         return self.rows @ self.model.values <= 3 * SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
 
     def largest_moments(self) -> tuple[str, ...]:
-        """Names of the moments of inertia at the largest value that a body can have."""
+        """Names of the moments of inertia at the largest value that a rigid body can have."""
         return tuple(self.model.names[int(np.argmin(row))] for row in self.rows[self.at_edge()])
 
     def at_bound(self) -> np.ndarray:
-        """(n_p,) parameters at the smallest value that physics allows."""
+        """(n_p,) which parameters are at their smallest physical value."""
         slack = 1e-9 * np.abs(self.lowest, where=np.isfinite(self.lowest), out=np.zeros(len(self.lowest)))
         return self.model.values <= self.lowest + slack
 
     def at_top(self) -> np.ndarray:
-        """(n_p,) parameters at the largest."""
+        """(n_p,) which parameters are at their largest value."""
         slack = 1e-9 * np.abs(self.highest, where=np.isfinite(self.highest), out=np.zeros(len(self.highest)))
         return self.model.values >= self.highest - slack
 
     def _try(self, step: np.ndarray) -> tuple[Fitted, float] | None:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
         if len(self.rows):
-            # Shorten the step to end where a moment reaches the sum of the other two, less the distance `edge`.
+            # Shorten the step so that it ends where a moment comes within `edge` of the sum of the other two.
             size = SETTINGS.edge * np.abs(self.rows) @ np.abs(self.model.values)
             room = np.maximum(self.rows @ self.model.values - size, 0.0)
             used = -(self.rows @ (values - self.model.values))
@@ -314,7 +318,7 @@ class _Descent(Generic[Fitted]):
         try:
             model = self.model.at(values)
         except InputError:
-            return None  # no rig has these parameters: a shorter step
+            return None  # no rig has these parameters: try a shorter step
         if not _physical(model):
             return None
         chi2 = self.evaluate(model, derivative=False).chi2
@@ -322,13 +326,14 @@ class _Descent(Generic[Fitted]):
 
 
 def _physical(model: FrequencyModel) -> bool:
-    """Stiffness, damping and sensitivities keep the sign that they have on a rig."""
+    """Whether stiffness, damping and sensitivities have the sign that they have on a real rig."""
     return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
 
 
 def block_residual(model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
                     ) -> tuple[np.ndarray, np.ndarray, Residual]:
-    """Real residual e (N,) of unit variance, its negative Jacobian J (n_p, N), both free of the transient."""
+    """Real residual e (N,) of unit variance and its negative Jacobian J (n_p, N), with the transient projected out of
+    both."""
     if not block.transient:
         found = model.answer(block, None, derivative)
         error = block.Y - found.Y
@@ -354,8 +359,10 @@ def block_residual(model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *
 
 def added_terms(model: FrequencyModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """H (k, k) and g (k,) with chi2 = chi2_0 + s^T H s - 2 g^T s for outputs that hold s times k known terms beside the
-    model's, the parameters moved along to where chi2 is least (to first order) and the transients taken out.
+    """H (k, k) and g (k,) with chi2 = chi2_0 + s^T H s - 2 g^T s, if s times k known terms are added to the model's
+    outputs.
+
+    The parameters move along to the minimum of chi2 (to first order), and the transients are projected out.
 
     columns : (k, n, n_y, m) of each block. Raises InputError for blocks without noise.
     """
@@ -380,7 +387,7 @@ def added_terms(model: FrequencyModel, blocks: Sequence[SpectralBlock], columns:
 
 
 def whitener(block: SpectralBlock) -> np.ndarray:
-    """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), with the correction for a covariance that was itself estimated.
+    """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), with a correction if the covariance was estimated.
 
     The inverse of a Wishart matrix of n_y outputs and dof degrees of freedom is too large by dof/(dof - n_y).
     """
@@ -400,11 +407,11 @@ def whitener(block: SpectralBlock) -> np.ndarray:
 
 
 def weight_cost(block: SpectralBlock) -> float:
-    """By how much the variance of an estimate with estimated weights exceeds that with the true ones.
+    """Ratio of the variance of an estimate with estimated weights to that with the true ones.
 
-    For weights inv(C_k) of independent complex Wishart matrices of p outputs and nu degrees of freedom, the errors of
-    a weighted least squares follow from E inv(W) and E inv(W)^2 (Maiwald and Kraus, IEE Proc. Radar 147, 2000): the
-    ratio is nu (nu - p) / ((nu - p)^2 - 1). Of less than a degree of freedom above p there is no such moment.
+    For weights inv(C_k) of independent complex Wishart matrices of p outputs and nu degrees of freedom, the errors of a
+    weighted least squares follow from E inv(W) and E inv(W)^2 (Maiwald and Kraus, IEE Proc. Radar 147, 2000): the ratio
+    is nu (nu - p) / ((nu - p)^2 - 1). With less than one degree of freedom above p this moment does not exist.
     """
     assert block.noise is not None
     p, nu = block.noise.shape[-1], block.dof
@@ -419,7 +426,7 @@ def whitened(L: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def whitened_real(L: np.ndarray, dY: np.ndarray) -> np.ndarray:
-    """(p, N) `as_real` of `whitened` dY (p, n, n_y, m), for many p: these come last in memory."""
+    """(p, N) `as_real` of `whitened` dY (p, n, n_y, m), for many parameters p, which are last in memory."""
     p, n, n_y, m = dY.shape
     J, few = np.empty((2, n, n_y, m, p)), SETTINGS.at_once
     for at in (slice(k, k + few) for k in range(0, n, few)):
@@ -435,12 +442,12 @@ def as_real(white: np.ndarray) -> np.ndarray:
 
 
 def transient_unknowns(block: SpectralBlock, model: FrequencyModel) -> int:
-    """How many unknowns the transient of a block has."""
+    """Number of unknowns in the transient of a block."""
     return len(transient_columns(block.lines(np.arange(1)), model)[1]) if block.transient else 0
 
 
 def _moved(model: Fitted, spread: float, rng: np.random.Generator) -> Fitted | None:
-    """Another start: each parameter a random factor away; None where no rig has the draw."""
+    """Another start: each parameter changed by a random relative amount; None if no rig has the drawn values."""
     for _ in range(20):
         try:
             moved = model.at(model.values + model.scales() * spread * rng.uniform(-1, 1, len(model.names)))
@@ -452,8 +459,7 @@ def _moved(model: Fitted, spread: float, rng: np.random.Generator) -> Fitted | N
 
 
 def _held_rows(first: FrequencyModel) -> np.ndarray:
-    """`moment_rows` without those that the starting values violate by more than `edge`: a thin plate starts at the sum
-    itself."""
+    """`moment_rows` that the starting values satisfy to within `edge`: a thin plate starts at the sum itself."""
     rows = moment_rows(first.names)
     return rows[rows @ first.values >= -SETTINGS.edge * np.abs(rows) @ np.abs(first.values)]
 

@@ -1,9 +1,9 @@
-"""The response that an identified model leaves unexplained, measured on the records themselves.
+"""The response that an identified model does not explain, measured on the records themselves.
 
-What the sensors read less what the model predicts is regressed on the inputs (model error modelling; Ljung, Model
-validation and model error modelling, 1999). Near a sharp resonance this is far better than comparing two responses:
-the prediction carries the resonance and the transient of the start, so that what is left is smooth over frequency,
-which the local polynomial asks for, and small.
+The sensor readings minus the model's prediction are regressed on the inputs (model error modelling; Ljung, Model
+validation and model error modelling, 1999). Near a sharp resonance this is far better than comparing two responses: the
+prediction contains the resonance and the transient of the start, so that the remainder is small and smooth over
+frequency, as the local polynomial requires.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
-# Lines to each side of a window; None for the fewest that the degrees of freedom allow.
+# Lines to each side of a window; None for the minimum that the degrees of freedom allow.
 HALF_WIDTHS = (None, 16, 24, 36)
 
 
 class Unexplained(RecordSource):
-    """A record with what the model predicts, from rest at the record's start, taken off y.
+    """A record with the model's prediction, from rest at the record's start, subtracted from y.
 
-    Pieces in order cost one run; a piece out of order starts the prediction anew. What was loaded last is kept: local
+    Pieces in order cost one run; a piece out of order restarts the prediction. The last loaded piece is cached: local
     models of several widths load every record again.
     """
 
@@ -62,17 +62,18 @@ class Unexplained(RecordSource):
 
 
 def unexplained(campaign: Campaign, model: ResponseModel) -> Campaign:
-    """The campaign with the model's prediction taken off. Raises InputError for channels that are not the model's."""
+    """The campaign with the model's prediction subtracted. Raises InputError for channels that are not the model's."""
     return replace(campaign, records=tuple(Unexplained(record, model) for record in campaign.records))
 
 
 def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
                       longest_piece: int | None = None, frequency_Hz: np.ndarray | None = None) -> FrequencyResponse:
-    """The frequency response as the records have it: the model's, and what it leaves unexplained.
+    """Frequency response measured in the records: the model's, plus what it leaves unexplained.
 
-    Windows of the local polynomial grow until the inputs can be told apart in each: with zippered lines each input has
-    only some of them. What is left is smooth, which wide windows need. Inputs that no window tells apart, as drives
-    that are played together along six axes, leave a singular Gram matrix: the response is known along what they span.
+    Windows of the local polynomial grow until the inputs can be separated in each: with zippered lines each input has
+    only some of the lines. The unexplained part is smooth, as wide windows require. Inputs that no window separates,
+    such as drives that are played together along six axes, give a singular Gram matrix: the response is known along the
+    directions that they span.
 
     Raises InputError as `unexplained` and `local_polynomial` do.
     """
@@ -86,7 +87,7 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
 
 def _local(campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None,
            frequency_Hz: np.ndarray | None) -> FrequencyResponse:
-    # Directions that the records do not play at all are missing in windows of any width.
+    # Directions that the records do not excite at all are missing in windows of any width.
     widths = HALF_WIDTHS if excited_space(campaign, band_Hz).full else HALF_WIDTHS[:1]
     for half_width in widths:
         try:

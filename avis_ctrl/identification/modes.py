@@ -1,6 +1,7 @@
-"""Modes of an identified rig, with their uncertainty, beside modes measured without its equations.
+"""Modes of an identified rig, with their uncertainty, and modes measured without its equations.
 
-Model: complex eigenvalues of lambda^2 M + lambda C + K. With right and left eigenvectors x, y, by any parameter
+Model: complex eigenvalues of lambda^2 M + lambda C + K. With right and left eigenvectors x, y, the derivative by any
+parameter is
 
     d lambda = - y^T (lambda^2 dM + lambda dC + dK) x / (y^T (2 lambda M + C) x)
 
@@ -11,8 +12,8 @@ Measured: the same number of common poles and free residues from every input to 
 
     y_i = s_i(w) (jw)^p sum_k (b_ijk + jw c_ijk) / (w_k^2 - w^2 + 2 j zeta_k w_k w) u_j,
 
-behind the known sensor chains and the hold: 2 numbers a mode to search for, the rest linear (variable projection, with
-Kaufman's Jacobian). Masses, stiffnesses and geometry do not enter, but for the start of the search.
+behind the known sensor chains and the hold: 2 numbers per mode to search for, the rest linear (variable projection,
+with Kaufman's Jacobian). Masses, stiffnesses and geometry are used only to start the search.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
-# A coordinate is named where it holds this share of the mode's kinetic energy.
+# Minimum fraction of the mode's kinetic energy for a coordinate to be named.
 NAMED_SHARE = 0.05
-# The fit runs from this part of the lowest mode to this multiple of the highest, over this many lines at most.
+# The fit extends from this fraction of the lowest mode to this multiple of the highest, over at most so many lines.
 REACH, MOST_LINES = (0.5, 3.0), 30_000
-# Real data needed for each unknown.
+# Minimum number of real data per unknown.
 FEWEST_PER_UNKNOWN = 2.0
 
 
@@ -42,7 +43,7 @@ FEWEST_PER_UNKNOWN = 2.0
 class ModelModes:
     """frequency_Hz (undamped), damping : (n,), ascending; covariance : (2 n, 2 n) of frequencies, then dampings.
 
-    shapes : (6, n) complex. words : each shape by the shares of kinetic energy of its coordinates.
+    shapes : (6, n) complex. words : each shape by its coordinates' fractions of the kinetic energy.
     """
 
     frequency_Hz: np.ndarray
@@ -62,9 +63,8 @@ class ModelModes:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredModes:
-    """As `ModelModes`, of the poles that the data have by themselves; misfit : mean square of the whitened residual,
-    1 where the poles explain all but the noise (standard deviations are multiplied by its root where it is larger).
-    """
+    """As `ModelModes`, for the poles of the data alone; misfit : mean square of the whitened residual, 1 if the poles
+    explain all but the noise (standard deviations are multiplied by its root if it is larger)."""
 
     frequency_Hz: np.ndarray
     damping: np.ndarray
@@ -76,7 +76,7 @@ class MeasuredModes:
 
 @dataclass(frozen=True)
 class ModeRow:
-    """A line of the mode table; *_sigma : difference, model less measured, over its standard deviation. NaN : not
+    """A line of the mode table; *_sigma : difference, model minus measured, over its standard deviation. NaN : not
     measured."""
 
     shape: str
@@ -95,7 +95,7 @@ class ModeRow:
 
 
 def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> ModelModes:
-    """Oscillating modes; covariance (n_p, n_p) of the model's parameters, without uncertainty where None.
+    """Oscillating modes; covariance (n_p, n_p) of the model's parameters, None for no uncertainty.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> M
 
 
 def _in_words(M: np.ndarray, x: np.ndarray) -> str:
-    """Coordinates by their share of the kinetic energy."""
+    """Coordinates by their fraction of the kinetic energy."""
     share = np.real(np.conj(x) * (M @ x))
     share = share / share.sum()
     order = np.argsort(-share)
@@ -139,7 +139,7 @@ def _in_words(M: np.ndarray, x: np.ndarray) -> str:
 
 def mode_table(model: ResponseModel, covariance: np.ndarray, start: ResponseModel,
                measured: MeasuredModes | None) -> tuple[ModeRow, ...]:
-    """The model's modes beside the start's and the measured ones, lowest first."""
+    """The model's modes with the start's and the measured ones, lowest first."""
     found, before = model_modes(model, covariance), model_modes(start)
     n = len(found.damping)
     beside = [np.full(n, np.nan)] * 6
@@ -159,7 +159,7 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
 
     Raises
     ------
-    ComputationError : too few lines for free residues, or a search that ends at no oscillating modes.
+    ComputationError : too few lines for free residues, or a search that does not converge.
     """
     start = model_modes(model)
     model, blocks = _of_one_kind(model, blocks)
@@ -188,7 +188,7 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
 
 
 def _of_one_kind(model: ResponseModel, blocks: Sequence[SpectralBlock]) -> tuple[ResponseModel, list[SpectralBlock]]:
-    """The outputs of the largest group of sensors with one chain, those that read motion in space first."""
+    """Model and blocks with the largest group of sensors with one chain, preferably sensors of motion in space."""
     sensors = model.sensors
     if sensors.alike:
         return model, list(blocks)
@@ -207,8 +207,8 @@ class _Poles:
     """Residual of common poles with the best residues, output by output, each weighted by its own noise.
 
     Rows are the lines of all blocks and experiments. weight, Y : (n_y, rows). correlation : (rows, n_y, n_y) of the
-    noise. through : (rows, columns) what the poles filter, inputs and one impulse a record, behind the sensors' chain;
-    beside : (rows, columns) regressors without poles.
+    noise. through : (rows, columns) signals that the poles filter, inputs and one impulse per record, behind the
+    sensors' chain; beside : (rows, columns) regressors without poles.
     """
 
     def __init__(self, blocks: Sequence[SpectralBlock], model: ResponseModel, modes: int):
@@ -247,7 +247,7 @@ class _Poles:
             size = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
             Q, R = np.linalg.qr(A / size)
             b = _real(weight * y)
-            # By QR with pivots: the divide-and-conquer SVD of numpy's lstsq may end without an answer.
+            # By pivoted QR: the divide-and-conquer SVD of numpy's lstsq may not converge.
             c = la.lstsq(R, Q.T @ b, cond=1e-12, lapack_driver="gelsy")[0] / size
             c = c[:poles.shape[0] * n * self.through.shape[1]]
             filtered = np.einsum("akc,amc->km", powers * self.through, c.reshape(2, n, -1))
@@ -257,7 +257,7 @@ class _Poles:
         return np.concatenate(left), np.concatenate(J)
 
     def covariance(self, x: tuple[float, ...]) -> np.ndarray:
-        """(2 modes, 2 modes): each output was weighted by itself, but the noise of all belongs together."""
+        """(2 modes, 2 modes): each output was weighted separately, but the noise of all outputs is correlated."""
         _, J = self.evaluate(x)
         by_output = J.reshape(self.n_y, 2, len(self.omega), -1)
         own = by_output[:, 0] + 1j * by_output[:, 1]
@@ -275,7 +275,7 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     chain, (drive, folded) = model.sensors.sense(omega)[:, 0], (one[:, 0, 0] for one in model.drive(omega))
     U = np.moveaxis(block.U[:, driven], 2, 0).reshape(m * n, -1)
     volts = driven < n_u
-    # Of a floor's velocity the springs take the integral.
+    # The springs act on the integral of the floor's velocity.
     inputs = U * np.where(volts, (chain * drive)[:, None], (chain / s)[:, None])
     noise = np.moveaxis(np.broadcast_to(block.noise, (n, m, n_y, n_y)), 1, 0).reshape(m * n, n_y, n_y)
     sigma = np.sqrt(np.real(np.einsum("kii->ki", noise)))

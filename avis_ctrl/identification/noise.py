@@ -1,15 +1,16 @@
-"""Covariance of the noise from what a fit leaves, smoothed over frequency and pooled over records of a kind.
+"""Noise covariance from the residuals of a fit, smoothed over frequency and pooled over records of a kind.
 
-A floor that is not measured is most of the noise of a table. It comes to the sensors through the table itself, so that
-the covariance turns and peaks with every mode within a fraction of a Hz, with three directions of six far quieter than
-the others: an average over frequency would fill these up. So the residuals are whitened first by the shape
+Unmeasured floor motion is most of the noise of a table. It reaches the sensors through the table itself. The covariance
+therefore changes direction and peaks at every mode within a fraction of a Hz, and three directions of six are far
+quieter than the others: an average over frequency would fill these up. The residuals are therefore whitened first by
+the shape
 
     C_0(w) = G_floor(w) S(w) G_floor(w)^H + diag d(w)
 
 with G_floor of the model and smooth S (3 x 3) and d fitted to the residuals by expectation maximisation (Dempster,
-Laird and Rubin 1977; factor analysis with known loadings), and their covariance, whatever it is, is averaged where it
-is nearly flat: whitening before smoothing, as Blackman and Tukey (1958) have it for spectra. Noise of another origin
-costs precision of the average, not its validity.
+Laird and Rubin 1977; factor analysis with known loadings). Their covariance, whatever it is, is then averaged where it
+is nearly flat: prewhitening before smoothing, as Blackman and Tukey (1958) do for spectra. Noise of another origin
+reduces the precision of the average, not its validity.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.response import FrequencyModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
-# Half the band [Hz] over which S and d count as constant, lines in it at least, and rounds of their fit.
+# Half the band [Hz] over which S and d are taken as constant, minimum lines in it, and iterations of their fit.
 SHAPE_HALF_Hz, SHAPE_LINES, ROUNDS = 0.25, 40, 30
-# Half the band [Hz] of an average at least, and its degrees of freedom: an estimate of so many costs n_y / dof of the
+# Minimum half band [Hz] and degrees of freedom of an average: an estimate with dof of them costs n_y / dof of the
 # precision that the noise would allow (Pintelon and Schoukens 2012, section 12.3).
 HALF_Hz, LEAST_DOF = 0.15, 100
 
 
 def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> list[SpectralBlock]:
-    """A first weight where nothing is known of the noise: independent, a fraction of each output's local power.
+    """Initial weights for unknown noise: independent, a fraction of each output's local power.
 
-    Each line then counts alike. It is good for starting a fit, not for standard deviations.
+    All lines then have equal weight. It is suitable for starting a fit, not for standard deviations.
     """
     found = []
     for block in blocks:
@@ -48,13 +49,13 @@ def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> li
 
 def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], model: FrequencyModel
                          ) -> list[SpectralBlock]:
-    """Blocks with the covariance that residuals of a model have near their lines, averaged over records of a kind.
+    """Blocks with the covariance of a model's residuals near their lines, averaged over records of a kind.
 
-    The window grows until the covariance has LEAST_DOF degrees of freedom and three for each output.
+    The window grows until the covariance has LEAST_DOF degrees of freedom, and three for each output.
 
     Raises
     ------
-    InputError : a block of a kind that no residual is of.
+    InputError : a block of a kind without residuals.
     """
     found = {}
     for kind in dict.fromkeys(block.kind for block in blocks):
@@ -81,7 +82,7 @@ class _Shape(NamedTuple):
     d: np.ndarray
 
     def at(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Straight lines between the grid's points, which keep them positive."""
+        """Linear interpolation between the grid's points, which preserves positivity."""
         right = np.clip(np.searchsorted(self.omega, omega), 1, len(self.omega) - 1)
         gap = self.omega[right] - self.omega[right - 1]
         share = np.clip((omega - self.omega[right - 1]) / gap, 0, 1)
@@ -96,7 +97,7 @@ class _Shape(NamedTuple):
 
 
 def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
-    """S and d of residuals, windows on a grid of half their width."""
+    """S and d fitted to residuals, with windows on a grid of half their width."""
     half = max(2 * np.pi * SHAPE_HALF_Hz, SHAPE_LINES / _density(pool) / 2)
     low, high = min(one.block.omega[0] for one in pool), max(one.block.omega[-1] for one in pool)
     grid = np.linspace(low, high, max(int(np.ceil((high - low) / half)) + 1, 2))
@@ -105,7 +106,7 @@ def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
     m = [one.error.shape[2] for one in pool]
     total, count = _window_sums(pool, R, grid, half)
     mean = _lifted(total / np.maximum(count, 1)[:, None, None])
-    # The quietest directions hold no floor; what the others hold more than that is the floor's, shared by three axes.
+    # The quietest directions contain no floor motion; the excess of the others is the floor's, equal on three axes.
     quiet = np.linalg.eigvalsh(mean)[:, 0]
     gain = np.interp(grid, pool[0].block.omega, np.sum(np.abs(G[0]) ** 2, axis=(1, 2)))
     loud = np.real(np.einsum("nii->n", mean)) / gain
@@ -145,19 +146,20 @@ def _outer(e: np.ndarray) -> np.ndarray:
 
 
 def _density(pool: Sequence[Residual]) -> float:
-    """Lines, times experiments, per rad/s of all records together."""
+    """Number of lines times experiments per rad/s, of all records together."""
     return max(sum(len(one.block.omega) * one.error.shape[2] / np.ptp(one.block.omega) for one in pool
                    if len(one.block.omega) > 1), 1e-9)
 
 
 def _window_sums(pool: Sequence[Residual], values: Sequence[np.ndarray], omega: np.ndarray, half: float
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of values (one array a record, by line) within half of each omega, at least one line; and their numbers."""
+    """Sums of values (one array per record, by line) within half of each omega, at least one line; and their numbers.
+    """
     total, count = np.zeros((len(omega), *values[0].shape[1:]), values[0].dtype), np.zeros(len(omega))
     for one, value in zip(pool, values, strict=True):
         own = one.block.omega
         running = np.concatenate([np.zeros((1, *value.shape[1:]), value.dtype), np.cumsum(value, axis=0)])
-        # At the ends of the band the window stays whole and slides inward.
+        # At the ends of the band the window keeps its width and shifts inward.
         low = np.clip(omega - half, own[0], max(own[-1] - 2 * half, own[0]))
         high = np.minimum(low + 2 * half, own[-1])
         first = np.minimum(np.searchsorted(own, low - 1e-9), len(own) - 1)
@@ -168,7 +170,7 @@ def _window_sums(pool: Sequence[Residual], values: Sequence[np.ndarray], omega: 
 
 
 def _lifted(noise: np.ndarray) -> np.ndarray:
-    """Hermitian, its smallest eigenvalues kept above round-off."""
+    """Hermitian part, with its smallest eigenvalues kept above round-off."""
     noise = (noise + np.conj(np.swapaxes(noise, -1, -2))) / 2
     size = np.real(np.einsum("nii->ni", noise))
     n_y = noise.shape[-1]

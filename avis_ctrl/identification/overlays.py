@@ -1,4 +1,4 @@
-"""Measured responses with their scatter beside those of the start and of the identified model, for figures."""
+"""Measured responses with their scatter, and those of the start and of the identified model, for figures."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
-# Frequencies of a figure.
+# Number of frequencies in a figure.
 POINTS = 400
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredOverlay:
-    """A measured response from each driven input to each output; what a model's response is drawn over.
+    """A measured response from each driven input to each output, to be drawn with a model's response.
 
     Attributes
     ----------
     frequency_Hz : (n,). inputs, outputs : names. unit : of an entry.
     measured : (n, n_y, n_u) complex.
-    measured_std : (n, n_y, n_u) standard deviation of real part, imaginary part and, where it is small, magnitude of
-        the measured entry: root of E|error|^2 / 2.
+    measured_std : (n, n_y, n_u) standard deviation of real part, imaginary part and, if it is small, magnitude of the
+        measured entry: root of E|error|^2 / 2.
     method : how the response was measured, in words.
     """
 
@@ -45,8 +45,8 @@ class MeasuredOverlay:
 
 @dataclass(frozen=True, eq=False)
 class ResponseOverlay(MeasuredOverlay):
-    """With the start and the identified model. If the drives were not excited separately, the inputs are forces along
-    coordinates.
+    """A measured response with those of the start and the identified model. If the drives were not excited separately,
+    the inputs are forces along coordinates.
 
     Attributes
     ----------
@@ -58,14 +58,14 @@ class ResponseOverlay(MeasuredOverlay):
 
     @property
     def inside(self) -> float:
-        """Share of the measured entries within two standard deviations (95 % of a circular normal error) of the
+        """Fraction of the measured entries within two standard deviations (95 % of a circular normal error) of the
         model; a bias of the measured response counts against it too."""
         # P(|e|^2 < r s^2) = 1 - exp(-r/2) for real and imaginary variance s^2.
         return float(np.mean(np.abs(self.measured - self.model) ** 2 < -2 * np.log(0.05) * self.measured_std ** 2))
 
 
 def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseModel) -> ResponseOverlay:
-    """Plain arrays for figures at the response's own frequencies, on the lines where it is known.
+    """Arrays for figures at the response's own frequencies, on the lines where it is known.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
 
 def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tuple[FrequencyResponse, np.ndarray]:
     """The response to forces along the coordinates (of rotations at the edge) and to the floor, as far as the inputs
-    span them; and what these are of the model's inputs (n_u + 3, k)."""
+    span them; and these as combinations of the model's inputs (n_u + 3, k)."""
     columns, names = [], []
     for axis in COORDINATES:
         try:
@@ -111,10 +111,11 @@ def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tup
 
 def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, float], model: ResponseModel
                       ) -> FrequencyResponse:
-    """The response as given; of records the best linear approximation where they allow it, or a local polynomial one.
+    """The given response; for records their best linear approximation if possible, otherwise a local polynomial
+    estimate.
 
-    The latter is of what the model leaves unexplained, with the model's response added: of the records themselves it
-    would round off the resonances, the more so the wider its windows have to be.
+    The latter estimates what the model leaves unexplained and adds the model's response: applied to the records
+    themselves, it would round off the resonances, the more so the wider its windows have to be.
 
     Raises
     ------
@@ -125,7 +126,8 @@ def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, 
     try:
         return thinned(best_linear_approximation(data, band_Hz=band_Hz))
     except AvisError:
-        # Not periodic, several levels, or different lines for different inputs: the local model asks for none of that.
+        # Not periodic, several levels, or different lines for different inputs: the local model can handle all of
+        # these.
         driven = [r.header for r in data.records if r.header.excitation not in ("rest", "sine")]
         step = data.sample_rate_Hz / min((header.samples for header in driven), default=2)
         low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
@@ -137,13 +139,13 @@ def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, 
 
 
 def _wholes(data: Campaign) -> Campaign:
-    """Whole records in the place of their parts, which do not all start at rest as a prediction does."""
+    """Whole records instead of their parts, which do not all start at rest as a prediction does."""
     wholes = {record.header.name: record.whole if isinstance(record, Portion) else record for record in data.records}
     return replace(data, records=tuple(wholes.values()))
 
 
 def thinned(response: FrequencyResponse) -> FrequencyResponse:
-    """Few enough lines for a figure, evenly in logarithm."""
+    """Few enough lines for a figure, evenly spaced in logarithm."""
     f = response.frequency_Hz
     if f.size <= POINTS:
         return response

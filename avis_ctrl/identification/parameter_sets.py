@@ -1,4 +1,4 @@
-"""Which parameters of a rig are worth estimating: what a tape measure or a data sheet does not give."""
+"""Parameters of a rig that are worth estimating: those that a tape measure or a data sheet does not give."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _LOAD = ("load.L7", "load.L8", "load.L9", "load.Ixx", "load.Iyy", "load.Izz", "l
 
 
 def default_parameters(rig: Rig) -> tuple[str, ...]:
-    """Free parameters where the user names none.
+    """Free parameters if the user names none.
 
-    AVIS: mass, principal inertias, stiffness and damping of every mount along every axis; positions and motor
-    constants are known (Rademakers, section 3.2). Halcyonics: what Table 1 identifies, each spring by itself, and
-    the actuators' k_a, with the load of Table 2 in place of the plate where it is on; mass and lengths are known.
+    AVIS: mass, principal inertias, stiffness and damping of every mount along every axis; positions and motor constants
+    are known (Rademakers, section 3.2). Halcyonics: the parameters identified in Table 1, each spring separately, and
+    the actuators' k_a; with a load, that of Table 2 instead of the plate; mass and lengths are known.
     """
     known = rig.parameters()
     if "mass" in known and "J1" in known:

@@ -1,9 +1,9 @@
-"""What a model leaves of data that it was not fitted to: error by frequency, whitened, with what it should be.
+"""Prediction error of a model on data that it was not fitted to: by frequency, whitened, with its expected size.
 
-The transient of a record's ends is projected out as in the fit. The error that remains of pure noise of covariance
-C_k is then (I - Q Q^T) w in whitened real numbers, with Q an orthonormal basis of the whitened transients: it has
-2 n n_y less the rank of Q degrees of freedom. An uncertain model adds J P J^T to the covariance of the whitened error,
-P the covariance of its parameters (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 11.3).
+The transient of a record's ends is projected out as in the fit. For pure noise of covariance C_k the remaining error is
+then (I - Q Q^T) w in whitened real numbers, with Q an orthonormal basis of the whitened transients: it has 2 n n_y less
+the rank of Q degrees of freedom. An uncertain model adds J P J^T to the covariance of the whitened error, P the
+covariance of its parameters (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 11.3).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 
 @dataclass(frozen=True, eq=False)
 class PredictionError:
-    """Of one block.
+    """Prediction error of one block.
 
     Attributes
     ----------
-    block : with the noise that the error is held against.
+    block : with the noise that the error is compared with.
     plain : (n, n_y, m) Y - G U. error : the same without the transient of the record's ends.
-    white : (n, n_y, m) the error whitened, E|white|^2 = 1 where it is noise only.
+    white : (n, n_y, m) the error whitened, E|white|^2 = 1 if it is noise only.
     derivative : (n_p, n, n_y, m) of the whitened model output by the parameters, transients projected out; unit as
-        `white`. Empty where it was not asked for.
+        `white`. Empty if not requested.
     dof : real degrees of freedom of the error. output_dof : (n_y,) of each output's own error.
     """
 
@@ -48,31 +48,31 @@ class PredictionError:
 
     @property
     def output_chi2(self) -> np.ndarray:
-        """(n_y,) the same for each output by itself, held against its own variance."""
+        """(n_y,) the same for each output separately, relative to its own variance."""
         return np.sum(2 * np.abs(self.error) ** 2 / self._variance, axis=(0, 2))
 
     @property
     def _variance(self) -> np.ndarray:
-        """(n, n_y, 1 or m) of each output's noise; 1/variance of an estimate is too large by dof/(dof - 1)."""
+        """(n, n_y, 1 or m) noise variance of each output; 1/variance of an estimate is too large by dof/(dof - 1)."""
         assert self.block.noise is not None
         variance = np.real(np.einsum("kmii->kim", self.block.noise))
         return variance if np.isinf(self.block.dof) else variance * self.block.dof / (self.block.dof - 1)
 
     def noise_share(self) -> np.ndarray:
-        """(n_y,) sum of |noise|^2 that each output's error holds on the average where it is noise only."""
+        """(n_y,) expected sum of |noise|^2 in each output's error if it is noise only."""
         assert self.block.noise is not None
         variance = np.real(np.einsum("kmii->kim", self.block.noise))
         whole = np.sum(np.broadcast_to(variance, self.error.shape), axis=(0, 2))
         return whole * self.output_dof / (2 * self.error.shape[0] * self.error.shape[2])
 
     def expected(self, covariance: np.ndarray) -> float:
-        """Mean of chi2 where the model errs by no more than its parameters' covariance (n_p, n_p) says."""
+        """Mean of chi2 if the covariance (n_p, n_p) of the parameters explains all errors of the model."""
         J = np.sqrt(2) * self.derivative.reshape(len(covariance), -1)
         return self.dof + float(np.real(np.einsum("ik,ij,jk->", J.conj(), covariance, J, optimize=True)))
 
 
 def prediction_error(model: FrequencyModel, block: SpectralBlock, derivative: bool = True) -> PredictionError:
-    """The error of a model on a block whose noise is known.
+    """Prediction error of a model on a block with known noise.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def prediction_error(model: FrequencyModel, block: SpectralBlock, derivative: bo
 
 
 def _lost(L: np.ndarray, basis: np.ndarray, block: SpectralBlock) -> np.ndarray:
-    """(n_y,) degrees of freedom of each output that went with the transient."""
+    """(n_y,) degrees of freedom of each output that the transient takes."""
     assert block.noise is not None
     n, n_y = block.Y.shape[:2]
     columns = np.linalg.solve(L[:, 0], np.moveaxis(_complex(basis.T, (n, n_y, 1))[..., 0], 0, -1))
@@ -105,9 +105,10 @@ def _complex(real: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def interval(expected: float, dof: float, noise_dof: float, level: float = 0.95) -> tuple[float, float]:
-    """Where chi2 / dof lies with probability `level`, when the noise was estimated with noise_dof real numbers.
+    """Interval that contains chi2 / dof with probability `level`, if the noise was estimated with noise_dof real
+    numbers.
 
-    Numerator and denominator of a ratio of variances: Fisher's F, moved to its mean `expected` (of chi2 / dof).
+    It is a ratio of variances, with Fisher's F distribution, scaled to its mean `expected` (of chi2 / dof).
     """
     law = stats.f(dof, noise_dof) if np.isfinite(noise_dof) else stats.chi2(dof, scale=1 / dof)
     low, high = law.ppf([(1 - level) / 2, (1 + level) / 2]) / law.mean() * expected

@@ -1,9 +1,9 @@
-"""What a rig's sensors read for given voltages and floor motion: simulation in time, record by record, piece by piece.
+"""Time-domain prediction of a rig's sensor outputs for given voltages and floor motion, piece by piece.
 
-Between samples the voltage is held and the floor's velocity is a straight line, so that the step of the linear table
-with its sensor chains is exact (Van Loan 1978); a delay that is no whole number of samples divides the step in two.
-The second-order terms of the table's rotations act beside them as accelerations that are extended in a straight line
-from one sample to the next, as the simulator does it (`simulation.kernel`).
+Between samples the voltage is constant and the floor's velocity linear, so that the step of the linear table with its
+sensor chains is exact (Van Loan 1978); a delay that is not a whole number of samples divides the step in two. The
+second-order terms of the table's rotations are added as accelerations that are extrapolated linearly from one sample to
+the next, as in the simulator (`simulation.kernel`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from avis_ctrl.rigs.nonlinear import rig_arrays
 
 
 class Continuous(NamedTuple):
-    """x' = A x + B (u, w, e), y = C x + D (u, w, e): volts u at the motors, floor velocity w (3) [m/s], and, where
-    asked for, accelerations e: of the payload (6), and beside it read by the sensors (n_y)."""
+    """x' = A x + B (u, w, e), y = C x + D (u, w, e): volts u at the motors, floor velocity w (3) [m/s], and optionally
+    accelerations e: of the payload (6), and added to the sensors' readings (n_y)."""
 
     A: np.ndarray
     B: np.ndarray
@@ -33,7 +33,7 @@ class Continuous(NamedTuple):
     D: np.ndarray
 
 
-# States of the table: q, q', displacement of the floor. How often each motion is integrated from an acceleration.
+# States of the table: q, q', displacement of the floor. Number of integrations from acceleration to each motion.
 TABLE, INTEGRATIONS = 15, {"displacement": 2, "velocity": 1, "acceleration": 0}
 
 
@@ -44,9 +44,9 @@ def _body(model: ResponseModel) -> np.ndarray:
 
 
 def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
-    """States q, q', displacement of the floor, and those of each sensor's chain (and of each amplifier).
+    """Model with states q, q', displacement of the floor, and those of each sensor's chain (and of each amplifier).
 
-    beside : with inputs e, whose readings add integrators in front of the chains as states behind the amplifiers.
+    beside : with inputs e. Their readings add integrators in front of the chains, as states after the amplifiers'.
     """
     n_u, rows, body = len(model.actuators), model.matrices.R, _body(model)
     sensors, gains = model.sensors.realised, model.sensors.sensitivity
@@ -54,7 +54,7 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
     corner = 2 * np.pi * model.amplifier_corner_Hz if model.amplifier_corner_Hz else None
     n_a = n_u if corner else 0
     plain = (own[-1].stop if own else TABLE) + n_a
-    # Those that make a sensor's motion of an acceleration.
+    # Integrators from an acceleration to a sensor's motion.
     integrators = _slices(plain, (INTEGRATIONS[motion] * beside for motion in sensors.motions))
     size, n_in, n_e = max(plain, *(one.stop for one in integrators)), n_u + 3, 6 + n_y if beside else 0
     amplifiers, volts = slice(plain - n_a, plain), slice(0, n_u)
@@ -68,7 +68,7 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
         A[amplifiers, amplifiers], B[amplifiers, volts] = -corner * np.eye(n_u), corner * np.eye(n_u)
     else:
         B[6:12, volts] = body[:, 15:15 + n_u]
-    # The motion that the sensors take in, along their axes.
+    # The motion that the sensors measure, along their axes.
     none = np.zeros((6, n_in + n_e))
     motion = {"displacement": (np.eye(size)[:6], none), "velocity": (np.eye(size)[6:12], none),
               "acceleration": (A[6:12].copy(), B[6:12].copy())}
@@ -78,7 +78,7 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
         if sensors.relative[k]:
             seen_x[12:15] -= rows[k, :3]
         if added.stop > added.start:
-            # The first of a sensor's integrators is the motion that its chain takes in, the last reads e.
+            # A sensor's first integrator is the motion at its chain's input, the last one integrates e.
             A[added, added] = np.eye(added.stop - added.start, k=1)
             B[added.stop - 1, n_in + 6 + k] = 1.0
             seen_x[added.start] += 1.0
@@ -97,17 +97,17 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
 
 
 def _slices(first: int, sizes: Iterable[int]) -> list[slice]:
-    """Of states that stand one after the other, from index `first` on."""
+    """Slices of consecutive groups of states, from index `first` on."""
     ends = first + np.cumsum([0, *sizes])
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
 class Predictor:
-    """Reads of the sensors of a model that starts at rest, piece after piece.
+    """Sensor outputs of a model that starts at rest, piece after piece.
 
-    A floor that was not measured counts as still. Nothing is rounded or clipped.
+    A floor that was not measured is taken as still. Nothing is rounded or clipped.
 
-    large_motion : with the second-order terms of the table's rotations, motors and sensors as `model.turning` says.
+    large_motion : with the second-order terms of the table's rotations, with `model.turning` for motors and sensors.
     """
 
     def __init__(self, model: ResponseModel, large_motion: bool = False):
@@ -121,7 +121,8 @@ class Predictor:
         early, late = self._step(part), self._step(1 - part)
         n_u = len(model.actuators)
         self.Phi = late[0] @ early[0]
-        # In the first part of a period the older voltage still acts; the floor's line runs over the whole of it.
+        # In the first part of a period the older voltage still acts; the floor velocity is linear over the whole
+        # period.
         whole_step = self._step(1.0)
         self.old, self.new = late[0] @ early[1][:, :n_u], late[1][:, :n_u]
         self.floor, self.ramp = (step[:, n_u:n_u + 3] for step in whole_step[1:])
@@ -149,7 +150,7 @@ class Predictor:
                      float(model.turning.sensors))
 
     def _step(self, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Over a fraction of a period: e^(A h), and what a constant and a rising unit line add."""
+        """Step over a fraction of a period: e^(A h), and the contributions of a constant and a rising unit input."""
         A, B = self.system.A, self.system.B
         n, m = B.shape
         block, h = np.zeros((n + 2 * m, n + 2 * m)), fraction * self.model.period_s
@@ -160,12 +161,12 @@ class Predictor:
     def read(self, u: np.ndarray, floor: np.ndarray | None = None) -> np.ndarray:
         """(n, n_y) for commanded u (n, n_u) in the model's order and floor velocity (n, 3) or None.
 
-        floor : with the sample that follows, (n + 1, 3), where it is known: the floor moves in a straight line to it.
+        floor : with the following sample, (n + 1, 3), if it is known: the floor velocity is linear up to it.
         """
         n = len(u)
         held = np.vstack([self.pending, u])
         self.pending = held[n:]
-        # While sample k is taken, the voltage u[k - whole] acts, or with a part of a sample more, the one before.
+        # At sample k the voltage u[k - whole] acts or, if the delay has a fractional part, the voltage before it.
         new, old = held[1:n + 1], held[:n]
         drive = new @ self.new.T + old @ self.old.T
         w = np.zeros((n + 1, len(FLOOR)))
@@ -190,7 +191,7 @@ class Predictor:
 
 
 def predict(model: ResponseModel, record: Record, large_motion: bool = True) -> np.ndarray:
-    """(samples, n_y) what the model reads in a record that starts at rest, in the unit of y.
+    """(samples, n_y) output of the model in a record that starts at rest, in the unit of y.
 
     large_motion : with the second-order terms of the table's rotations.
 
@@ -206,7 +207,7 @@ def predict(model: ResponseModel, record: Record, large_motion: bool = True) -> 
 
 
 def model_inputs(model: ResponseModel, record: Record) -> tuple[np.ndarray, np.ndarray | None]:
-    """u (n, n_u) and floor (n, 3) of a record in the model's order; inputs that it does not name are zero."""
+    """u (n, n_u) and floor (n, 3) of a record in the model's order; inputs that the record does not have are zero."""
     h = record.header
     u = np.zeros((h.samples, len(model.actuators)))
     u[:, places(h.u_names, model.actuators, "the model's actuators are", f"record {h.name}: u names")] = record.u

@@ -1,14 +1,14 @@
-"""High-pass filter of voltages and measurements alike, the sensors' chain undone on the way (Rademakers 2005, 3.2).
+"""High-pass filter of voltages and measurements, with the sensors' chain inverted (Rademakers 2005, 3.2).
 
-A geophone's voltage is not proportional to velocity near its corner, which a Kalman filter with velocity measurements
-takes for dynamics of the table. The source filters its data with a sixth-order high-pass of 1 Hz and calls the problem
-solved; a corner of 0.5 Hz and damping 0.7 still turns the phase by 0.35 rad at 2 Hz. The chain is known, and behind
-the high-pass its inverse is proper and stable: the double pole of 1/chain at zero frequency cancels two of the six
-zeros of the high-pass.
+Near the corner of a geophone its voltage is not proportional to velocity, and a Kalman filter with velocity
+measurements takes this for dynamics of the table. The source filters its data with a sixth-order high-pass of 1 Hz and
+regards the problem as solved; a corner of 0.5 Hz and damping 0.7 still shifts the phase by 0.35 rad at 2 Hz. The chain
+is known, and after the high-pass its inverse is proper and stable: the double pole of 1/chain at zero frequency cancels
+two of the six zeros of the high-pass.
 
-The same discrete high-pass acts on u and on y, and filters that are alike commute with a sampled linear system: the
-filtered data obey the unfiltered model. The chain's inverse is discretised by Tustin's rule; what that leaves at
-1 kHz is some 1e-5 rad of phase between 2 and 10 Hz.
+The same discrete high-pass acts on u and on y, and identical filters commute with a sampled linear system: the filtered
+data obey the unfiltered model. The chain's inverse is discretised by Tustin's rule; at 1 kHz the remaining phase error
+is about 1e-5 rad between 2 and 10 Hz.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SensorInverse(NamedTuple):
     """(s - zeros) / (s - poles) / gain, from the measured quantity to the motion that the model measures.
 
     gain : (n_y,) of each channel. poles lie at zero or in the open left half plane. low_pass : poles of the anti-alias
-    filter, which no proper filter undoes: u passes it, too.
+        filter, which no proper filter inverts: u passes it, too.
     """
 
     motion: str
@@ -39,11 +39,11 @@ class SensorInverse(NamedTuple):
 
 
 def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str) -> SensorInverse:
-    """How the records of a rig become velocity, or displacement where they are in m.
+    """Conversion of a rig's records to velocity, or to displacement if they are in m.
 
     Raises
     ------
-    InputError : a unit that is none of V, m, m/s, m/s^2; volts of a rig without sensors; unknown channels.
+    InputError : a unit other than V, m, m/s, m/s^2; volts of a rig without sensors; unknown channels.
     """
     names, _ = rig.sensor_rows()
     places(y_names, names, f"the sensors of the rig {rig.name} are", "y names")
@@ -59,7 +59,7 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str) -> SensorInver
     if len(kinds) != 1 or not sensors[0].inertial:
         raise InputError("expected geophones or accelerometers of one kind: the filter inverts a single sensor chain",
                          field="y names", value=list(y_names))
-    # Velocity is the voltage over the chain: of an accelerometer its zero at rest and the integration.
+    # Velocity is the voltage over the chain. Poles at zero: the chain's zeros, and an accelerometer's integration.
     first = sensors[0]
     at_rest = len(first.zeros) + (first.quantity == "acceleration")
     own = np.array([pole for pole in first.poles if pole not in first.low_pass], complex)
@@ -69,17 +69,17 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str) -> SensorInver
 
 def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz: float = 1.0, order: int = 6
               ) -> tuple[np.ndarray, np.ndarray]:
-    """u (n, n_u) V, delayed as the actuators see it, and y (n, n_y) as motion, both behind a high-pass.
+    """u (n, n_u) V, delayed as it acts on the actuators, and y (n, n_y) as motion, both after a high-pass.
 
     Parameters
     ----------
-    record : from rest. delay_s : loop delay. A part of a sample is met by the mean of the voltages held during the
-        sample, which leaves the force impulse of each sample exact.
+    record : from rest. delay_s : loop delay. A fraction of a sample is represented by the mean of the voltages held
+        during the sample, which keeps the force impulse of each sample exact.
     corner_Hz, order : Butterworth, by the bilinear map with its corner prewarped.
 
     Raises
     ------
-    InputError : an order that leaves the inverse unstable, a corner beyond half the sample rate.
+    InputError : an order for which the inverse is not stable, a corner beyond half the sample rate.
     """
     rate = record.header.sample_rate_Hz
     at_rest = int(np.count_nonzero(inverse.poles == 0))
@@ -90,7 +90,7 @@ def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz:
     zeros, poles, gain = signal.butter(order, corner_Hz, "highpass", fs=rate, output="zpk")
 
     def filtered(samples: np.ndarray, of: np.ndarray, by: np.ndarray, k: float) -> np.ndarray:
-        """Behind the high-pass and k (s - of) / (s - by); poles at z = 1 cancel zeros of the high-pass."""
+        """Apply the high-pass and k (s - of) / (s - by); poles at z = 1 cancel zeros of the high-pass."""
         z, p, k = signal.bilinear_zpk(of, by, k, rate)
         cancelled = int(np.count_nonzero(by == 0))
         sections = signal.zpk2sos([*zeros[cancelled:], *z], [*poles, *p[by != 0]], gain * k)
@@ -101,7 +101,7 @@ def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz:
 
 
 def delayed(u: np.ndarray, samples: float) -> np.ndarray:
-    """Held voltages (n, n_u), `samples` later, zero before; the mean over each sample where that is no whole number."""
+    """Held voltages (n, n_u), `samples` later, zero before; the mean over each sample if it is not a whole number."""
     whole = int(np.floor(samples + 1e-9))
     part = max(samples - whole, 0.0)
 

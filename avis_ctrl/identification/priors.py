@@ -1,4 +1,4 @@
-"""The parameters of a rig with their priors: what is re-identified, and the tolerances of what the rig file states."""
+"""Priors of a rig's parameters: re-identified parameters, and the tolerances of what the rig file states."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """Normal priors of free parameters: value = mean + sigma z, z standard normal; of positive ones log value is so.
+    """Normal priors of free parameters: value = mean + sigma z, z standard normal; for positive parameters, of log
+    value.
 
-    names : (n,). mean, sigma : (n,), units of the parameters; of a positive one sigma is that of the logarithm.
-    positive : (n,) bool.
+    names : (n,). mean, sigma : (n,), in the parameters' units; for a positive parameter sigma is that of the logarithm.
+    positive : (n,) bool. low, high : bounds of the values.
     """
 
     names: tuple[str, ...]
@@ -32,10 +33,10 @@ class Priors:
     high: np.ndarray | float = np.inf
 
     def values(self, z: np.ndarray) -> np.ndarray:
-        """(n,) of the parameters at standardised values z (n,)."""
+        """(n,) values of the parameters at standardised values z (n,)."""
         found = np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
                          self.mean + self.sigma * z)
-        # At its bound a parameter has exactly that value, whatever rounding makes of it.
+        # At its bound a parameter has exactly that value, regardless of rounding.
         low, high = self.bounds
         return np.clip(np.where(z <= low, self.low, np.where(z >= high, self.high, found)), self.low, self.high)
 
@@ -46,27 +47,27 @@ class Priors:
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) each: standardised values at the lower and upper bound; infinite where there is none."""
+        """(n,) each: standardised values at the lower and upper bound; infinite without a bound."""
         low, high = (np.broadcast_to(one, len(self.names)).astype(float) for one in (self.low, self.high))
-        # A positive parameter has no least standardised value where its lower bound is zero or less.
+        # A positive parameter has no minimum standardised value if its lower bound is zero or less.
         low = np.where(self.positive & (low <= 0), -np.inf, low)
         z_low, z_high = (np.where(np.isinf(one), one, self.z(one)) for one in (low, high))
         return z_low, z_high
 
     def followed_by(self, other: Priors) -> Priors:
-        """Both, one after the other."""
+        """Both sets, concatenated."""
         def both(name: str) -> np.ndarray:
             return np.concatenate([np.broadcast_to(getattr(one, name), len(one.names)) for one in (self, other)])
         return Priors((*self.names, *other.names), *map(both, _FIELDS))
 
     def of(self, names: Sequence[str]) -> Priors:
-        """Those of some parameters, in their order. Raises ValueError for one that is not there."""
+        """Priors of some parameters, in their order. Raises ValueError for a name that is not among them."""
         rows = [self.names.index(name) for name in names]
         return Priors(tuple(names), *(np.broadcast_to(getattr(self, field), len(self.names))[rows]
                                       for field in _FIELDS))
 
     def scaled(self, rows: Sequence[int], factor: float) -> Priors:
-        """With some standard deviations times a factor."""
+        """The priors with some standard deviations multiplied by a factor."""
         sigma = self.sigma.copy()
         sigma[rows] *= factor
         return replace(self, sigma=sigma)
@@ -80,7 +81,7 @@ _FIELDS = ("mean", "sigma", "positive", "low", "high")
 
 
 def re_identified(rig: Rig, settings: FitSettings = SETTINGS) -> Priors:
-    """Mass, moments of inertia, stiffness and damping: what every identification leaves free."""
+    """Priors of mass, moments of inertia, stiffness and damping: free in every identification."""
     known, names = rig.parameters(), default_parameters(rig)
     mean = np.array([known[name].value for name in names])
     damping = np.array([known[name].unit.startswith("N s") or known[name].unit.startswith("N m s") for name in names])
@@ -89,13 +90,13 @@ def re_identified(rig: Rig, settings: FitSettings = SETTINGS) -> Priors:
 
 
 def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: FitSettings = SETTINGS) -> Priors:
-    """The same and every value of the rig file that has a tolerance; the model has its channels apart."""
+    """`re_identified`, and every value of the rig file that has a tolerance; the model has separate channels."""
     first = re_identified(model.rig, settings)
     return first.followed_by(beside(model, first.names, tolerances))
 
 
 def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -> Priors:
-    """Every value of the rig file that has a tolerance, but for `names`; the model has its channels apart."""
+    """Priors of every value of the rig file that has a tolerance, except `names`; the model has separate channels."""
     known = model.all_parameters()
     rest = {name: sigma for name in known if name not in names and (sigma := _sigma(name, tolerances))}
     mean = np.array([known[name].value for name in rest])
@@ -105,8 +106,8 @@ def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -
 
 def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
                ) -> Priors:
-    """The free parameters of a model: as stated (mean, standard deviation), otherwise about their present values.
-    The prior is so wide that it acts only on combinations that the data do not determine."""
+    """Priors of the free parameters of a model: as stated (mean, standard deviation), otherwise about their present
+    values. The latter are so wide that they affect only combinations that the data do not determine."""
     mean, scale = model.values.copy(), model.scales()
     sigma = settings.unknown_percent / 100 * scale
     for name, (value, deviation) in stated.items():
@@ -117,7 +118,7 @@ def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """A value of the rig file with a tolerance: its estimate and standard deviation, and how many tolerances it moved.
+    """A value of the rig file with a tolerance: its estimate, standard deviation, and shift in units of its tolerance.
     """
 
     parameter: str
@@ -127,12 +128,12 @@ class Tolerance:
     unit: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """As the contract has it."""
+        """As specified in the contract."""
         return {"parameter": self.parameter, "value": self.value, "std": self.std, "tolerances_moved": self.moved}
 
 
 def tolerances_of(rig: Rig) -> Tolerances:
-    """Of the rig file, or those of the contract."""
+    """Tolerances of the rig file, or those of the contract."""
     return getattr(rig, "tolerances", None) or Tolerances()
 
 

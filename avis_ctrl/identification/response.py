@@ -1,13 +1,13 @@
-"""Frequency response of a rig as its records see it, with its derivative by every parameter.
+"""Frequency response of a rig as its records show it, with its derivatives by all parameters.
 
     y = s(w) (jw)^p R { inv(D) F  [u; v_floor; transient] - r E v_floor / jw } + aliases R inv(M) T u
     D = K + jw C - w^2 M,    F = [ T h(w) a(w),  (K_f + jw C_f) E / jw,  I, jw I ]
 
-R picks the motion along each sensor, s is its chain (geophone, compensation, preamplifier), p the derivative that it
-senses, each its own, h hold and delay, a the amplifiers, E the three translations of the floor, r one for what is
-read against the chassis and zero otherwise. The last two blocks of F carry the transient of a record that does not
-start and end alike: whatever momentum and displacement it starts with acts as an impulse and a step (real vectors,
-unknown, found along with the parameters).
+R picks the motion along each sensor. For each sensor, s is its chain (geophone, compensation, preamplifier) and p the
+order of the derivative that it measures; r is one if it measures relative to the chassis and zero otherwise. h is hold
+and delay, a the amplifiers, E the three translations of the floor. The last two blocks of F represent the transient of
+a record that does not start and end alike: its initial momentum and displacement act as an impulse and a step (real
+vectors, unknown, estimated along with the parameters).
 
 Derivatives are analytic: d inv(D)F = inv(D) (dF - dD inv(D) F), with dM, dC, dK, dT of the rig's matrices. These are
 polynomials of at most second degree in each parameter, for which a central difference is exact at any step.
@@ -38,13 +38,14 @@ _POWER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
 N_Q = 6
 Model = TypeVar("Model")
 Value = TypeVar("Value")
-# Share of its size at the start that a positive parameter keeps in a fit.
+# Lower bound of a positive parameter in a fit, as a fraction of its size at the start.
 LOWEST = 1e-6
 
 
 @lru_cache(maxsize=32)
 def _chain_response(chain: StateSpace | None, motion: Motion, lines: bytes) -> np.ndarray:
-    """(n,) from displacement to y of unit sensitivity; not to be written to. A fit asks for the same lines again."""
+    """(n,) from displacement to y of unit sensitivity; read-only. Cached, because a fit needs the same lines
+    repeatedly."""
     omega = np.frombuffer(lines)
     return (1.0 if chain is None else chain.frequency_response(omega)[:, 0, 0]) * (1j * omega) ** _POWER[motion]
 
@@ -52,14 +53,14 @@ def _chain_response(chain: StateSpace | None, motion: Motion, lines: bytes) -> n
 @lru_cache(maxsize=64)
 def _aliases(lines: bytes, period_s: float, delay_s: float, motion: Motion, corner_Hz: float | None,
              low_pass: tuple[complex, ...]) -> np.ndarray:
-    """(n,) `aliases`, not to be written to."""
+    """(n,) `aliases`; read-only."""
     return aliases(np.frombuffer(lines), period_s, delay_s, motion, corner_Hz, low_pass)
 
 
 def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
                ) -> Callable[[Model, np.ndarray], Value]:
-    """A method of lines omega that keeps the `most` results it found last, not to be written to: a fit needs them again
-    and again, and records of one kind share their lines."""
+    """Cache the last `most` results of a method of lines omega; they are read-only. A fit needs them repeatedly, and
+    records of one kind share their lines."""
     known: list[tuple[Model, np.ndarray, Value]] = []
 
     @wraps(compute)
@@ -75,12 +76,12 @@ def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
 
 @dataclass(frozen=True, eq=False)
 class SensorModel:
-    """Sensors of a rig: names, what motion each chain takes in, and the chain (unit sensitivity).
+    """Sensors of a rig: names, the motion that each measures, and its chain (unit sensitivity).
 
-    motions, chains, poles, sensitivity_units : one a sensor. chain None for an ideal sensor; poles the coefficients
-    (ascending) of the chain's denominator, [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion, in
-    the passband. relative : (n_y,) which read the payload against the chassis. low_pass : poles of the anti-alias
-    filter, which every chain contains.
+    motions, chains, poles, sensitivity_units : one per sensor. chain None for an ideal sensor; poles the coefficients
+        (ascending) of the chain's denominator, [1] without a chain. sensitivity : (n_y,) unit of y per unit of motion,
+        in the passband. relative : (n_y,) which sensors measure relative to the chassis. low_pass : poles of the
+        anti-alias filter, which every chain contains.
     """
 
     names: tuple[str, ...]
@@ -91,13 +92,13 @@ class SensorModel:
     sensitivity_units: tuple[str, ...]
     poles: tuple[tuple[float, ...], ...]
     relative: np.ndarray
-    # Corner [Hz] and damping ratio of each geophone's suspension, as it is and as its filter assumes; None without one.
+    # Corner [Hz] and damping ratio of each geophone's suspension, actual and assumed by its filter; None without one.
     suspensions: tuple[tuple[float, float] | None, ...] = ()
     assumed: tuple[tuple[float, float] | None, ...] = ()
     low_pass: tuple[complex, ...] = ()
 
     def _detuned(self, s: np.ndarray, k: int) -> np.ndarray | float:
-        """Factor on a geophone's response whose suspension is not the one that its filter assumes."""
+        """Factor on the response of a geophone whose suspension differs from the one that its filter assumes."""
         known, own = (one[k] if one else None for one in (self.assumed, self.suspensions))
         if known is None or own is None or known == own:
             return 1.0
@@ -107,7 +108,7 @@ class SensorModel:
 
     @property
     def detuned(self) -> dict[str, tuple[float, float]]:
-        """Corner [Hz] and damping ratio of the geophones that their filters do not match."""
+        """Corner [Hz] and damping ratio of the geophones whose filters do not match them."""
         known = zip(self.names, self.suspensions, self.assumed, strict=False)
         return {name: own for name, own, assumed in known if own is not None and own != assumed}
 
@@ -121,7 +122,7 @@ class SensorModel:
 
     @property
     def realised(self) -> SensorModel:
-        """The same with every suspension that its filter does not match as part of the sensor's chain."""
+        """The same sensors, with every suspension that its filter does not match included in the sensor's chain."""
         chains = []
         for chain, known, own in zip_longest(self.chains, self.assumed, self.suspensions):
             if chain is not None and known and own and known != own:
@@ -130,7 +131,7 @@ class SensorModel:
         return replace(self, chains=tuple(chains), assumed=self.suspensions)
 
     def picked(self, index: Sequence[int]) -> SensorModel:
-        """The sensors at `index` (from the first), in that order; an index may come again."""
+        """The sensors at `index`, in that order; an index may be repeated."""
         def of(values: tuple) -> tuple:
             return tuple(values[k] for k in index)
         return SensorModel(of(self.names), of(self.motions), of(self.chains), self.sensitivity[list(index)], self.unit,
@@ -139,7 +140,7 @@ class SensorModel:
 
     @property
     def alike(self) -> bool:
-        """Whether all sensors have one chain on one kind of motion, in space."""
+        """Whether all sensors measure one kind of motion, in space, with one chain."""
         return len({*zip(self.motions, map(id, self.chains), strict=True)}) == 1 and not np.any(self.relative)
 
     def _common(self) -> int:
@@ -149,21 +150,21 @@ class SensorModel:
 
     @property
     def motion(self) -> Motion:
-        """That of all sensors. Raises InputError where they differ."""
+        """Motion that all sensors measure. Raises InputError if they differ."""
         return self.motions[self._common()]
 
     @property
     def chain(self) -> StateSpace | None:
-        """That of all sensors. Raises InputError where they differ."""
+        """Chain of all sensors. Raises InputError if they differ."""
         return self.chains[self._common()]
 
     @property
     def transient_poles(self) -> tuple[float, ...]:
-        """Those of all sensors. Raises InputError where they differ."""
+        """Denominator coefficients of all sensors. Raises InputError if they differ."""
         return self.poles[self._common()]
 
     def sense(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y) from displacement to y of unit sensitivity."""
+        """(n, n_y) response from displacement to y of unit sensitivity."""
         s = 1j * np.asarray(omega, float)
         lines = s.imag.tobytes()
         return np.stack([_chain_response(chain, motion, lines) * self._detuned(s, k) for k, (chain, motion) in
@@ -171,8 +172,9 @@ class SensorModel:
 
     def driven(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None
                ) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) commanded to acting volts: hold, delay and amplifier; and (n, n_y) `aliases` of each sensor's motion,
-        which pass its chain far above its corners: its gain is that of the anti-alias filter alone."""
+        """(n,) response from commanded to acting volts: hold, delay and amplifier; and (n, n_y) `aliases` of each
+        sensor's motion. They pass the chain far above its corners, where its gain is that of the anti-alias filter
+        alone."""
         omega = np.asarray(omega, float)
         lag = 1 + 1j * omega / (2 * np.pi * corner_Hz) if corner_Hz else 1.0
         if not period_s:
@@ -183,11 +185,11 @@ class SensorModel:
 
 
 def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) -> SensorModel:
-    """The rig's sensors as its file describes them ("V"), or ideal ones in m, m/s, m/s^2.
+    """The rig's sensors as its file describes them ("V"), or ideal sensors in m, m/s, m/s^2.
 
     Raises
     ------
-    InputError : a unit that is none of these, names that it does not have.
+    InputError : any other unit, names that the rig does not have.
     """
     known, _ = rig.sensor_rows()
     chosen = tuple(names) if names is not None else known
@@ -199,7 +201,7 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     if unit != "V":
         raise InputError(f"expected V, {', '.join(MOTION_OF_UNIT)}", field="unit of y", value=unit)
     sensors = [rig.sensors()[k] for k in at]
-    # Alike sensors share one chain object, whose response is computed once.
+    # Identical sensors share one chain object, whose response is computed once.
     systems = {(one.zeros, one.poles, one.quantity): one.chain(1.0) for one in sensors}
     units = {"velocity": "V s/m", "acceleration": "V s^2/m", "displacement": "V/m"}
     return SensorModel(chosen, tuple(one.quantity for one in sensors),
@@ -212,7 +214,7 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
 
 
 class Matrices(NamedTuple):
-    """Equations of motion and sensor rows; for derivatives with a leading axis of parameters."""
+    """Equations of motion and sensor rows; derivatives have a leading axis of parameters."""
 
     M: np.ndarray
     C: np.ndarray
@@ -224,7 +226,7 @@ class Matrices(NamedTuple):
 
 
 class Driven(NamedTuple):
-    """Y (n, n_y, m) for inputs U, and dY (n_p, n, n_y, m) by the parameters in the model's order."""
+    """Y (n, n_y, m) for inputs U, and its derivatives dY (n_p, n, n_y, m) by the parameters in the model's order."""
 
     Y: np.ndarray
     dY: np.ndarray
@@ -232,12 +234,13 @@ class Driven(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Operands:
-    """What the entries of the matrices multiply on each line, and how y follows.
+    """Vectors that the entries of the matrices multiply on each line, and the maps from there to y.
 
-    s : (n, 1, 1) j omega. left, inertial : (n, n_y, 6) y by forces on q, and by forces of inertia, whose reaction a
-    chassis may bear. sense, alias : (n, n_y, 1) y by the displacement along a sensor, and by what of it folds back.
-    volts : (n, n_u, m) whose aliases are seen; times hold (n, 1, 1) they act. q : (n, 6, m). floor, chassis :
-    (n, 3 or 6, m) displacement of what pushes through the mounts, and of what sensors read against. Y : (n, n_y, m).
+    s : (n, 1, 1) j omega. Y : (n, n_y, m). q : (n, 6, m).
+    left, inertial : (n, n_y, 6) y by forces on q, and by inertial forces, whose reaction may act on a chassis.
+    sense, alias : (n, n_y, 1) y by the displacement along a sensor, and by its aliased part.
+    volts : (n, n_u, m) whose aliases are measured; multiplied by hold (n, 1, 1) they act.
+    floor, chassis : (n, 3 or 6, m) displacement that acts through the mounts, and reference of the relative sensors.
     """
 
     sensors: SensorModel
@@ -257,7 +260,7 @@ class Operands:
     def derivative(self, names: Sequence[str], d: Matrices, more: int = 0) -> np.ndarray:
         """(n_p + more, n, n_y, m): of Y by parameters of the rig and its sensors, then zeros. d : of the matrices.
 
-        In memory the parameters come last: what is done to all of them is one product a line.
+        The parameters are last in memory, so that one product per line serves all of them.
         """
         s, q, (n, n_y, m), n_f = self.s, self.q, self.Y.shape, self.floor.shape[1]
         dY = np.zeros((n, m, n_y, len(names) + more), complex)
@@ -266,13 +269,13 @@ class Operands:
         springs = [(-d.K, q), (-d.C, s * q)]
         if np.any(self.floor):
             springs += [(d.K_floor[:, :, :n_f], self.floor), (d.C_floor[:, :, :n_f], s * self.floor)]
-        # y by a vector, and the entries with what they multiply to make it: of rows (p) that they enter at all.
+        # Map from a vector to y, and the matrices with the vectors they multiply; only rows (p) with nonzero entries.
         for left, entries in ((self.left, springs), (-self.inertial, [(d.M, s ** 2 * q)]), (-aliased, [(d.M, folded)]),
                               (self.left * self.hold + aliased, [(d.T, self.volts)])):
             rows = np.flatnonzero(sum(np.any(A, axis=(1, 2)) for A, _ in entries))
             if rows.size:
                 dY[..., rows] += left[:, None] @ sum(_products(A[rows], x) for A, x in entries)
-        # A row of R touches its own sensor only, as do the sensor's own parameters.
+        # A row of R affects its own sensor only, as do the sensor's own parameters.
         alias = np.broadcast_to(self.alias, (n, n_y, 1))
         rows, k = np.nonzero(np.any(d.R, axis=2))
         if rows.size:
@@ -296,13 +299,14 @@ class Operands:
 
 
 def _products(slopes: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """(n, m, i, p) of matrices (p, i, j) times x (n, j, m)."""
+    """(n, m, i, p) products of matrices (p, i, j) and x (n, j, m)."""
     (p, i, j), (n, _, m) = slopes.shape, x.shape
     return (x.swapaxes(1, 2).reshape(n * m, j) @ slopes.transpose(2, 1, 0).reshape(j, i * p)).reshape(n, m, i, p)
 
 
 class FrequencyModel(Protocol):
-    """What the fit of records uses of a model: `ResponseModel`, or one with effects (`gap.table_model`)."""
+    """Interface of a model that the fit of records requires: `ResponseModel`, or a model with effects
+    (`gap.table_model`)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -331,14 +335,14 @@ class FrequencyModel(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ResponseModel:
-    """y of a rig by frequency, as a function of its physical parameters.
+    """Frequency response of a rig as a function of its physical parameters.
 
     Parameters
     ----------
-    rig : structure, and the values of what is not free.
+    rig : structure, and the values of the fixed parameters.
     names : free parameters: of `rig.parameters()`, "sensor.NAME" (its sensitivity), "loop_delay_s".
-    sensors : as `sensor_model`. actuators : inputs that records drive, by default all.
-    period_s, delay_s : hold and loop delay; period_s = 0 for responses measured against the voltage itself.
+    sensors : from `sensor_model`. actuators : inputs that records drive, by default all.
+    period_s, delay_s : hold and loop delay; period_s = 0 for responses measured relative to the voltage itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
     turning : what turns with the payload, in the second-order terms of a prediction in time; the response is linear.
 
@@ -365,7 +369,7 @@ class ResponseModel:
     def of(rig: Rig, names: Sequence[str], unit: str = "V", sensors: Sequence[str] | None = None,
            actuators: Sequence[str] | None = None, sampled: bool = True,
            amplifier_corner_Hz: float | None = None) -> ResponseModel:
-        """The model of a rig with its own clock and delay."""
+        """The model of a rig with its own sample rate and delay."""
         driven = tuple(actuators) if actuators is not None else rig.equations_of_motion().actuators
         return ResponseModel(rig, tuple(names), sensor_model(rig, unit, sensors), driven,
                              1 / rig.sample_rate_Hz if sampled else 0.0, rig.loop_delay_s if sampled else 0.0,
@@ -373,11 +377,11 @@ class ResponseModel:
 
     @property
     def _known(self) -> frozenset[str]:
-        """Names of every parameter that could be free."""
+        """Names of all parameters that may be free."""
         return frozenset(self.all_parameters())
 
     def all_parameters(self) -> dict[str, Parameter]:
-        """Every parameter that could be free."""
+        """All parameters that may be free."""
         found = dict(self.rig.parameters())
         for name, value, unit in zip(self.sensors.names, self.sensors.sensitivity, self.sensors.sensitivity_units,
                                      strict=True):
@@ -391,7 +395,7 @@ class ResponseModel:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """(n_p,) present values of the free parameters; not to be written to."""
+        """(n_p,) present values of the free parameters; read-only."""
         known = self.all_parameters()
         found = np.array([known[name].value for name in self.names])
         found.setflags(write=False)
@@ -403,17 +407,17 @@ class ResponseModel:
         return tuple(known[name].unit for name in self.names)
 
     def scales(self) -> np.ndarray:
-        """(n_p,) what one relative unit of a parameter is: its size, or 0.1 (m, kg m^2, ..) for one that is zero."""
+        """(n_p,) size of one relative unit of each parameter: its magnitude, or 0.1 (m, kg m^2, ..) if it is zero."""
         values = self.values
         return np.where(values == 0, 0.1, np.abs(values))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_p,) lowest and highest values in a fit from here: what is positive keeps LOWEST of its size."""
+        """(n_p,) lower and upper bounds in a fit that starts here: LOWEST times its size for a positive parameter."""
         low = np.where([positive(name) for name in self.names], LOWEST * self.scales(), -np.inf)
         return low, np.full(len(low), np.inf)
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_p,) relative units by which a parameter may go down or up in one step of a fit: half of itself."""
+        """(n_p,) relative amounts by which a parameter may decrease or increase in one step of a fit: half its size."""
         half = np.full(len(self.names), 0.5)
         return half, half
 
@@ -423,7 +427,7 @@ class ResponseModel:
         return (*self.actuators, *FLOOR)
 
     def at(self, theta: Sequence[float] | np.ndarray) -> Self:
-        """The model with its free parameters at theta (n_p,). Raises InputError where no rig has them."""
+        """The model with its free parameters at theta (n_p,). Raises InputError if no rig has these values."""
         values = dict(zip(self.names, np.asarray(theta, float).tolist(), strict=True))
         sensitivity = np.array([values.get(f"sensor.{name}", old) for name, old
                                 in zip(self.sensors.names, self.sensors.sensitivity, strict=True)])
@@ -439,11 +443,11 @@ class ResponseModel:
 
     @cached_property
     def matrices(self) -> Matrices:
-        """Of the rig as it is, the actuators and sensors of the model."""
+        """Matrices of the rig, with the actuators and sensors of the model."""
         return self.matrices_of(self.rig)
 
     def matrices_of(self, rig: Rig) -> Matrices:
-        """Of that rig, with the actuators and sensors of the model."""
+        """Matrices of the given rig, with the actuators and sensors of the model."""
         eom = rig.equations_of_motion()
         known, rows = rig.sensor_rows()
         R = rows[[known.index(name) for name in self.sensors.names]]
@@ -452,7 +456,7 @@ class ResponseModel:
 
     @cached_property
     def derivative_matrices(self) -> Matrices:
-        """By each free parameter, (n_p, ...) each; zero for those that are not the rig's."""
+        """Derivatives by each free parameter, (n_p, ...) each; zero for parameters that are not the rig's."""
         known = self.rig.parameters()
         shapes = [(len(self.names), *matrix.shape) for matrix in self.matrices]
         found = Matrices(*(np.zeros(shape) for shape in shapes))
@@ -470,7 +474,7 @@ class ResponseModel:
 
     def _differences(self, name: str, value: float) -> list[tuple[str, str, np.ndarray]]:
         """As `Rig.slopes`, whole matrices: central differences, exact at any step for polynomials of second degree."""
-        step = 0.1 * abs(value) or 1e-3  # a tenth loses no digits
+        step = 0.1 * abs(value) or 1e-3  # large enough to avoid cancellation
         up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step})) for sign in (1, -1))
         slopes = (high - low for high, low in zip(up, down, strict=True))
         return [(which, "", slope / (2 * step)) for which, slope in zip(Matrices._fields, slopes, strict=True)]
@@ -482,22 +486,22 @@ class ResponseModel:
 
     def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
                inner: np.ndarray | None = None) -> Driven:
-        """y of a block of data; body (n, 12, m): impulses and steps of the transient beside the block's inputs; inner:
-        states beside those of body and sensors, of which this model has none."""
+        """y of a block of data; body (n, 12, m) : impulses and steps of the transient, added to the block's inputs;
+        inner : initial states other than those of body and sensors, of which this model has none."""
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
         return self.driven(block.omega, U, derivative)
 
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, n_t): what the ends of a record leave in the sensors: in their chains, and in the suspensions of
-        geophones whose corners are free, for no filter cancels these exactly then."""
+        """(n, n_y, n_t) transients of the sensors due to the ends of a record: of their chains and, if their corners
+        are free, of the geophones' suspensions, which no filter then cancels exactly."""
         own = self.chains_ring(omega)
         if not any(name.startswith("corner.") for name in self.names):
             return own
         return np.concatenate([own, self.suspensions_ring(omega)], axis=2)
 
     def suspensions_ring(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, 2 m) transients 1/p and s/p of the suspensions of m geophones, p the polynomial of each, at the
-        corner that its filter assumes: what a corner within its tolerance changes of them is of second order."""
+        """(n, n_y, 2 m) transients 1/p and s/p of the suspensions of m geophones, p the polynomial of each at the
+        corner that its filter assumes; a change of the corner within its tolerance has only a second-order effect."""
         s, known = 1j * omega, [(k, own) for k, own in enumerate(self.sensors.assumed) if own is not None]
         lags = np.array(self.sensors.low_pass)
         filtered = np.prod(lags / (lags - s[:, None]), axis=1)
@@ -509,7 +513,7 @@ class ResponseModel:
         return found.reshape(*found.shape[:2], -1)
 
     def chains_ring(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, n_t): `chain_transients` of each sensor."""
+        """(n, n_y, n_t): `chain_transients` of all sensors."""
         each, start = self.chain_transients(1j * omega), 0
         found = np.zeros((len(omega), len(each), sum(own.shape[1] for own in each)), complex)
         for k, own in enumerate(each):
@@ -518,8 +522,8 @@ class ResponseModel:
         return found
 
     def chain_transients(self, s: np.ndarray) -> list[np.ndarray]:
-        """(n, k) of each sensor: what the ends of a record leave in it by itself: the states of its chain, and a
-        constant and a slope in frequency, which hold the aliases of all others; s (n,) j omega."""
+        """(n, k) for each sensor: its own transients due to the ends of a record. These are the states of its chain,
+        and a constant and a slope in frequency for the aliases of all other transients; s (n,) j omega."""
         known = {}
         for poles in dict.fromkeys(self.sensors.poles):
             states = (s ** k / np.polyval(np.asarray(poles)[::-1], s) for k in range(len(poles) - 1))
@@ -527,11 +531,11 @@ class ResponseModel:
         return [known[poles] for poles in self.sensors.poles]
 
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
-        """(n, n_y, 0): y by initial states beside those of body and sensors, of which this model has none."""
+        """(n, n_y, 0): y by initial states other than those of body and sensors, of which this model has none."""
         return np.zeros((len(omega), len(self.sensors.names), 0), complex)
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
-        """y for spectra of the inputs, and its derivative by the free parameters.
+        """y for spectra of the inputs, and its derivatives by the free parameters.
 
         U : (n, n_u + 3, m), or (n, n_u + 3 + 12, m) with impulse and step of the transient last.
         """
@@ -567,7 +571,8 @@ class ResponseModel:
         return Driven(Y, dY)
 
     def _delay_derivative(self, omega, volts, mat, inverse, out, Minv) -> np.ndarray:
-        """Of the continuous term exactly; aliases by a difference, for they are small, with a kink at whole samples."""
+        """Exact for the continuous term; a difference for the aliases, which are small and have a kink at whole
+        samples."""
         s, step = 1j * omega[:, None, None], 1e-4 * (self.period_s or 1e-3)
         a, _ = self.drive(omega)
         earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
@@ -578,27 +583,28 @@ class ResponseModel:
 
     @kept_lines
     def _lines(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """`drive`, inv(D) (n, 6, 6), and the chains of the sensors (n, n_y, 1)."""
+        """`drive`, inv(D) (n, 6, 6), and the responses of the sensor chains (n, n_y, 1)."""
         s, mat = 1j * omega[:, None, None], self.matrices
         inverse = np.linalg.inv(mat.K + s * mat.C + s ** 2 * mat.M)
         return *self.drive(omega), inverse, self.sensors.sense(omega)[:, :, None]
 
     def drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Voltage commanded to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1)."""
+        """Response from commanded voltage to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1).
+        """
         a, folded = self.sensors.driven(omega, self.period_s, self.delay_s, self.amplifier_corner_Hz)
         return a[:, None, None], folded[:, :, None]
 
 
-# Names of parameters: the moments of inertia of a payload, and with its mass and its load's all that is inertia.
+# Names of parameters: the moments of inertia of a payload; and all inertial parameters, including masses and load.
 MOMENTS = (("J1", "J2", "J3"), ("Ixx", "Iyy", "Izz"))
 INERTIAL = ("mass", "load.mass", *MOMENTS[0], *MOMENTS[1])
 
 
 def moment_rows(names: Sequence[str]) -> np.ndarray:
-    """(k, n_p) rows r: r @ theta > 0 for all of them where no moment of inertia exceeds the sum of the other two.
+    """(k, n_p) rows r: r @ theta > 0 for all rows if no moment of inertia exceeds the sum of the other two.
 
-    No rows unless all three moments are free. The moments about the axes stand for the principal ones: products of
-    inertia are assumed to be small.
+    No rows unless all three moments are free. The moments about the axes are taken as the principal moments: products
+    of inertia are assumed to be small.
     """
     rows = []
     for moments in MOMENTS:
@@ -613,9 +619,9 @@ def moment_rows(names: Sequence[str]) -> np.ndarray:
 
 
 def positive(name: str) -> bool:
-    """Whether physics asks for a positive value: masses, stiffness, damping, force constants, sensitivities.
+    """Whether physics requires a positive value: masses, stiffness, damping, force constants, sensitivities.
 
-    Of a rig's own parameters; those of effects ("effect@place.parameter") have bounds of their own.
+    For a rig's own parameters; those of effects ("effect@place.parameter") have their own bounds.
     """
     if "@" in name:
         return False

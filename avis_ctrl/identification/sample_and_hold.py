@@ -1,13 +1,13 @@
-"""What sampling does to a response: zero-order hold, loop delay, and the aliases that they fold into the band.
+"""Effects of sampling on a response: zero-order hold, loop delay, and the aliases that fall into the band.
 
 The voltage is held between samples and delayed; y is sampled. With H(s) from voltage to y, the sampled response is
 
     G(e^{jwT}) = sum over k of H(jw + jk ws) h(jw + jk ws),    h(s) = (1 - e^{-sT}) / (sT) e^{-s tau}.
 
-The term k = 0 is the continuous response times hold and delay. At the others, half the sample rate and more, a table
-is only its mass: there H is 1/s (a velocity per force and mass) or 1 (an acceleration), times amplifier and anti-alias
-filter, and their sum is known in closed form. That leaves an error of the order of the damping over mass and frequency,
-below 1e-4 of the response in the band of a table (a test measures it against the exact discretisation).
+The term k = 0 is the continuous response times hold and delay. In the other terms, at half the sample rate and above, a
+table behaves as a pure mass: H is 1/s (a velocity per force and mass) or 1 (an acceleration), times amplifier and
+anti-alias filter, and their sum is known in closed form. The remaining error is of the order of the damping over mass
+and frequency, below 1e-4 of the response in the band of a table (a test compares it with the exact discretisation).
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ Motion = Literal["displacement", "velocity", "acceleration"]
 
 @dataclass(frozen=True)
 class AliasSettings:
-    """apart : relative step from lag to lag by which their poles are moved apart [1], for partial fractions need
-    distinct ones: the result is off by about as much, and by round-off over it where two were equal.
-    """
+    """apart : relative separation of the poles of successive lags [1], because partial fractions need distinct poles.
+    The error of the result is about as large, plus round-off divided by it if two poles were equal."""
 
     apart: float = 1e-6
 
@@ -34,20 +33,20 @@ SETTINGS = AliasSettings()
 
 
 def hold(omega: np.ndarray, period_s: float, delay_s: float = 0.0) -> np.ndarray:
-    """h(jw), (n,): zero-order hold with unit gain at rest, and delay."""
+    """h(jw), (n,): zero-order hold with unit DC gain, and delay."""
     half = np.asarray(omega, float) * period_s / 2
     return np.sinc(half / np.pi) * np.exp(-1j * omega * (period_s / 2 + delay_s))
 
 
 def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: complex) -> np.ndarray:
-    """Sampled response, (n,), of 1/(s - pole) behind hold and delay, exact (modified z-transform); real part <= 0."""
+    """Exact sampled response, (n,), of 1/(s - pole) after hold and delay (modified z-transform); real part <= 0."""
     whole, part = divmod(delay_s / period_s, 1.0)
-    if part > 1 - 1e-9:  # a delay of whole samples that rounding put below
+    if part > 1 - 1e-9:  # a whole number of samples, rounded down
         whole, part = whole + 1, 0.0
     z = np.exp(1j * np.asarray(omega, float) * period_s)
 
     def integral(low: float, high: float) -> complex:
-        """Of e^(pole t) from low to high sample periods."""
+        """Integral of e^(pole t) from low to high sample periods."""
         if pole == 0:
             return (high - low) * period_s
         return (np.exp(pole * high * period_s) - np.exp(pole * low * period_s)) / pole
@@ -58,11 +57,12 @@ def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: compl
 
 def aliases(omega: np.ndarray, period_s: float, delay_s: float, motion: Motion,
             amplifier_corner_Hz: float | None = None, low_pass: Sequence[complex] = ()) -> np.ndarray:
-    """(n,) what the terms k != 0 add to the motion per force and mass: the exact sampled response less the term k = 0.
+    """(n,) contribution of the terms k != 0 to the motion per force and mass: exact sampled response minus the term k =
+    0.
 
-    displacement : taken as zero, for it falls off as the square of the frequency. acceleration : without amplifier and
-    anti-alias filter the force jumps at the sampling instant; the sample is taken just after it.
-    low_pass : poles [rad/s] of the anti-alias filter, whose gain at rest is one.
+    displacement : taken as zero, because it decreases with the square of the frequency. acceleration : without
+        amplifier and anti-alias filter the force jumps at the sampling instant; the sample is taken just after it.
+    low_pass : poles [rad/s] of the anti-alias filter, whose DC gain is one.
     """
     omega = np.asarray(omega, float)
     if motion == "displacement":
@@ -78,5 +78,5 @@ def aliases(omega: np.ndarray, period_s: float, delay_s: float, motion: Motion,
             residues = [gain / np.prod(pole - np.delete(poles, k)) for k, pole in enumerate(poles)]
             exact = sum(residue * sampled_pole(omega, period_s, delay_s, pole)
                         for residue, pole in zip(residues, poles, strict=True))
-        # At rest both integrators are infinite and their difference is finite, but no velocity is measured there.
+        # At zero frequency both integrators are infinite with a finite difference, but no velocity is measured there.
         return np.where(omega == 0, 0.0, exact - continuous)

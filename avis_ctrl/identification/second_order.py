@@ -1,7 +1,8 @@
-"""Second-order terms of large rotations in the spectra of records, for a fit whose model is linear by frequency.
+"""Second-order terms of large rotations in the spectra of records, for a fit whose model is linear in frequency.
 
-They are what a prediction in time with them differs from one without, at a model's present parameters: small, and
-hardly changed by what a fit still moves. A fit takes them off the records and forms them anew where it ends.
+They are the difference between time-domain predictions with and without them, at a model's present parameters: small,
+and hardly affected by the remaining changes of a fit. A fit subtracts them from the records and recomputes them where
+it ends.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Portion, RecordSource, ranges
 
-# Samples that are worked on at once.
+# Samples processed at once.
 PIECE = 1 << 17
-# Twice the logarithm of the odds, 19 to 1, with which the records have to say that something turns otherwise.
+# Twice the logarithm of the odds, 19 to 1, that the records must give against the model's own turning.
 EVIDENCE = 2 * np.log(19.0)
 
 
 def terms(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel,
           turnings: Sequence[Turning] | None = None) -> list[np.ndarray]:
-    """(k, n, n_y, 1) of each block: the second-order terms of its record, for each of k ways of turning.
+    """(k, n, n_y, 1) for each block: the second-order terms of its record, for each of k turnings.
 
-    blocks : of the campaign's records, or of pieces of them. turnings : by default the model's own alone.
+    blocks : of the campaign's records, or of pieces of them. turnings : by default only the model's own.
     """
     ways = [model.turning] if turnings is None else list(turnings)
     found: list[np.ndarray] = [np.zeros(0)] * len(blocks)
@@ -50,7 +51,7 @@ def _of_record(record: RecordSource, blocks: Sequence[SpectralBlock], models: Se
     predictors = [Predictor(models[0]), *(Predictor(one, large_motion=True) for one in models)]
     for block in blocks:
         start = round((block.start_s - whole.header.start_s) * fs)
-        # What lies between two pieces moves the table, too.
+        # The inputs between two pieces move the table, too.
         for first, last in ranges(start - at, PIECE) if start - at > 1 else ():
             _read(whole, at + first, at + last, predictors)
         parts = [_read(whole, start + first, start + last, predictors) for first, last in ranges(block.samples, PIECE)]
@@ -63,26 +64,27 @@ def _of_record(record: RecordSource, blocks: Sequence[SpectralBlock], models: Se
 
 
 def _read(whole: RecordSource, start: int, stop: int, predictors: Sequence[Predictor]) -> np.ndarray:
-    """(k, samples, n_y) of each predictor less the first, which is linear."""
+    """(k, samples, n_y) output of each predictor minus that of the first, which is linear."""
     u, floor = model_inputs(predictors[0].model, whole.load(start, stop))
     linear, *others = (one.read(u, floor) for one in predictors)
     return np.array([y - linear for y in others])
 
 
 def without(blocks: Sequence[SpectralBlock], of: Sequence[np.ndarray]) -> list[SpectralBlock]:
-    """Blocks with the terms (n, n_y, 1) of each taken off."""
+    """The blocks with their terms (n, n_y, 1) subtracted."""
     return [replace(block, Y=block.Y - one) for block, one in zip(blocks, of, strict=True)]
 
 
 def chosen_turning(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel
                    ) -> tuple[Turning, list[np.ndarray]]:
-    """What turns with the payload, as blocks with noise have it, and the terms (n, n_y, 1) of each block with that.
+    """What turns with the payload according to blocks with noise, and the corresponding terms (n, n_y, 1) of each
+    block.
 
-    Another way than the model's own is taken where the records say so by 19 to 1.
+    The model's own turning is replaced only if the records favour another by 19 to 1.
     """
     ways = (Turning(0.0, 0.0), Turning(1.0, 0.0), Turning(0.0, 1.0))
     parts = terms(campaign, blocks, model, ways)
-    # The terms are linear in both shares, to the order that counts.
+    # The terms are linear in both fractions, to the order considered.
     columns = [np.stack([one[0], one[1] - one[0], one[2] - one[0]]) for one in parts]
     H, g = added_terms(model, blocks, columns)
 

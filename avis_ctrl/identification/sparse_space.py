@@ -1,10 +1,10 @@
-"""Sparse bases of subspaces of parameters: what a person can read of a null space.
+"""Sparse bases of subspaces of parameters, which make a null space readable.
 
-A subspace is given by any basis of it. Its reduced row echelon form with complete pivoting splits it into parts that
-share no parameter (the connected components of a matroid are those of the graph of its fundamental circuits: Oxley,
+A subspace is given by any basis of it. Its reduced row echelon form with complete pivoting splits it into parts without
+common parameters (the connected components of a matroid are those of the graph of its fundamental circuits: Oxley,
 Matroid Theory, 2nd ed., 2011, section 4.1). Within a part the vectors of fewest entries are its circuits, found by
-setting all but one of the dimensions to zero in turn; where there are too many of them, the echelon form itself is
-the answer.
+setting all but one of the dimensions to zero in turn; if there are too many of them, the echelon form itself is the
+result.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ _MOST_CIRCUITS = 3000
 
 
 def reduced_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
-    """Reduced row echelon form, (d, n), of the columns of basis (n, d): row k has 1 at its pivot, where others have 0.
+    """Reduced row echelon form, (d, n), of the columns of basis (n, d): row k has 1 at its pivot, where all other rows
+    have 0.
 
-    Entries below the tolerance of their row's largest are zero.
+    Entries below the tolerance, relative to the largest of their row, are zero.
     """
     rows = np.array(basis, float).T
     _, R, order = la.qr(rows, mode="economic", pivoting=True)
@@ -35,7 +36,7 @@ def reduced_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
 
 
 def components(rows: np.ndarray) -> list[tuple[list[int], list[int]]]:
-    """Parts that share no column: (rows, columns) of each, columns ascending, parts by their first column."""
+    """Parts without common columns: (rows, columns) of each, columns ascending, parts by their first column."""
     count, of = connected_components((rows != 0).astype(int) @ (rows != 0).T.astype(int), directed=False)
     parts = [np.flatnonzero(of == k) for k in range(count)]
     return sorted(((part.tolist(), np.flatnonzero(np.any(rows[part], axis=0)).tolist()) for part in parts),
@@ -65,7 +66,7 @@ def _circuits(part: np.ndarray, tolerance: float) -> np.ndarray:
         if size[-1] > tolerance:
             row = orthonormal @ Vh[-1]
             candidates.append(_cleaned((row / row[np.argmax(np.abs(row))])[None], tolerance)[0])
-    # Fewest entries first; of those alike, the most even.
+    # Fewest entries first; of equally many, the most even.
     candidates.sort(key=lambda row: (np.count_nonzero(row), -round(float(np.sum(np.abs(row))), 6)))
     chosen: list[np.ndarray] = []
     for row in candidates:
@@ -81,7 +82,7 @@ def _circuits(part: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def whole_numbers(row: np.ndarray, largest: int = 12, tolerance: float = 1e-4) -> np.ndarray:
-    """The row as whole numbers where a factor makes it so; otherwise with its largest entry 1. First entry positive."""
+    """The row in whole numbers if a factor makes it so; otherwise with its largest entry 1. First entry positive."""
     inside = np.flatnonzero(row)
     if not inside.size:
         return row

@@ -1,4 +1,4 @@
-"""Blocks of records and of frequency responses, their lines and their transients."""
+"""Spectral blocks of records and of frequency responses, their lines and their transients."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from avis_ctrl.measurement.frequency_response.response import GRAM_TOLERANCE
 
 # Lines of a record on which models are compared.
 THIN_LINES = 450
-# Below this [Hz] lie the resonances of a table: there no line is left out before the others.
+# Frequency [Hz] below which the resonances of a table lie: there all lines have the full weight in a selection.
 DENSE_BELOW_Hz = 8.0
 
 
 def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, float]) -> SpectralBlock:
-    """Spectra of a whole record on its DFT lines in a band, scaled by 1/sqrt(samples): white noise keeps its variance.
+    """Spectra of a whole record on its DFT lines in a band, scaled by 1/sqrt(samples) to preserve the variance of white
+    noise.
 
     Raises
     ------
@@ -55,8 +56,9 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
                    ) -> SpectralBlock:
     """A measured frequency response, weighted by its covariance.
 
-    Where neighbouring lines share their data, each is given a covariance as many times larger: together they then hold
-    the information that they have. Directions that the inputs do not span on a line hold none: their columns are zero.
+    If neighbouring lines share data, the covariance of each is multiplied by their number, so that together they
+    contain no more than the actual information. Directions that the inputs do not span on a line contain no
+    information: their columns are zero.
 
     Raises
     ------
@@ -82,8 +84,8 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
 
 
 def _root(gram: np.ndarray) -> np.ndarray:
-    """(n, n_u, n_u) W with W W^H = gram, which may be singular; inputs are brought to unit size before, for units
-    differ by orders.
+    """(n, n_u, n_u) W with W W^H = gram, which may be singular; inputs are first normalised, because units differ by
+    orders of magnitude.
 
     Raises InputError for eigenvalues that are negative beyond round-off.
     """
@@ -102,16 +104,16 @@ def _root(gram: np.ndarray) -> np.ndarray:
 
 def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str,
            offset: int = 0) -> None:
-    """Rows of the inputs by name."""
+    """Write values to the entries of the named inputs."""
     into[:, [offset + k for k in places(names, known, "the model's inputs are", field)]] = values
 
 
 def transient_columns(block: SpectralBlock, model: FrequencyModel) -> tuple[np.ndarray, np.ndarray]:
-    """(n, n_y, n_t) columns, for real coefficients, of what the ends of a record leave in its spectra; (n_t,) norms.
+    """(n, n_y, n_t) columns, for real coefficients, of the transient of a record's ends in its spectra; (n_t,) norms.
 
     Impulse and step on the body (12), the states of the sensors' chains (`ResponseModel.sensor_transients`), and last
-    the states that a model has inside beside the body.
-    The columns have unit norm; each was divided by its own.
+    the inner states of a model other than the body's. The columns have unit norm; each was divided by its original
+    norm.
     """
     return _transient_columns(model, block.omega)
 
@@ -129,27 +131,27 @@ def _transient_columns(model: FrequencyModel, omega: np.ndarray) -> tuple[np.nda
 
 def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: FrequencyModel
                     ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 12, 1) impulses and steps on the body, and (m,) what the states inside start with: the part of unknowns
-    x (n_t,) of the columns of `transient_columns`, norms (n_t,), that changes with the model's parameters."""
+    """(n, 12, 1) impulses and steps on the body, and (m,) initial values of the inner states: the part of unknowns x
+    (n_t,) of the columns of `transient_columns`, norms (n_t,), that depends on the model's parameters."""
     n_b, true = 2 * N_Q, x / norms
     chains = model.sensor_transients(block.omega[:1]).shape[2]
     body = np.broadcast_to(true[None, :n_b, None], (len(block.omega), n_b, 1))
     return body, true[n_b + chains:]
 
 
-# Singular values of unit columns below this share of the largest: two states whose columns agree within it are one.
+# Relative singular value of unit columns below which a direction is dropped: states with columns this close are one.
 DEPENDENT = 1e-7
 
 
 def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Q (N, r) orthonormal and X (n_t, r) with columns (N, n_t) X = Q, directions that depend on others left out.
+    """Q (N, r) orthonormal and X (n_t, r) with columns (N, n_t) X = Q; dependent directions are omitted.
 
-    Of dependent columns (an integrator inside a mount beside impulse and step on the body) the unknowns would be huge,
-    of opposite sign, and of no meaning one by one.
+    For dependent columns (an integrator inside a mount, in addition to impulse and step on the body) the unknowns would
+    be huge, of opposite sign, and individually meaningless.
     """
     squares, V = np.linalg.eigh(columns.T @ columns)
     if squares[0] > DEPENDENT * squares[-1]:
-        # Well apart: by their products, twice against round-off, in half the time of reflections.
+        # Well conditioned: by the Gram matrix, twice because of round-off, in half the time of Householder QR.
         X = V / np.sqrt(squares)
         Q = columns @ X
         again = np.linalg.inv(np.linalg.cholesky(Q.T @ Q)).T
@@ -161,7 +163,7 @@ def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> SpectralBlock:
-    """Some lines of a block: those that the input drives, dense where the resonances are, drawn above."""
+    """Subset of the lines of a block: preferably driven lines, dense where the resonances are, thinned out above."""
     n = len(block.omega)
     if n <= lines:
         return block
@@ -169,7 +171,7 @@ def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> Spe
     power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
     driven = power > 1e-3 * np.max(power)
     frequency = block.omega / (2 * np.pi)
-    # Equal numbers per octave above DENSE_BELOW_Hz, all the same below it.
+    # Equal numbers per octave above DENSE_BELOW_Hz, equal weights below it.
     weight = np.where(frequency < DENSE_BELOW_Hz, 1.0, DENSE_BELOW_Hz / frequency) * np.where(driven, 1.0, 0.05)
     keep = np.argsort(rng.exponential(size=n) / weight)[:lines]
     return block.lines(np.sort(keep))

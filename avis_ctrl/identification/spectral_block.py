@@ -1,9 +1,9 @@
 """Data for the fit: spectra of records, or frequency responses, in one form.
 
-A block holds Y = G U + noise on lines omega for m experiments, with the covariance of the noise. A record is one
-experiment (its own spectra, with the transient of its ends unknown); a measured frequency response of n_u inputs is
-n_u experiments: any W with W W^H = S, its Gram matrix, makes the columns of Y = G W independent with the noise
-covariance of one experiment (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 2.7).
+A block represents Y = G U + noise on lines omega for m experiments, with the covariance of the noise. A record is one
+experiment (its own spectra, with the unknown transient of its ends). A measured frequency response of n_u inputs is n_u
+experiments: any W with W W^H = S, its Gram matrix, makes the columns of Y = G W independent with the noise covariance
+of one experiment (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section 2.7).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class SpectralBlock:
     U : (n, n_in, m) inputs in the order of the model's (actuators, floor).
     Y : (n, n_y, m) outputs in the order of the model's sensors.
     noise : (n, 1 or m, n_y, n_y) covariance E[e e^H] of the noise of an experiment; None until it is known.
-    dof : complex degrees of freedom that `noise` was estimated with; infinite when it is exact.
-    transient : the ends of a record leave a transient in it, which the fit takes out (m = 1).
+    dof : complex degrees of freedom of the estimate `noise`; infinite if it is exact.
+    transient : whether the ends of a record add a transient, which the fit removes (m = 1).
     kind : records of one kind share their noise.
-    shared : lines whose errors go together; the information of so many is that of one.
-    start_s, samples : of the record's part that it is of: its begin on the campaign's clock, and its length.
+    shared : number of lines with common errors; together they have the information of one line.
+    start_s, samples : start on the campaign's clock and length of the part of the record that it represents.
     """
 
     name: str
@@ -59,11 +59,11 @@ class SpectralBlock:
         return round(2 * self.Y.size / self.shared)
 
     def with_noise(self, noise: np.ndarray, dof: float = np.inf) -> SpectralBlock:
-        """With the covariance of the noise, (n, n_y, n_y) or (n, m, n_y, n_y)."""
+        """The block with the covariance of its noise, (n, n_y, n_y) or (n, m, n_y, n_y)."""
         n_y = self.Y.shape[1]
         return replace(self, noise=noise.reshape(len(self.omega), -1, n_y, n_y), dof=dof)
 
     def lines(self, keep: np.ndarray) -> SpectralBlock:
-        """Some of the lines."""
+        """The block on some of its lines."""
         return replace(self, omega=self.omega[keep], U=self.U[keep], Y=self.Y[keep],
                        noise=None if self.noise is None else self.noise[keep])

@@ -1,16 +1,16 @@
-r"""How far a measured frequency response may lie from an identified rig, in the coordinates of a design.
+r"""Bound on the difference between a measured frequency response and an identified rig, in a design's coordinates.
 
-With A (volts per axis force) and D (axis velocities from sensors), both from geometry, the kept coordinates see
+With A (volts per axis force) and D (axis velocities from sensors), both from geometry, the kept coordinates have
 
     G_k = D G A    and    L = inv(G_k) D (G_measured - G) A,    so that D G_measured A = G_k (I + L),
 
-an input-multiplicative error, rotations as displacement and force at the edge. The measured response has an error of
-its own, N with vec(N) of known covariance, so that the true L is L_measured - inv(G_k) D N A and
+an input-multiplicative error, with rotations as displacement and force at the edge. The measured response has an error
+N, with vec(N) of known covariance. The true L is therefore L_measured - inv(G_k) D N A, and
 
     sigma_max(L) <= sigma_max(L_measured) + q,
 
-q the quantile of the largest singular value of that noise. The bound holds line by line with at least the confidence
-asked for; it counts the noise twice, for L_measured contains it.
+with q the quantile of the largest singular value of that noise. The bound is valid line by line with at least the
+requested confidence. It counts the noise twice, because L_measured contains it.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from avis_ctrl.measurement.frequency_response.response import SPANNED
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Rig
 
-# Random draws behind the quantiles; that of 99 % then rests on the 20 largest.
+# Random draws for the quantiles; the 99 % quantile then depends on the 20 largest.
 DRAWS = 2000
 CONFIDENCES = (0.8, 0.9, 0.95, 0.99)
-# Lines worked on at once, which bounds the memory.
+# Lines processed at once, to limit the memory.
 CHUNK = 200
 
 
@@ -43,7 +43,7 @@ class FrfSpread:
     ----------
     keep : coordinates.
     measured : (n,) largest singular value of L as measured, noise included.
-    noise : (c, n) q, quantiles of what noise alone makes, at each of confidences (c,).
+    noise : (c, n) q, quantiles for noise alone, at each of confidences (c,).
     """
 
     keep: tuple[str, ...]
@@ -53,10 +53,10 @@ class FrfSpread:
     confidences: tuple[float, ...]
 
     def bound(self, confidence: float = 0.95) -> np.ndarray:
-        """(n,) what the largest singular value of the true L stays below, with that confidence at each line, or the
-        next larger one that was computed.
+        """(n,) upper bound on the largest singular value of the true L, with at least that confidence at each line: the
+        next larger confidence that was computed.
 
-        Raises InputError for one above all that were.
+        Raises InputError for a confidence above all computed ones.
         """
         able = [k for k, one in enumerate(self.confidences) if one >= confidence - 1e-9]
         if not able:
@@ -65,22 +65,22 @@ class FrfSpread:
         return self.measured + self.noise[min(able, key=lambda k: self.confidences[k])]
 
     def drowned(self, confidence: float = 0.95) -> np.ndarray:
-        """(n,) bool: lines at which noise alone makes a spread of 100 % or more, with that confidence."""
+        """(n,) bool: lines at which noise alone gives a spread of 100 % or more, with that confidence."""
         return np.asarray(self.bound(confidence) - self.measured >= 1.0)
 
     def usable(self, confidence: float = 0.95) -> np.ndarray:
-        """(n,) the bound, where noise drowns the response no more than 100 % or what is there for certain.
+        """(n,) the bound, reduced on lines where noise alone gives a spread of 100 % or more.
 
-        A response that noise alone hides says nothing of the model: at such lines the bound is the noise's size. The
-        100 % in its place are an assumption, not a measurement, unless the difference stays above them with the noise
-        taken off. Elsewhere as `bound`.
+        A response hidden by noise says nothing about the model: at such lines the bound is the size of the noise. It is
+        replaced by 100 %, an assumption and not a measurement, or by the measured difference minus the noise if that is
+        larger. On all other lines as `bound`.
         """
         bound, drowned = self.bound(confidence), self.drowned(confidence)
         certain = np.maximum(1.0, 2 * self.measured - bound)
         return np.where(drowned, np.minimum(bound, certain), bound)
 
     def thinned(self, per_octave: int = 24, confidence: float = 0.95) -> FrfSpread:
-        """Of each part of an octave the line with the largest bound."""
+        """Keep the line with the largest bound in each fraction of an octave."""
         place = np.floor(per_octave * np.log2(self.frequency_Hz / self.frequency_Hz[0]) + 1e-9).astype(int)
         bound = self.bound(confidence)
         largest = np.array([np.flatnonzero(place == one)[np.argmax(bound[place == one])] for one in np.unique(place)])
@@ -94,7 +94,7 @@ def kept_axes(rig: Rig, keep: Sequence[str], actuators: Sequence[str], sensors: 
 
     Raises
     ------
-    InputError : coordinates that these actuators cannot push or these sensors cannot tell apart.
+    InputError : coordinates that these actuators cannot drive or these sensors cannot distinguish.
     """
     lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
     return (actuator_axes(rig, keep, actuators).allocation * lever,
@@ -103,21 +103,21 @@ def kept_axes(rig: Rig, keep: Sequence[str], actuators: Sequence[str], sensors: 
 
 def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence[str] = ("z", "phi_x"),
                confidences: Sequence[float] = CONFIDENCES, seed: int = 1) -> FrfSpread:
-    """The spread of a measured frequency response about an identified model.
+    """Spread of a measured frequency response about an identified model.
 
     Parameters
     ----------
-    measured : from the model's actuators to its sensors; columns of a measured floor are passed over.
+    measured : from the model's actuators to its sensors; columns of a measured floor are ignored.
     model : at the identified parameters.
-    confidences : shares of repeated measurements in which a bound holds at a line.
+    confidences : probabilities, over repeated measurements, that a bound is valid at a line.
 
-    If the records do not excite every drive separately, the controlled coordinates are driven by the combinations that
-    they do excite; lines on which these are not known are left out.
+    If the records do not excite every drive separately, the controlled coordinates are driven by combinations that the
+    records do excite; lines on which these are not known are omitted.
 
     Raises
     ------
-    InputError : a confidence outside 0 .. 1, channels or units that are not the model's, coordinates that the
-        channels cannot push or tell apart, or that the records do not push.
+    InputError : a confidence outside 0 .. 1, channels or units that are not the model's, coordinates that the channels
+        cannot drive or distinguish, or that the records do not excite.
     """
     if not confidences or not all(0 < one < 1 for one in confidences):
         raise InputError("expected shares between 0 and 1", field="confidences", value=list(confidences))
@@ -137,10 +137,10 @@ def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence
 
 def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, keep: Sequence[str]
             ) -> tuple[FrequencyResponse, np.ndarray]:
-    """The lines on which the response to the kept coordinates is known, and how the measured drives push along them.
+    """Lines on which the response to the kept coordinates is known, and A (n_u, k) for the measured drives.
 
-    That is A (n_u, k) as a design would have it, in the order of those drives, where the records hold it; otherwise
-    the least of what they play that makes the same forces.
+    This is A as a design has it, in the order of those drives, if the records excite it; otherwise the minimum-norm
+    combination of the played voltages that gives the same forces.
     """
     drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
     at = [measured.inputs.index(model.actuators[k]) for k in drives]
@@ -164,7 +164,7 @@ def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, ke
 
 
 def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
-    """(k, r) orthonormal proportions of the inputs `at` whose response is known on the line that knows most."""
+    """(k, r) orthonormal combinations of the inputs `at` whose response is known, at the line where most are known."""
     if measured.gram is None:
         return np.eye(len(at))
     _, inside = measured.inverse_gram()
@@ -175,7 +175,7 @@ def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
 
 
 def _channels(measured: FrequencyResponse, model: ResponseModel) -> tuple[list[int], list[int]]:
-    """Rows of the model's sensors in the response, and which of the model's actuators it has."""
+    """Rows of the model's sensors in the response, and indices of the model's actuators that it contains."""
     if measured.output_unit != model.sensors.unit:
         raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
                          value=measured.output_unit)
@@ -191,7 +191,7 @@ def _channels(measured: FrequencyResponse, model: ResponseModel) -> tuple[list[i
 
 def _covariance(measured: FrequencyResponse, rows: list[int], columns: list[int], left: np.ndarray,
                 A: np.ndarray) -> np.ndarray:
-    """(n, k k, k k) covariance of vec(left N A), the columns of the error stacked."""
+    """(n, k k, k k) covariance of vec(left N A), with the columns of the error stacked."""
     if measured.entry_variance is None:
         assert measured.gram is not None and measured.noise is not None
         inverse = measured.inverse_gram()[0][:, columns][:, :, columns]
@@ -212,7 +212,7 @@ def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Seq
     rng = np.random.default_rng(seed)
     Z = (rng.standard_normal((DRAWS, k * k)) + 1j * rng.standard_normal((DRAWS, k * k))) / np.sqrt(2)
     if np.isfinite(dof):
-        # The covariance was estimated: the ratio follows F in place of chi-square.
+        # The covariance was estimated: the ratio has an F instead of a chi-square distribution.
         Z /= np.sqrt(rng.gamma(dof, 1 / dof, (DRAWS, 1)))
     values, vectors = np.linalg.eigh((covariance + np.conj(np.swapaxes(covariance, 1, 2))) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]

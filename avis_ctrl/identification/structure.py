@@ -1,9 +1,10 @@
-"""What the equations themselves leave undetermined, whatever the data: null space, scalings, and groups of parameters.
+"""Parameters that no data can determine: null space of the equations, scalings, and groups of parameters.
 
-A direction of the parameters that changes no response of the model cannot be identified from any record of these
-inputs and outputs. There are two sorts. Some parameters enter the matrices only through sums (two springs in one
-line), which are directions with whole numbers in the parameters' units. Others are scalings: a factor on all of
-mass, stiffness, damping and force constants changes no response, which is a direction with whole exponents.
+A direction of the parameters that changes no response of the model cannot be identified from any record of these inputs
+and outputs. There are two kinds. Some parameters enter the matrices only through sums (two springs in one line), which
+gives directions with integer entries in the parameters' units. The other kind are scalings: multiplying mass,
+stiffness, damping and force constants by a common factor changes no response, which gives a direction with integer
+exponents.
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ import scipy.linalg as la
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.sparse_space import components, reduced_rows, sparse_rows, whole_numbers
 
-# The derivative is exact to some 1e-12; a singular value below this, relative to the largest, is a zero.
+# The derivative is exact to about 1e-12; a singular value below this, relative to the largest, counts as zero.
 _ZERO = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Parameters that a factor f multiplies, f^exponent each, without a change of any response.
+    """Parameters that can be multiplied by f^exponent each, for any factor f, without a change of any response.
 
-    exponents : (n_p,) whole numbers, 0 for those that it leaves alone. pin : one of them, which sets the scale.
+    exponents : (n_p,) integers, 0 for parameters that it does not change. pin : a parameter whose value fixes the
+        scale.
     """
 
     exponents: np.ndarray
@@ -36,8 +38,8 @@ class Scaling:
 class Group:
     """Parameters that are determined only together.
 
-    members : indices. unseen : (d, n_p) directions in the parameters' units that change nothing.
-    seen : (members - d, n_p) weights of combinations that are left, in the parameters' units.
+    members : indices. unseen : (d, n_p) directions in the parameters' units that change no response.
+    seen : (members - d, n_p) weights of the combinations that can be determined, in the parameters' units.
     """
 
     members: tuple[int, ...]
@@ -47,7 +49,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A null space in parts: scalings with their pins, groups given the pins, and singles determined given the pins."""
+    """Parts of a null space: scalings with their pins, groups given the pins, and singles determined given the pins."""
 
     scalings: tuple[Scaling, ...]
     groups: tuple[Group, ...]
@@ -55,15 +57,15 @@ class Structure:
 
 
 def size_of(values: np.ndarray) -> np.ndarray:
-    """What one relative unit of a parameter is: its size, or 0.1 for one that is zero (as in the fit)."""
+    """One relative unit of each parameter: its size, or 0.1 if it is zero (as in the fit)."""
     return np.where(values == 0, 0.1, np.abs(values))
 
 
 def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarray:
     """(n_p, d) orthonormal, relative: directions that change no response of the model at any frequency.
 
-    From the derivative of the response, which has the poles twice: with six coordinates, 40 lines are more than its
-    numerator has coefficients. floor : whether the response to a measured floor counts too.
+    Computed from the derivative of the response, which has double poles: with six coordinates, 40 lines are more than
+    its numerator has coefficients. floor : whether to include the response to a measured floor.
     """
     modes = model.rig.equations_of_motion().natural_frequencies().frequencies_Hz
     lines = 2 * np.pi * np.geomspace(0.2 * max(np.min(np.abs(modes)), 1e-3), 8 * np.max(np.abs(modes)), 40)
@@ -85,9 +87,9 @@ def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarr
 
 def structure_of(null: np.ndarray, values: np.ndarray, units: Sequence[str], names: Sequence[str],
                  tolerance: float = 1e-6) -> Structure:
-    """The parts of a null space (n_p, d), given in relative units.
+    """Parts of a null space (n_p, d), given in relative units.
 
-    tolerance : what is a zero in it, relative to the largest entry of a vector.
+    tolerance : threshold of a zero entry, relative to the largest entry of a vector.
     """
     scale = size_of(values)
     scalings = _scalings(null, values, units, names, tolerance)
@@ -112,8 +114,8 @@ def _whole(rows: np.ndarray) -> np.ndarray:
 
 def _scalings(null: np.ndarray, values: np.ndarray, units: Sequence[str], names: Sequence[str],
               tolerance: float) -> tuple[Scaling, ...]:
-    """Exponents by kind of parameter (its unit) that lie in the null space; two kinds or more."""
-    # Sensors first: of scalings with as many kinds, the one without sensors is preferred.
+    """Scalings in the null space, with one exponent per kind of parameter (its unit); two kinds or more."""
+    # Sensors first: of scalings with equally many kinds, the one without sensors is preferred.
     kinds = sorted({(not name.startswith("sensor."), unit) for name, unit in zip(names, units, strict=True)})
     member = np.array([[float((not name.startswith("sensor."), unit) == kind and value != 0) for kind in kinds]
                        for name, unit, value in zip(names, units, values, strict=True)])
@@ -129,13 +131,13 @@ def _scalings(null: np.ndarray, values: np.ndarray, units: Sequence[str], names:
 
 
 def _signed(row: np.ndarray) -> np.ndarray:
-    """More kinds multiplied than divided."""
+    """The row with the sign for which more kinds are multiplied than divided."""
     return row if np.sum(np.sign(row)) > 0 or (np.sum(np.sign(row)) == 0 and row[-1] > 0) else -row
 
 
 def _pinned(null: np.ndarray, scalings: tuple[Scaling, ...], names: Sequence[str], tolerance: float
             ) -> tuple[Scaling, ...]:
-    """For each scaling the parameter whose knowledge leaves the fewest entries in the rest of the null space."""
+    """Pin of each scaling: the parameter whose knowledge leaves the fewest entries in the remaining null space."""
     pins: list[int] = []
     found = []
     for k, scaling in enumerate(scalings):
@@ -156,7 +158,7 @@ def _pinned(null: np.ndarray, scalings: tuple[Scaling, ...], names: Sequence[str
 
 
 def _without(null: np.ndarray, pins: Sequence[int]) -> np.ndarray:
-    """The part of the null space that leaves the pins alone."""
+    """The part of the null space that does not change the pins."""
     if not pins or not null.shape[1]:
         return null
     return null @ la.null_space(null[list(pins)], rcond=1e-9)

@@ -1,8 +1,8 @@
-"""A rig's parameters together with every value of its file that has a tolerance, by the likelihood of `likelihood`.
+"""Fit of a rig's parameters together with all file values that have a tolerance, by the likelihood of `likelihood`.
 
-What the file states is never exact: with places, directions, gains and corners taken for exact, their errors end up in
-mass, stiffness and damping, and in the residual. Here each is free within its tolerance; noise, path errors that nobody
-has named, and distortion weigh the residual. The parameters have no prior unless one is stated.
+The values of a rig file are never exact: if positions, directions, gains and corners are taken as exact, their errors
+end up in mass, stiffness and damping, and in the residual. Here each is free within its tolerance; noise, unspecified
+path errors, and distortion weight the residual. The parameters have no prior unless one is stated.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from avis_ctrl.rigs.instruments import Tolerances
 
 
 class ToleranceFit(NamedTuple):
-    """fitted : parameters and tolerances. flat : (n,) which have a prior that stands for none, about where their fit
-    began."""
+    """fitted : parameters and tolerances. flat : (n,) which parameters have no stated prior but a wide one about their
+    start."""
 
     fitted: Fitted
     flat: np.ndarray
@@ -40,14 +40,14 @@ class ToleranceFit(NamedTuple):
 
 def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping[str, float], tolerances: Tolerances,
           stated: Mapping[str, Prior], settings: FitSettings = SETTINGS) -> ToleranceFit:
-    """From parameters that were fitted with the rest as the file states it, on some lines of each block.
+    """Start from parameters that were fitted with the file's values as stated, on some lines of each block.
 
     Parameters
     ----------
     model : with these parameters free. levels : [V] by record.
     stated : (mean, standard deviation) of parameters that have a prior.
     """
-    assert isinstance(model.rig, AvisTable)  # each channel at a place of its own
+    assert isinstance(model.rig, AvisTable)  # each channel at its own position
     rig = model.rig.with_channels_apart()
     rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
     priors = identified(model, stated, settings).followed_by(rest)
@@ -60,7 +60,7 @@ def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping
 
 def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float],
         settings: FitSettings = SETTINGS) -> ToleranceFit:
-    """On from there, with blocks whose second-order terms are those of the model found."""
+    """Continue from there, with blocks from which the second-order terms of the fitted model were subtracted."""
     one, data = begun.fitted, Data.of(blocks, levels, settings.lines)
     priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
     rounds = replace(settings, rounds=settings.final_rounds)
@@ -70,7 +70,8 @@ def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[st
 
 def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit[ResponseModel],
                       settings: FitSettings = SETTINGS) -> LikelihoodFit[ResponseModel]:
-    """In the form of a fit by noise alone, tolerances among the parameters; residuals on all lines of the blocks."""
+    """Convert to the form of a fit by noise alone, with tolerances among the parameters; residuals on all lines of the
+    blocks."""
     one, model = found.fitted, found.fitted.model
     H, g, cost = one.weights.normal_equations(one.white.J, one.white.e)
     known = np.where(found.flat, 0.0, 1.0)
@@ -80,7 +81,7 @@ def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], firs
     step = np.linalg.solve(H + np.eye(len(g)), g - one.z)
     less = int(known.sum()) - sum(transient_unknowns(block, model) for block in blocks) - information.rank
     fitted, dof = len(one.white.e) + less, sum(block.numbers for block in blocks) + less
-    # The lines that were fitted stand for all of the residuals.
+    # The fitted lines represent all of the residuals.
     chi2 = (cost + float(known @ one.z ** 2)) * dof / fitted
     residuals = tuple(block_residual(model, block, whitener(block), derivative=False)[2] for block in blocks)
     return LikelihoodFit(model, information, chi2, dof, first.iterations + one.iterations,

@@ -1,8 +1,8 @@
-"""An identified rig against data that no fit has seen.
+"""Validation of an identified rig on data that no fit has used.
 
-The noise that errors are held against comes from the fitted records, never from the held-out ones: the covariance of
-the fit's own residuals, pooled over records of a kind (records share their noise when the floor was measured in all of
-them, or in none). The local polynomial model's covariance gives a second figure.
+The noise that errors are compared with comes from the fitted records, never from the held-out ones: it is the
+covariance of the fit's own residuals, pooled over records of a kind (records share their noise when the floor was
+measured in all of them, or in none). The local polynomial model's covariance gives a second figure.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from avis_ctrl.identification.whiteness import Whiteness, whiteness
 from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
-# Level of the intervals.
+# Probability of the intervals.
 LEVEL = 0.95
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Figures of one record (or piece of a long one, or response) that no fit has seen.
+    """Figures of one record (or piece of a long one, or response) that no fit has used.
 
     Attributes
     ----------
-    name : of the record. lines : in the band. noise : which noise the error is held against, in words.
-    chi2_per_dof, chi2_interval : with where it lies at 95 % if only noise and the uncertainty of the parameters are
-        left. chi2_start : of the start model. chi2_local : held against the noise of the local polynomial model of the
-        fitted records, NaN where there is none.
-    output_chi2_per_dof, output_chi2_interval : (n_y,) and (n_y, 2), each output by itself.
-    nrms, nrms_start : (n_y,) r.m.s. error in the band over r.m.s. output in the band, transient of the ends taken out.
-    nrms_floor : (n_y,) what noise alone would leave.
-    nrms_all, nrms_all_start, nrms_all_floor : the same of all outputs together. nrms_all_interval : where nrms_all lies
-        at 95 % if noise alone is left; wide where few lines at a resonance hold most of the noise.
-    nrms_time, nrms_time_start : (n_y,) of the prediction from rest in time, its error and the output filtered to the
-        band; None where the record does not start at rest. nrms_time_whole : (n_y,) without the filter.
+    name : of the record. lines : in the band. noise : which noise the error is compared with, in words.
+    chi2_per_dof, chi2_interval : with its 95 % interval if only noise and the uncertainty of the parameters remain.
+        chi2_start : of the start model. chi2_local : with the noise of the local polynomial model of the fitted
+        records, NaN without one.
+    output_chi2_per_dof, output_chi2_interval : (n_y,) and (n_y, 2), each output separately.
+    nrms, nrms_start : (n_y,) r.m.s. error in the band over r.m.s. output in the band, transient of the ends removed.
+    nrms_floor : (n_y,) expected from noise alone.
+    nrms_all, nrms_all_start, nrms_all_floor : the same for all outputs together. nrms_all_interval : 95 % interval of
+        nrms_all for noise alone; wide if few lines at a resonance contain most of the noise.
+    nrms_time, nrms_time_start : (n_y,) of the time-domain prediction from rest, with error and output filtered to the
+        band; None if the record does not start at rest. nrms_time_whole : (n_y,) without the filter.
     time_note : why there is no prediction in time, or what it covers.
-    whiteness : correlations of the residual; None where there are too few lines.
-    nrms_all_exact : nrms_all of the fit that takes the rig file for exact, None where no tolerance was fitted.
+    whiteness : correlations of the residual; None if there are too few lines.
+    nrms_all_exact : nrms_all of the fit that takes the rig file as exact, None if no tolerance was fitted.
     """
 
     name: str
@@ -79,7 +79,7 @@ class HeldOut:
 
     @property
     def consistent(self) -> bool:
-        """Whether chi-square is not above its interval. Below it the record has less noise than the fitted ones."""
+        """Whether chi-square is not above its interval. Below it, the record has less noise than the fitted ones."""
         return self.chi2_per_dof <= self.chi2_interval[1]
 
 
@@ -89,9 +89,9 @@ class Validation:
 
     Attributes
     ----------
-    outputs, band_Hz : of all figures. held_out : one a record, or piece of a long one.
-    overlay : measured and model responses for figures, of all records; None where they allow none.
-    modes : the model's beside the start's and those measured in the held-out data without the rig's equations.
+    outputs, band_Hz : of all figures. held_out : one per record, or piece of a long one.
+    overlay : measured and model responses for figures, of all records; None if they do not allow it.
+    modes : the model's, with the start's and those measured in the held-out data without the rig's equations.
     verdict : one sentence with the numbers. sentences : the verdict, whiteness, time, modes and responses in words.
     notes : what was used, and what could not be computed.
     """
@@ -107,7 +107,7 @@ class Validation:
 
     @property
     def passed(self) -> bool:
-        """Chi-square not above its interval and residuals white in every held-out record."""
+        """Chi-square not above its interval and residuals white, in every held-out record."""
         return all(one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out)
 
     def as_dict(self) -> dict[str, Any]:
@@ -125,12 +125,12 @@ def _without_figures(one: HeldOut) -> dict[str, Any]:
 
 def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse
              ) -> Validation:
-    """Prediction errors, their whiteness, responses and modes of the fitted model on data that no fit has seen.
+    """Prediction errors, their whiteness, responses and modes of the fitted model on data that no fit has used.
 
     Raises
     ------
-    InputError : held-out data of another kind than the fitted ones, without lines in the band, or without anything
-        that moves.
+    InputError : held-out data of another kind than the fitted ones, without lines in the band, without excitation, or
+        with outputs that do not move.
     """
     notes: list[str] = []
     if isinstance(fitted, FrequencyResponse) != isinstance(held_out, FrequencyResponse):
@@ -148,7 +148,7 @@ def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
 
 def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
             ) -> list[tuple[SpectralBlock, RecordSource | None]]:
-    """Spectra of what is held out, in pieces where it is long, with the record where it begins at its start."""
+    """Spectra of the held-out data, in pieces if long; each with its record if it begins at the record's start."""
     model = found.fit.model
     if isinstance(held_out, FrequencyResponse):
         return [(response_block(held_out.between(*found.band_Hz), model, "held-out lines"), None)]
@@ -161,7 +161,7 @@ def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
                 blocks.append((block, piece if whole else None))
     if not blocks:
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="held out")
-    # Against the model by frequency, which is linear, stands what is linear in the records.
+    # The frequency-domain model is linear: it is compared with the linear part of the records.
     raw = [block for block, _ in blocks]
     linear = without(raw, [one[0] for one in terms(held_out, raw, model)])
     return [(block, record) for block, (_, record) in zip(linear, blocks, strict=True)]
@@ -169,7 +169,7 @@ def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
 
 def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock
                 ) -> tuple[SpectralBlock, float, str]:
-    """The block with the noise of the fitted data, real numbers that this was estimated from, and words on it."""
+    """The block with the noise of the fitted data, the real numbers used to estimate it, and a description."""
     if isinstance(fitted, FrequencyResponse):
         near = response_block(fitted.between(*found.band_Hz), found.fit.model)
         assert near.noise is not None
@@ -183,7 +183,7 @@ def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block:
                          field=f"held-out record {block.name}", value=block.kind)
     noisy = noise_from_residuals(residuals, [block], model=found.fit.model)[0]
     pool = sum(one.block.numbers for one in residuals if one.block.kind == block.kind)
-    # The fit bent the model to its own residuals: its free numbers are missing in them.
+    # The fit reduced its own residuals: they lack its degrees of freedom.
     share = found.fit.dof / sum(one.block.numbers for one in residuals)
     assert noisy.noise is not None
     return (noisy.with_noise(noisy.noise / share, noisy.dof), pool * share * _inverse_dof(noisy.dof, len(noisy.Y[0])),
@@ -192,7 +192,7 @@ def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block:
 
 
 def _inverse_dof(dof: float, n_y: int) -> float:
-    """How much less an inverse is known than the estimated covariance itself, as a share of the real numbers.
+    """Relative variance of an estimated covariance over that of its inverse, a factor on the number of real numbers.
 
     The trace of the inverse of a complex Wishart matrix of n_y outputs and dof degrees of freedom has the relative
     variance dof / (n_y ((dof - n_y)^2 - 1)) (moments of Maiwald and Kraus, IEE Proc. Radar 147, 2000).
@@ -225,8 +225,8 @@ def _exact(found: CampaignFit, block: SpectralBlock) -> float | None:
 
 
 def floor_interval(error: PredictionError, floor: float, times: float) -> tuple[float, float]:
-    """Interval of the root of sum |e|^2 / sum |Y|^2 of noise, estimated from `times` as many lines; it has few degrees
-    of freedom where few lines hold most of it (Welch and Satterthwaite)."""
+    """Interval of the root of sum |e|^2 / sum |Y|^2 for noise alone, which was estimated from `times` as many lines;
+    few degrees of freedom if few lines contain most of it (Welch and Satterthwaite)."""
     assert error.block.noise is not None
     C = np.broadcast_to(error.block.noise, (*error.block.noise.shape[:1], error.error.shape[2],
                                             *error.block.noise.shape[2:]))
@@ -258,7 +258,7 @@ def _local_chi2(found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: S
 
 def _in_time(found: CampaignFit, record: RecordSource | None
              ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None, str]:
-    """n.r.m.s. of the prediction in time: in the band, of the start model, and without a filter."""
+    """n.r.m.s. error of the time-domain prediction: in the band, of the start model, and without a filter."""
     if record is None:
         return None, None, None, "no time-domain prediction: the data do not start at rest, or are frequency responses"
     whole = record.load()
@@ -268,7 +268,7 @@ def _in_time(found: CampaignFit, record: RecordSource | None
 
 
 def _time_nrms(model: ResponseModel, record: Record, band_Hz: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """(n_y,) in the band, and of the whole signal without its mean."""
+    """(n_y,) n.r.m.s. error in the band, and that of the whole signal without its mean."""
     y = record.y[:, [record.header.y_names.index(name) for name in model.sensors.names]]
     e = y - predict(model, record)
     return (np.sqrt(_band_power(e, record.header.sample_rate_Hz, band_Hz)
@@ -276,14 +276,14 @@ def _time_nrms(model: ResponseModel, record: Record, band_Hz: tuple[float, float
 
 
 def _band_power(x: np.ndarray, rate: float, band_Hz: tuple[float, float]) -> np.ndarray:
-    """(n_y,) mean square of the part of x inside a band, by a filter without phase in time."""
+    """(n_y,) mean square of the part of x inside a band, by a zero-phase filter."""
     spectrum, f = np.fft.rfft(x - x.mean(0), axis=0), np.fft.rfftfreq(len(x), 1 / rate)
     spectrum[(f < band_Hz[0]) | (f > band_Hz[1])] = 0
     return np.mean(np.fft.irfft(spectrum, len(x), axis=0) ** 2, axis=0)
 
 
 def _modes(found: CampaignFit, blocks: list[SpectralBlock]) -> tuple[tuple[ModeRow, ...], str]:
-    """The table, and a sentence on the measured ones."""
+    """Table of modes, and a sentence on the measured ones."""
     model, covariance = found.fit.model, found.fit.information.covariance
     measured: MeasuredModes | None = None
     try:
@@ -301,7 +301,7 @@ def _modes(found: CampaignFit, blocks: list[SpectralBlock]) -> tuple[tuple[ModeR
 
 def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse,
              notes: list[str]) -> ResponseOverlay | None:
-    """Responses of everything that was measured: a single record seldom tells all inputs apart."""
+    """Responses from all measured data: a single record seldom separates all inputs."""
     if isinstance(fitted, Campaign) and isinstance(held_out, Campaign):
         data: Campaign | FrequencyResponse = replace(fitted, records=(*fitted.records, *held_out.records))
     else:
@@ -314,7 +314,7 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
 
 
 def verdict_of(figures: list[HeldOut]) -> str:
-    """Of the record that fits worst; where some are beyond what noise leaves, of the worst of these."""
+    """Verdict on the record that fits worst; if some records exceed what noise explains, on the worst of these."""
     def ratio(one: HeldOut) -> float:
         return one.chi2_per_dof / one.chi2_interval[1]
     off = [one for one in figures if ratio(one) > 1]

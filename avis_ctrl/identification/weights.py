@@ -1,8 +1,8 @@
-"""What a residual is held against: noise, distortion, and relative errors of the paths that nobody has named.
+"""Weights of residuals: noise, distortion, and unspecified relative errors of the paths from inputs to sensors.
 
-On a line the residual of a record has the covariance N + diag(s) of noise and distortion; s is of a level and band.
-Beside it every path from an input to a sensor may have a relative error, constant over a band and the same in all
-records, for what the linear model misses is the same at every level:
+On a line the residual of a record has the covariance N + diag(s) of noise and distortion; s depends on level and band.
+In addition, every path from an input to a sensor may have a relative error, constant over a band and the same in all
+records, because the errors of the linear model are the same at every level:
 
     e_c(k) = sum_j eps_cjb G_cj(k) u_j(k) + noise,     eps circular normal, E|eps|^2 = v_cb
 
@@ -35,13 +35,13 @@ class Variances:
     distortion: Mapping[Group, np.ndarray]
 
     def of_path(self, band: int) -> np.ndarray:
-        """v (n_y,) of a band, or of the nearest that was fitted."""
+        """v (n_y,) of a band, or of the nearest fitted band."""
         if band in self.path:
             return self.path[band]
         return self.path[min(self.path, key=lambda one: abs(one - band))]
 
     def of_distortion(self, level: float, band: int) -> np.ndarray:
-        """s (n_y,) of a level and band, or of the nearest that was fitted."""
+        """s (n_y,) of a level and band, or of the nearest fitted ones."""
         if (level, band) in self.distortion:
             return self.distortion[level, band]
         return self.distortion[min(self.distortion, key=lambda one: (
@@ -49,13 +49,13 @@ class Variances:
 
 
 def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
-    """(n,) number of the band of each line, counted from 1 rad/s."""
+    """(n,) band number of each line, counted from 1 rad/s."""
     return np.floor(per_octave * np.log2(omega) + 1e-9).astype(int)
 
 
 @dataclass(frozen=True, eq=False)
 class PathError:
-    """Lines of one band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T."""
+    """Path errors of one band: rows (m,) of the stacked real residual, and Q (m, r), lambda (r,) of B B^T."""
 
     rows: np.ndarray
     Q: np.ndarray
@@ -66,9 +66,9 @@ class PathError:
 class Weights:
     """Whitening of stacked residuals.
 
-    L : (n, n_y, n_y) a block. paths : of every band. rows : of the stacked real residual, by level and band.
-    log_determinants : of the covariance of the real numbers, by level and band; what the path errors of a band add is
-    divided among its levels by their rows.
+    L : (n, n_y, n_y) per block. paths : one per band. rows : of the stacked real residual, by level and band.
+    log_determinants : of the covariance of the real numbers, by level and band; the contribution of a band's path
+        errors is divided among its levels in proportion to their rows.
     """
 
     L: tuple[np.ndarray, ...]
@@ -81,7 +81,7 @@ class Weights:
         return float(sum(self.log_determinants.values()))
 
     def flatten(self, x: np.ndarray) -> np.ndarray:
-        """(k, N) whitened rows times the inverse root of I + B B^T."""
+        """(k, N) whitened rows multiplied by the inverse root of I + B B^T."""
         out = x.copy()
         for one in self.paths:
             part = x[:, one.rows]
@@ -101,7 +101,8 @@ class Weights:
 
 
 def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
-    """(n, n_y, n_in): what each input of a record contributes to each sensor, or what a model calls its parts."""
+    """(n, n_y, n_in): contribution of each input of a record to each sensor, or the parts that the model itself
+    defines."""
     if hasattr(model, "contributions"):
         return np.asarray(model.contributions(block))
     U = np.zeros((*block.U.shape[:2], block.U.shape[1]), complex)
@@ -111,7 +112,7 @@ def path_contributions(model: Any, block: SpectralBlock) -> np.ndarray:
 
 
 def with_distortion(block: SpectralBlock, level: float, variances: Variances, settings: FitSettings) -> SpectralBlock:
-    """The block with noise and distortion as its covariance."""
+    """The block with the sum of noise and distortion as its covariance."""
     assert block.noise is not None
     own, of_line = np.unique(bands(block.omega, settings.bands_per_octave), return_inverse=True)
     s = np.array([variances.of_distortion(level, int(band)) for band in own])[of_line]
@@ -120,7 +121,7 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
 
 def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Sequence[np.ndarray], variances: Variances,
           settings: FitSettings) -> Weights:
-    """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block by the present model."""
+    """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block, from the present model."""
     L, start = [], 0
     determinants: dict[Group, float] = {}
     members: dict[int, list[tuple[Group, np.ndarray, np.ndarray]]] = {}
@@ -168,7 +169,7 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
 
 def mean_noise(blocks: Sequence[SpectralBlock], levels: Sequence[float], settings: FitSettings
                ) -> dict[Group, np.ndarray]:
-    """(n_y,) mean variance of the noise by level and band."""
+    """(n_y,) mean noise variance by level and band."""
     found: dict[Group, list[np.ndarray]] = {}
     for block, level in zip(blocks, levels, strict=True):
         assert block.noise is not None
@@ -180,28 +181,28 @@ def mean_noise(blocks: Sequence[SpectralBlock], levels: Sequence[float], setting
 
 def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], levels: Sequence[float],
               paths: Sequence[np.ndarray], old: Variances, settings: FitSettings, hold_path: bool = False) -> Variances:
-    """The most likely variances of path errors and distortion for residuals left (n, n_y) of each block.
+    """Most likely variances of path errors and distortion, for residuals `left` (n, n_y) of each block.
 
-    hold_path : those of path errors stay as they are.
+    hold_path : keep the variances of the path errors.
 
-    Sensor by sensor and band by band, with the mean noise n_l of a level l, the covariance of the residual e is
-    W = D + v G G^H, D = n_l + s_l on the lines of level l, G (m, k) the contributions of the inputs. With
+    Sensor by sensor and band by band, with the mean noise n_l of a level l, the covariance of the residual e is W = D +
+    v G G^H, D = n_l + s_l on the lines of level l, G (m, k) the contributions of the inputs. With
 
         K = (G^H inv(D) G + I / v)^-1,   x = K G^H inv(D) e    (covariance and mean of the path errors given e)
 
-    the likelihood is climbed by minorisation-maximisation (H. Zhou, L. Hu, J. Zhou, K. Lange, J. Comput. Graph. Stat.
+    the likelihood is maximised by minorisation-maximisation (H. Zhou, L. Hu, J. Zhou, K. Lange, J. Comput. Graph. Stat.
     28 (2019) 350-361),
 
         v <- v sqrt((|x|^2 / v^2 + nu v0 / 2 v^2) / ((k - tr K / v) / v + nu / 2 v)),
 
-    and s_l likewise. Both have priors of the same kind (`log_prior`).
+    and s_l likewise. Both have priors of the same kind (`log_prior`), with nu degrees of freedom and scale v0.
     """
     noise = mean_noise(blocks, levels, settings)
     row = {band: k for k, band in enumerate(sorted({band for _, band in noise}))}
     column = {level: k for k, level in enumerate(sorted({level for level, _ in noise}))}
     n_y, k = paths[0].shape[1:]
     shape = len(row), len(column), n_y
-    # Sums over the lines of a band and level: G^H G, G^H e, |e|^2, how many; a level without lines in a band adds none.
+    # Sums over the lines of a band and level: G^H G, G^H e, |e|^2, and their number; zero for a level without lines.
     M, p = np.zeros((*shape, k, k), complex), np.zeros((*shape, k), complex)
     q, lines, n, s = np.zeros(shape), np.zeros((*shape[:2], 1)), np.ones(shape), np.ones(shape)
     for e, block, level, G in zip(left, blocks, levels, paths, strict=True):
@@ -232,8 +233,8 @@ def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], level
 
 
 def log_prior(variances: Variances, noise: Mapping[Group, np.ndarray], settings: FitSettings) -> float:
-    """Logarithm of the priors of the variances, but for a constant: flat in the logarithm, falling off exponentially
-    below the least values. noise : (n_y,) mean variance by level and band (`mean_noise`)."""
+    """Log prior of the variances up to a constant: flat in the logarithm, with an exponential decrease below the
+    minimum values. noise : (n_y,) mean variance by level and band (`mean_noise`)."""
     half = settings.error_weight / 2
     pairs = [(v, np.full(len(v), settings.least_error ** 2)) for v in variances.path.values()]
     pairs += [(variances.of_distortion(*group), settings.least_distortion * n) for group, n in noise.items()]

@@ -1,17 +1,17 @@
-"""Is what a model leaves no more than noise: correlations of the whitened residual, with limits on false alarms.
+"""Whiteness test of what a model leaves unexplained: correlations of the whitened residual, with false-alarm limits.
 
 The whitened residual w of a line has E|w|^2 = 1 and is independent from line to line and of the inputs, if model and
-noise are right. With n lines over a band of width B three things are looked at, each complex normal with variance 1/n
-under that hypothesis (so that n |r|^2 is exponential with mean 1):
+noise are correct. With n lines over a band of width B three correlations are tested, each complex normal with variance
+1/n under that hypothesis (so that n |r|^2 is exponential with mean 1):
 
     over frequency    r(l) = 1/n sum_k w_{k+l} conj(w_k)                          transients, leakage
-    over time         r(tau) = 1/n sum_k (|w_k|^2 - 1) e^{j w_k tau}              a spectrum that is not the noise's
-    with an input     r(tau) = 1/n sum_k w_k conj(u_k) e^{j w_k tau} / rms(u)     dynamics that the model lacks
+    over time         r(tau) = 1/n sum_k (|w_k|^2 - 1) e^{j w_k tau}              a spectrum other than the noise's
+    with an input     r(tau) = 1/n sum_k w_k conj(u_k) e^{j w_k tau} / rms(u)     unmodelled dynamics
 
-tau runs in steps of 1/B. The last one adds g P g^H to its variance, g its derivative by the parameters and P their
-covariance; the second one adds what the noise's own estimate scatters. Limits are Sidak's: with all tests of a
-validation together, white data exceed one of them in 1 % of the cases (Ljung, System Identification, 2nd ed., 1999,
-section 16.6, has the same tests one by one).
+tau increases in steps of 1/B. The variance of the last correlation increases by g P g^H, g its derivative by the
+parameters and P their covariance; that of the second by the scatter of the noise's own estimate. Limits are Sidak's:
+over all tests of a validation together, white data exceed any limit in 1 % of the cases (Ljung, System Identification,
+2nd ed., 1999, section 16.6, has the same tests individually).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ import numpy as np
 
 from avis_ctrl.identification.prediction_error import PredictionError
 
-# Chance of one false alarm or more, and how far the lags go: lines; steps of 1/bandwidth.
+# Probability of at least one false alarm, and maximum lags: lines; steps of 1/bandwidth.
 FAMILY = 0.01
 LINE_LAGS, TIME_LAGS, NEGATIVE_LAGS = 20, 100, 10
-# Part of the power of the strongest input below which one counts as silent.
+# Fraction of the power of the strongest input below which an input counts as silent.
 SILENT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Of one kind, for figures.
+    """Correlations of one kind, for figures.
 
     what : in words. rows : labels, "Sz1" or "Sz1 with Ax2". lags : (n_l,) in lag_unit ("lines" or "s").
     value, limit : (rows, n_l) modulus of the normalised correlation, and the limit it should stay below.
@@ -47,7 +47,7 @@ class Correlation:
 
     @property
     def beyond(self) -> int:
-        """Values above their limit."""
+        """Number of values above their limit."""
         return int(np.count_nonzero(self.value > self.limit))
 
     @property
@@ -64,7 +64,7 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False)
 class Whiteness:
-    """correlations : over frequency, over time and, where an input is driven, with the inputs. sentences : one each."""
+    """correlations : over frequency, over time and, if an input is driven, with the inputs. sentences : one each."""
 
     correlations: tuple[Correlation, ...]
 
@@ -79,13 +79,13 @@ class Whiteness:
 
 def whiteness(error: PredictionError, outputs: Sequence[str], inputs: Sequence[str], covariance: np.ndarray,
               noise_lines: float = np.inf, families: int = 1) -> Whiteness | None:
-    """Correlations of the residual of one block; None where it has too few lines for any.
+    """Correlations of the residual of one block; None if it has too few lines.
 
     Parameters
     ----------
     error : with its derivative. covariance : (n_p, n_p) of the parameters.
-    noise_lines : lines that the noise covariance was estimated from, in all.
-    families : blocks that are tested, which share the chance of a false alarm.
+    noise_lines : total number of lines from which the noise covariance was estimated.
+    families : number of blocks that are tested, among which the false-alarm probability is divided.
     """
     omega, n = error.block.omega, len(error.block.omega)
     lines, steps = min(LINE_LAGS, n // 4), min(TIME_LAGS, n // 4)
@@ -117,7 +117,7 @@ def _over_time(error: PredictionError, outputs: Sequence[str], tau: np.ndarray, 
                ) -> Correlation:
     count = error.white.shape[0] * error.white.shape[2]
     excess = np.mean(np.abs(error.white) ** 2, axis=2)
-    # Its mean is the business of chi-square.
+    # Its mean is tested by chi-square.
     excess = excess - excess.mean(axis=0)
     value = np.abs(excess.T @ np.exp(1j * np.outer(error.block.omega, tau))) / len(excess)
     limit = np.sqrt(level / count * (1 + count / noise_lines))

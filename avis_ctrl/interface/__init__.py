@@ -1,1 +1,1 @@
-"""The Python interface: what `import avis_ctrl as ac` offers beyond the parts below it."""
+"""The Python interface of the commands, offered by `import avis_ctrl as ac`."""

@@ -1,4 +1,4 @@
-"""Results of the interface: a summary, plots, and the files of the command of the same name."""
+"""Results of the public functions: a summary, plots, and the files of the corresponding command."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from avis_ctrl.summary import html_table, wrapped
 
 
 class DesignStudy:
-    """What `avis design` computes: controllers, bounds, simulation, verdict.
+    """Result of `design`, as `avis design` computes it: controllers, bounds, simulation, verdict.
 
-    result : the whole `DesignResult`. controller : the delivered controller u = K y of the axes kept.
-    sampled_controller : the controller for the processor, sensor volts to drive volts, all axes (None if none was
-        simulated). requirements : lines of the verdict table.
+    result : the complete `DesignResult`. controller : the delivered controller u = K y of the axes in `keep`.
+        sampled_controller : the controller for the processor, sensor volts to drive volts, all axes (None without a
+        simulation). requirements : rows of the verdict table.
     """
 
     def __init__(self, result: DesignResult) -> None:
@@ -47,7 +47,7 @@ class DesignStudy:
     @property
     def controller(self) -> StateSpace:
         K = self.result.controller("mu").K
-        assert K is not None  # only the table without control has none
+        assert K is not None  # only the passive table has no controller
         return K
 
     @property
@@ -84,15 +84,15 @@ class DesignStudy:
         return rows
 
     def plot_transmissibility(self, ax: Any = None, controllers: Any = None) -> Any:
-        """Floor to payload of every controller; see `plot.transmissibility`."""
+        """Transmissibility from floor to payload of every controller; see `plot.transmissibility`."""
         return plot.transmissibility(self.result, ax, controllers=controllers)
 
     def plot_mu(self, ax: Any = None, controller: str = "mu") -> Any:
-        """Bounds of mu of one controller's loop; see `plot.mu`."""
+        """Bounds of mu of the loop with one controller; see `plot.mu`."""
         return plot.mu(self.result.controller(controller).mu, ax)
 
     def plot_dk_history(self, ax: Any = None) -> Any:
-        """The course of the mu synthesis; see `plot.dk_history`."""
+        """Progress of the D-K iteration; see `plot.dk_history`."""
         return plot.dk_history(self.result.dk_history, ax)
 
     def plot_controller(self, ax: Any = None) -> Any:
@@ -100,14 +100,14 @@ class DesignStudy:
         return plot.sigma(self.controller, ax=ax)
 
     def plot_vibration(self, ax: Any = None) -> Any:
-        """Third-octave velocity of floor and payload (worst axis) against the vibration criteria."""
+        """Third-octave velocity of floor and payload (worst axis) with the vibration criteria."""
         site = self.result.controller("mu").site
         f = site.third_octave_Hz
         return plot.vc_curves({"floor": (f, site.floor_third_octaves),
                                "payload, mu": (f, np.max(site.payload_third_octaves, axis=1))}, ax)
 
     def save(self, folder: str | Path) -> list[Path]:
-        """The files of `avis design`, all or none: reports, controllers, plant.json, result.json.
+        """Write the files of `avis design`, all or none: reports, controllers, plant.json, result.json.
 
         Raises InputError for a folder that cannot be written, ComputationError for a full disk.
         """
@@ -123,9 +123,9 @@ class DesignStudy:
 
 
 class IdentificationStudy:
-    """What `avis identify` computes: the identified table, its uncertainty, the verdict on held-out records.
+    """Result of `identify`, as `avis identify` computes it: identified table, uncertainty, verdict on held-out records.
 
-    found : the whole `Identification`. rig : the table with the identified values.
+    found : the complete `Identification`. rig : the table with the identified values.
     """
 
     def __init__(self, found: Identification) -> None:
@@ -137,7 +137,7 @@ class IdentificationStudy:
 
     @property
     def values(self) -> dict[str, tuple[float, float, str]]:
-        """(value, standard deviation, unit) by parameter; infinite where it is determined only in combination."""
+        """(value, standard deviation, unit) by parameter; std is inf for a parameter determined only in combination."""
         i = self.found.information
         return {name: (float(v), float(s), u) for name, v, s, u in zip(i.names, i.values, i.standard_deviation, i.units,
                                                                        strict=True)}
@@ -147,7 +147,7 @@ class IdentificationStudy:
                  f"{value:.6g}, only in combination", unit) for name, (value, sigma, unit) in self.values.items()]
 
     def summary(self) -> str:
-        """The identified values, the verdict on held-out records, what the data do not determine."""
+        """The identified values, the verdict on held-out records, and what the data do not determine."""
         verdict, *more = self.found.validation.sentences
         rest = (*self.found.campaign_fit.notes, *more, *self.found.identifiability.sentences)
         return "\n".join([wrapped(f"{verdict[:1].upper()}{verdict[1:]}."),
@@ -155,7 +155,7 @@ class IdentificationStudy:
                           *map(wrapped, rest)])
 
     def plot_values(self, ax: Any = None) -> Any:
-        """Identified over starting value of each parameter, with its standard deviation."""
+        """Relative change of each parameter from its starting value, with its standard deviation."""
         ax = axes_of(ax)
         start = self.found.start.parameters()
         rows = [(name, v, s, start[name].value) for name, (v, s, _) in self.values.items()
@@ -169,9 +169,9 @@ class IdentificationStudy:
         return finish(ax, "identified against starting value [%]", "", log=False)
 
     def files(self, sections: Mapping[str, Any] | None = None) -> dict[str, str]:
-        """Texts of rig.toml, uncertainty.json and design.toml by name, from which a design starts.
+        """Contents of rig.toml, uncertainty.json and design.toml by name: the input of a design.
 
-        sections : of the design, in place of those that are proposed. Raises as `design`.
+        sections : sections of the design that replace the proposed ones. Raises as `design`.
         """
         require_readable(self.found)
         return {RIG_FILE: identified_toml(self.found), **design_start(self.found, self._template(sections))[0]}
@@ -186,7 +186,7 @@ class IdentificationStudy:
         return design_from_table({**proposed, "keep": keep, **given, "rig": RIG_FILE})
 
     def save(self, folder: str | Path, **sections: Any) -> list[Path]:
-        """The files of `avis identify`, all or none; sections : of design.toml, as for `files`.
+        """Write the files of `avis identify`, all or none; sections : of design.toml, as for `files`.
 
         Raises InputError for a folder that cannot be written or sections that do not fit.
         """
@@ -197,7 +197,7 @@ class IdentificationStudy:
             require_readable(self.found)
             more, made = design_start(self.found, template)
         except AvisError:
-            # As in the command: the identification is valid without the files for design.
+            # As in the command: the identification is valid without the design files.
             if sections:
                 raise
         return write_identification(self.found, out, *rendered(identification.document(self.found, made)), more)
@@ -212,9 +212,9 @@ class IdentificationStudy:
 
 
 class GapStudy:
-    """What `avis gap` computes: the verdict, the named effects, both models.
+    """Result of `gap`, as `avis gap` computes it: the verdict, the named effects, both models.
 
-    found : the whole `GapFinding`. gap : its `Gap`. effects : the named effects.
+    found : the complete `GapFinding`. gap : its `Gap`. effects : the named effects.
     """
 
     def __init__(self, found: GapFinding) -> None:
@@ -230,7 +230,7 @@ class GapStudy:
 
     @property
     def verdict(self) -> str:
-        """none, explained, partly explained or unexplained."""
+        """One of none, explained, partly explained, unexplained."""
         return self.gap.verdict
 
     def summary(self) -> str:
@@ -243,7 +243,7 @@ class GapStudy:
         return [*rows, ("noise alone", f"{100 * self.gap.noise_nrmse:.3g} %")]
 
     def plot_stages(self, ax: Any = None) -> Any:
-        """Error of the predicted sensor signals on held-out records [%], by stage, with the noise."""
+        """Prediction error of the sensor signals on held-out records [%] by stage, with the noise level."""
         ax = axes_of(ax)
         names = [stage.name for stage in self.gap.stages]
         places = np.arange(len(names))[::-1]
@@ -253,7 +253,7 @@ class GapStudy:
         return finish(ax, "error of held-out signals, r.m.s. [%]", "", log=False)
 
     def save(self, folder: str | Path) -> list[Path]:
-        """The files of `avis gap`, all or none. Raises InputError for a folder that cannot be written."""
+        """Write the files of `avis gap`, all or none. Raises InputError for a folder that cannot be written."""
         out = open_folder(folder, GAP_FILES)
         return write_gap(out, self.gap, *rendered(gap_content.document(self.found)), self.found.to_json())
 

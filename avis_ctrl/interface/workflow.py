@@ -1,6 +1,6 @@
-"""From a campaign to a controller: each function is a command of `avis`, with its result in memory.
+"""From a campaign to a controller. Each function corresponds to a command of `avis` and returns its result in memory.
 
-Files are written only by a result's `save`, and they are those of the command.
+Only the `save` method of a result writes files, the same ones as the command.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ Progress = Callable[[str], Any]
 
 
 def rig(source: str | Path = "avis", loaded: bool = False) -> Rig:
-    """A table: a built-in one ("avis", "halcyonics", "halcyonics_loaded") or that of a rig file (docs/rig_file.md).
+    """A table: a built-in one ("avis", "halcyonics", "halcyonics_loaded") or one from a rig file (docs/rig_file.md).
 
-    loaded : with the load of the file's [load] section. Raises InputError: one line that names file, field and value.
+    loaded : add the load of the file's [load] section. Raises InputError: one line that names file, field and value.
 
     Examples
     --------
@@ -45,11 +45,11 @@ def rig(source: str | Path = "avis", loaded: bool = False) -> Rig:
 
 
 def campaign(path: str | Path, columns: Mapping[str, Any] | None = None, **hints: Any) -> Campaign | FrequencyResponse:
-    """Measurements from a file: HDF5, MATLAB .mat, UFF 58 or CSV; records, or frequency responses.
+    """Records or frequency responses from a measurement file: HDF5, MATLAB .mat, UFF 58 or CSV.
 
     Parameters
     ----------
-    columns : which variable of the file is what, such as {"u": ["V1", "V2"], "y": "S1", "t": "time"}.
+    columns : which variable of the file is which signal, such as {"u": ["V1", "V2"], "y": "S1", "t": "time"}.
     hints : what the file does not state: period_s, excitation, sample_rate_Hz, y_unit.
 
     Raises
@@ -69,11 +69,11 @@ def campaign(path: str | Path, columns: Mapping[str, Any] | None = None, **hints
 
 def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | None = None, *, seed: int = 1,
                       progress: Progress | None = None) -> Campaign:
-    """A campaign of the nonlinear table, to rehearse an identification; as `avis simulate-campaign`.
+    """Simulate a campaign with the nonlinear table, to rehearse an identification; as `avis simulate-campaign`.
 
     plan : file or keys of docs/campaign_plan.md; by default multisines at three levels, noise, rest, a shaken floor.
         Its `effect` sections add effects that the rig file does not contain.
-    Raises InputError for a plan that is wrong.
+    Raises InputError for an invalid plan.
 
     Examples
     --------
@@ -95,13 +95,13 @@ def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | s
 
     Parameters
     ----------
-    measured : of `campaign`, or a file. table : to start from.
-    options : parameters, priors, hold_out, band_Hz, starts, kalman, despite_gates, seed, amplifier_corner_Hz;
-        see `avis_ctrl.study.identification.IdentifyOptions`.
+    measured : result of `campaign`, or a file. table : starting model.
+    options : parameters, priors, hold_out, band_Hz, starts, kalman, despite_gates, seed, amplifier_corner_Hz; see
+        `avis_ctrl.study.identification.IdentifyOptions`.
 
     Raises
     ------
-    InputError : records that are not of this table, a gate that says stop, options that do not fit.
+    InputError : records of another table, a gate (check of the records) with severity "stop", options that do not fit.
     ComputationError : a fit that does not converge.
 
     Examples
@@ -141,13 +141,13 @@ def design(source: Design | IdentificationStudy | Rig | str | Path, *, progress:
     Parameters
     ----------
     source : a design file; a table (`rig`, or the name of a built-in one); an identification.
-    sections : keep, transmissibility, control_effort, uncertainty, ... with the keys of docs/design_file.md; in place
-        of those of a design file or, of an identification, of the design that it proposes.
+    sections : keep, transmissibility, control_effort, uncertainty, ... with the keys of docs/design_file.md. They
+        replace those of the design file, or those of the design that an identification proposes.
     progress : called with a line of text at each step, such as `print`.
 
     Raises
     ------
-    InputError : a key, value or parameter that does not fit, in one line. ComputationError : no controller exists.
+    InputError : a key, value or parameter that does not fit, in one line. ComputationError : no controller was found.
 
     Examples
     --------
@@ -163,7 +163,7 @@ def design(source: Design | IdentificationStudy | Rig | str | Path, *, progress:
 
 
 def study_inputs(source: Any, **sections: Any) -> tuple[Design, Rig]:
-    """The checked design and its rig from what `design` takes."""
+    """The checked design and its rig from the arguments of `design`."""
     if isinstance(source, IdentificationStudy):
         return _identified(source, sections)
     path = Path(source) if isinstance(source, (str, Path)) else None
@@ -178,15 +178,15 @@ def study_inputs(source: Any, **sections: Any) -> tuple[Design, Rig]:
 
 
 def _identified(source: IdentificationStudy, sections: dict[str, Any]) -> tuple[Design, Rig]:
-    # Through the files of the command, so that both give the same controller.
+    # Goes through the command's files, so that both give the same controller.
     with tempfile.TemporaryDirectory() as folder:
         write_together(Path(folder), {name: text.encode() for name, text in source.files(sections or None).items()})
         return read_study(Path(folder, "design.toml"))
 
 
 def _changed(made: Design, sections: dict[str, Any]) -> Design:
-    """A design with other sections; a mapping replaces the keys that it has, anything else the whole."""
-    # The content of an uncertainty file is no key of a design file.
+    """A design with other sections. A mapping replaces single keys of a section, any other value the whole section."""
+    # The content of an uncertainty file is not a key of a design file.
     bare = made.model_copy(update={"uncertainty": made.uncertainty.model_copy(update={"identified": None})})
     table = bare.model_dump(exclude_none=True)
     for name, value in sections.items():

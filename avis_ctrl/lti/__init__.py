@@ -1,4 +1,4 @@
-"""Linear systems: state space with named signals, connection by name, norms, realisations."""
+"""Linear systems: state-space models with named signals, connection by name, norms, realisations."""
 
 from avis_ctrl.lti.connect import connect, lft_lower, lft_upper, summing_junction
 from avis_ctrl.lti.norms import h2_norm, hinf_norm

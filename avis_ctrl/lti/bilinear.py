@@ -1,10 +1,10 @@
 """The bilinear map between sampled and continuous systems, s = (2/dt) (z - 1)/(z + 1).
 
-It takes the unit circle to the imaginary axis one to one, z = exp(j omega dt) to s = j v, v = (2/dt) tan(omega dt/2),
-half the sample rate to infinity, and the inside of the circle to the left half plane. A sampled system and its image
-have the same response at omega and v, hence the same stability, H-infinity norm, structured singular value and
-scalings (Zhou, Doyle and Glover, Robust and Optimal Control, 1996, section 21.4). The factor 2/dt leaves frequencies
-far below the sample rate as they are, so that the image is as well scaled as the system.
+It maps the unit circle one to one to the imaginary axis, z = exp(j omega dt) to s = j v, v = (2/dt) tan(omega dt/2).
+The Nyquist frequency maps to infinity, and the inside of the circle to the left half plane. The response of the
+sampled system at omega equals that of its image at v. Both therefore have the same stability, H-infinity norm,
+structured singular value and scalings (Zhou, Doyle and Glover, Robust and Optimal Control, 1996, section 21.4). The
+factor 2/dt keeps frequencies far below the sample rate unchanged, so that the image is as well scaled as the system.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from avis_ctrl.lti.statespace import StateSpace
 
 @dataclass(frozen=True)
 class BilinearSettings:
-    """at_infinity : distance of a pole from the point that goes to infinity, relative to that point, up to which it
-    counts as there; nearer ones lose more digits than a design can spare."""
+    """at_infinity : a pole is treated as mapped to infinity if its distance from the point that maps to infinity,
+    relative to that point, is at most this value; for nearer poles the map loses too many digits for a design."""
 
     at_infinity: float = 1e-9
 
@@ -30,16 +30,16 @@ SETTINGS = BilinearSettings()
 
 
 def continuous_image(system: StateSpace) -> StateSpace:
-    """Continuous system with the response of a sampled one, on the warped frequency axis; signal names kept.
+    """Continuous system with the response of a sampled system on the warped frequency axis; keeps the signal names.
 
-    A continuous system is returned as it is. ComputationError where A has an eigenvalue at z = -1.
+    A continuous system is returned unchanged. Raises ComputationError if A has an eigenvalue at z = -1.
     """
     if not system.dt:
         return system
     n, a = system.nstates, 2.0 / system.dt
     if not n:
         return replace(system, dt=0.0)
-    # In Schur coordinates a pole near z = -1 does not blur the others.
+    # In Schur coordinates a pole near z = -1 does not spoil the accuracy of the other poles.
     _, (scale, _) = la.matrix_balance(system.A, permute=False, separate=True)
     T, Q = la.schur(system.A / scale[:, None] * scale)
     B, C = Q.T @ (system.B / scale[:, None]), (system.C * scale) @ Q
@@ -52,9 +52,9 @@ def continuous_image(system: StateSpace) -> StateSpace:
 
 
 def sampled_image(system: StateSpace, dt: float) -> StateSpace:
-    """Inverse of `continuous_image` for a sample time dt [s] > 0; a continuous pole at 2/dt makes it not causal.
+    """Inverse of `continuous_image` for a sample time dt [s] > 0; with a pole at 2/dt the result is not causal.
 
-    ComputationError where A has an eigenvalue at 2/dt.
+    Raises ComputationError if A has an eigenvalue at 2/dt.
     """
     n, a = system.nstates, 2.0 / dt
     if not n:
@@ -67,7 +67,7 @@ def sampled_image(system: StateSpace, dt: float) -> StateSpace:
 
 
 def image_frequency(omega: np.ndarray | float, dt: float) -> np.ndarray | float:
-    """Frequency [rad/s] of the continuous image for omega from 0 to pi/dt; inf at (and above) the Nyquist frequency."""
+    """Frequency [rad/s] of the continuous image for omega from 0 to pi/dt; inf at and above the Nyquist frequency."""
     if not dt:
         return omega
     inside = np.asarray(omega) * dt < np.pi
@@ -75,12 +75,12 @@ def image_frequency(omega: np.ndarray | float, dt: float) -> np.ndarray | float:
 
 
 def sampled_frequency(image: np.ndarray | float, dt: float) -> np.ndarray | float:
-    """Frequency [rad/s] of the sampled system for one of its continuous image; inf gives pi/dt."""
+    """Frequency [rad/s] of the sampled system for a frequency of its continuous image; inf gives pi/dt."""
     return (2 / dt * np.arctan(np.asarray(image) * dt / 2))[()] if dt else image
 
 
 def _inverse(matrix: np.ndarray, size: float, failed: str, cause: str) -> np.ndarray:
-    # By the poles, not by a condition, in which the units of the states would count.
+    # The test uses the poles, because a condition number would depend on the units of the states.
     nearest = float(np.min(np.abs(la.eigvals(matrix)))) / size
     if nearest <= SETTINGS.at_infinity:
         raise ComputationError(failed, measured=f"relative distance {nearest:.1e}", cause=cause,

@@ -1,8 +1,8 @@
 """Connection of systems by signal name, and linear fractional transformations.
 
-A signal has one source (an output of a part, or an external input) and any number of readers
-(inputs of parts of the same name). A signal read but driven by nothing, or driven twice, is an
-error that names the parts; so user code never needs an index.
+A signal has one source (an output of a part, or an external input) and any number of destinations (inputs of parts
+with the same name). A signal without a source or with two sources is an error that names the parts. User code
+therefore never needs an index.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from avis_ctrl.lti.statespace import StateSpace, append, gain
 
 
 def summing_junction(output: str, terms: Sequence[str]) -> StateSpace:
-    """Sum of signals: terms such as ["a", "-b"] give output = a - b."""
+    """Sum of signals: the terms ["a", "-b"] give output = a - b."""
     names = [term.lstrip("+-") for term in terms]
     signs = [-1.0 if term.startswith("-") else 1.0 for term in terms]
     return gain([signs], names, [output])
@@ -24,17 +24,17 @@ def summing_junction(output: str, terms: Sequence[str]) -> StateSpace:
 
 def connect(parts: dict[str, StateSpace] | Sequence[StateSpace], inputs: Sequence[str],
             outputs: Sequence[str]) -> StateSpace:
-    """Interconnect parts through the signals that share a name.
+    """Connect systems through signals of the same name.
 
     Parameters
     ----------
-    parts : systems; a dict names them in error messages.
-    inputs : external signals, in the order wanted.
-    outputs : signals to bring out (any output of a part, or an external input).
+    parts : systems; the keys of a dict are used in error messages.
+    inputs : external input signals, in order.
+    outputs : output signals, in order (any output of a part, or an external input).
 
     Raises
     ------
-    InputError : a signal driven twice, read but not driven, or asked for but absent.
+    InputError : a signal with two sources, an input without a source, or an unknown output.
     ComputationError : an algebraic loop (the connection is not well posed).
     """
     named = parts if isinstance(parts, dict) else {f"part {k}": part for k, part in enumerate(parts)}
@@ -66,7 +66,7 @@ def connect(parts: dict[str, StateSpace] | Sequence[StateSpace], inputs: Sequenc
 
 
 def signal_sources(parts: dict[str, StateSpace], inputs: Sequence[str]) -> dict[str, str]:
-    """The part (or "external input") that drives each signal; raises as `connect` does."""
+    """The part (or "external input") that drives each signal; raises InputError as `connect` does."""
     source: dict[str, str] = {name: "external input" for name in inputs}
     if len(source) != len(inputs):
         raise InputError(f"external input named twice in {list(inputs)}")
@@ -82,7 +82,7 @@ def signal_sources(parts: dict[str, StateSpace], inputs: Sequence[str]) -> dict[
 
 
 def _close(total: StateSpace, F: np.ndarray, E: np.ndarray) -> tuple[np.ndarray, ...]:
-    """State space of all part outputs, from the external inputs, with u = F y + E e."""
+    """(A, B, C, D) from the external inputs e to all outputs y of the parts, with u = F y + E e."""
     loop = np.eye(total.noutputs) - total.D @ F
     if total.noutputs and (condition := np.linalg.cond(_equilibrated(loop))) > 1e12:
         raise ComputationError("the connection is not well posed", cause="an algebraic loop of unit gain",
@@ -94,7 +94,7 @@ def _close(total: StateSpace, F: np.ndarray, E: np.ndarray) -> tuple[np.ndarray,
 
 
 def _equilibrated(matrix: np.ndarray) -> np.ndarray:
-    """Rows and columns scaled to largest entries near one, so that units of signals do not look like singularity."""
+    """Scale the largest entry of each row and column to about one, so that signal units do not affect the condition."""
     for _ in range(10):
         for axis in (0, 1):
             size = np.sqrt(np.max(np.abs(matrix), axis=axis, keepdims=True))
@@ -103,7 +103,7 @@ def _equilibrated(matrix: np.ndarray) -> np.ndarray:
 
 
 def lft_lower(P: StateSpace, K: StateSpace) -> StateSpace:
-    """F_l(P, K): closes u = K y around the last inputs and outputs of P."""
+    """Lower LFT F_l(P, K): closes u = K y around the last inputs and outputs of P."""
     n_y, n_u = K.ninputs, K.noutputs
     n_z, n_w = P.noutputs - n_y, P.ninputs - n_u
     if n_z < 0 or n_w < 0:
@@ -118,7 +118,7 @@ def lft_lower(P: StateSpace, K: StateSpace) -> StateSpace:
 
 
 def lft_upper(P: StateSpace, Delta: StateSpace | np.ndarray) -> StateSpace:
-    """F_u(P, Delta): closes w_delta = Delta z_delta around the first inputs and outputs of P."""
+    """Upper LFT F_u(P, Delta): closes w_delta = Delta z_delta around the first inputs and outputs of P."""
     delta = Delta if isinstance(Delta, StateSpace) else gain(Delta, dt=P.dt)
     n_w, n_z = delta.D.shape
     order_out = [*range(n_z, P.noutputs), *range(n_z)]

@@ -1,7 +1,7 @@
-"""Systems of other libraries, numbers and matrices taken as systems of this one, and responses taken from either.
+"""Conversion of python-control systems, numbers and matrices to StateSpace, and frequency responses of all of them.
 
-python-control's StateSpace, TransferFunction and FRD are known by what they offer, so that the library is not imported
-(which takes two seconds) before one of its systems exists.
+The StateSpace, TransferFunction and FRD of python-control are recognised by their attributes, so that the library is
+not imported (which takes two seconds) unless one of its systems is used.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from avis_ctrl.lti.statespace import StateSpace, operand
 
 
 def as_system(given: Any, field: str = "system") -> StateSpace:
-    """A StateSpace from ours, python-control's StateSpace or TransferFunction, a number or a matrix.
+    """Convert a python-control StateSpace or TransferFunction, a number or a matrix to a StateSpace.
+
+    A StateSpace is returned unchanged. An object with a method `system` is replaced by the result of that method.
 
     Raises
     ------
-    InputError : anything else, an improper transfer function, a frequency response (which has no states).
+    InputError : any other type, an improper transfer function, a frequency response (which has no states).
     """
     if hasattr(given, "frdata"):
         raise InputError("expected a system with states; a frequency response has none", field=field)
@@ -36,7 +38,7 @@ def as_system(given: Any, field: str = "system") -> StateSpace:
 
 
 def is_response(given: Any) -> bool:
-    """Whether it is python-control's FRD: values at frequencies and nothing between them."""
+    """Whether `given` is a python-control FRD, defined only at its frequencies."""
     return hasattr(given, "frdata")
 
 
@@ -46,11 +48,11 @@ def frequencies_of(given: Any) -> np.ndarray:
 
 
 def response_of(given: Any, omega: np.ndarray, field: str = "system") -> np.ndarray:
-    """(n, n_y, n_u) response at the frequencies omega (n,) [rad/s] of a system, or of an FRD that has them.
+    """(n, n_y, n_u) response of a system or an FRD at the frequencies omega (n,) [rad/s].
 
     Raises
     ------
-    InputError : frequencies that an FRD does not have; as `as_system`.
+    InputError : as in `as_system`, or frequencies that the FRD does not contain.
     """
     omega = np.atleast_1d(np.asarray(omega, float))
     if not is_response(given):
@@ -63,9 +65,9 @@ def response_of(given: Any, omega: np.ndarray, field: str = "system") -> np.ndar
 
 
 def plot_frequencies(given: Any, points: int = 400) -> np.ndarray:
-    """(n,) frequencies [rad/s] that show a system: two decades about its poles, denser at resonances; those of an FRD.
+    """(n,) frequencies [rad/s] for a plot: one decade beyond the poles on both sides, denser at resonances.
 
-    Up to the Nyquist frequency for a sampled system.
+    The grid of a sampled system ends at the Nyquist frequency. An FRD is plotted at its frequencies.
     """
     if is_response(given):
         return frequencies_of(given)
@@ -84,7 +86,7 @@ def plot_frequencies(given: Any, points: int = 400) -> np.ndarray:
     near = []
     for p in poles[np.abs(poles.imag) > 0.9 * np.abs(poles)]:
         damping = abs(p.real) / abs(p)
-        # A pole on the axis has no peak to show: keep away from it.
+        # The response is infinite at a pole on the axis: keep away from it.
         steps = np.linspace(-5, 5, 21) * damping if damping > 1e-7 else np.linspace(-5, 5, 20) * 1e-3
         near.append(abs(p.imag) * np.exp(steps))
     every = np.unique(np.concatenate([grid, *near]))

@@ -1,4 +1,7 @@
-"""Series, parallel and feedback connection of (A, B, C, D); integrators or uncertain elements close A."""
+"""Series, parallel and feedback connection of quadruples (A, B, C, D).
+
+The internal signals, at A, can be closed by integrators or by uncertain elements.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ Quadruple = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def series(X: Quadruple, Y: Quadruple) -> Quadruple:
-    """X Y: Y's outputs into X's inputs; the internal signals of X first."""
+    """X Y, the outputs of Y connected to the inputs of X; the internal signals of X come first."""
     (A, B, C, D), (a, b, c, d) = X, Y
     return (np.block([[A, B @ c], [np.zeros((a.shape[0], A.shape[1])), a]]), np.vstack([B @ d, b]),
             np.hstack([C, D @ c]), D @ d)
@@ -22,14 +25,14 @@ def parallel(X: Quadruple, Y: Quadruple) -> Quadruple:
 
 
 def return_difference(X: Quadruple, Y: Quadruple, sign: int) -> np.ndarray:
-    """I - sign D_X D_Y (n_y, n_y), which `feedback` inverts."""
+    """I - sign D_X D_Y, (n_y, n_y); `feedback` inverts it."""
     return np.eye(X[3].shape[0]) - sign * X[3] @ Y[3]
 
 
 def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
-    """From r to y of y = X u, u = r + sign Y y."""
+    """Closed loop from r to y with y = X u, u = r + sign Y y."""
     (A, B, C, D), (a, b, c, d) = X, Y
-    # y and u from the internal signals of X and Y, and from r.
+    # y and u as functions of the internal signals of X and Y, and of r.
     y = np.linalg.inv(return_difference(X, Y, sign)) @ np.hstack([C, sign * D @ c, D])
     u = sign * d @ y
     u[:, A.shape[1]:] += np.hstack([sign * c, np.eye(D.shape[1])])

@@ -1,12 +1,11 @@
-"""Rational, stable and minimum-phase functions with a given magnitude.
+"""Fit of stable, minimum-phase rational functions to a given magnitude.
 
-`magnitude_fit` minimises the squared error of the logarithm (equal dB count equally at any level);
-`covering_fit` keeps the magnitude at or above a lower curve and minimises the largest excess over an upper one (a
-Chebyshev problem in dB), for weights that must not ask less than was specified.
+`magnitude_fit` minimises the squared error of the log magnitude (errors in dB have equal weight at any level).
+`covering_fit` keeps the magnitude at or above a lower curve and minimises the largest excess over an upper curve (a
+Chebyshev problem in dB). It is intended for weights that must not require less than was specified.
 
-The unknowns are the logarithms of corner frequencies and dampings, so that no step can leave the stable,
-minimum-phase set; a fit of higher order starts from the one below with a pair of factors added
-where the error is largest.
+The unknowns are the logarithms of corner frequencies and dampings, so that every iterate is stable and minimum phase.
+A fit of higher order starts from the fit two orders below, with a pair of factors added where the error is largest.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ DB = 20.0 / np.log(10.0)
 
 
 class MagnitudeFit(NamedTuple):
-    """A fitted function with its error over the points given [dB]: r.m.s. and largest."""
+    """A fitted function with its r.m.s. and maximum error over the given points [dB]."""
 
     function: Rational
     error_rms_dB: float
@@ -34,7 +33,7 @@ class MagnitudeFit(NamedTuple):
 
 @dataclass(frozen=True)
 class _Layout:
-    """How many factors of each kind the vector of unknowns holds: log gain, then log w, log zeta of each."""
+    """Numbers of factors; the vector of unknowns is log gain, then log w and log zeta of pairs, log w of real roots."""
 
     zero_pairs: int
     pole_pairs: int
@@ -93,20 +92,21 @@ class _Layout:
 
 def magnitude_fit(omega: np.ndarray, magnitude: np.ndarray, order: int, relative_degree: int = 0,
                   min_damping: float = 0.02, reach: float = 10.0) -> MagnitudeFit:
-    """Stable, minimum-phase rational function whose log-magnitude is nearest in least squares.
+    """Stable, minimum-phase rational function by a least-squares fit of the log magnitude.
 
     Parameters
     ----------
-    omega : (n,) increasing positive frequencies [rad/s]; their spacing is the weighting.
+    omega : (n,) increasing positive frequencies [rad/s]; their density determines the weighting.
     magnitude : (n,) positive values.
     order : number of poles.
-    relative_degree : poles less zeros.
-    min_damping : smallest damping of any factor; keeps a fit from chasing single lines.
-    reach : corners stay within [omega[0]/reach, omega[-1]*reach].
+    relative_degree : number of poles minus number of zeros.
+    min_damping : minimum damping of any factor; prevents the fit of single narrow peaks.
+    reach : corner frequencies stay within [omega[0]/reach, omega[-1]*reach].
 
     Raises
     ------
-    InputError : data that are not positive, finite and increasing, or an order below the relative degree.
+    InputError : frequencies not positive, finite and increasing, magnitudes not positive and finite, or an order
+        below the relative degree.
     """
     omega, log_target = _checked(omega, magnitude)
     if not (order >= relative_degree >= 0):
@@ -120,22 +120,22 @@ def magnitude_fit(omega: np.ndarray, magnitude: np.ndarray, order: int, relative
 
 def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order: int,
                  target: np.ndarray | None = None, min_damping: float = 0.1, reach: float = 10.0) -> MagnitudeFit:
-    """Biproper function with |H| >= lower everywhere and the largest excess of |H| over upper, in dB, minimised.
+    """Biproper function with |H| >= lower at all points and the smallest maximum excess of |H| over upper in dB.
 
     Parameters
     ----------
     omega : (n,) increasing positive frequencies [rad/s].
-    lower, upper : (n,) positive, lower <= upper; they are equal where the magnitude is to be met closely.
-    target : (n,) the magnitude that the search starts from; None for the geometric mean of the two.
+    lower, upper : (n,) positive, lower <= upper; equal where the magnitude is to be matched closely.
+    target : (n,) initial magnitude of the search; None for the geometric mean of lower and upper.
     order, min_damping, reach : as in `magnitude_fit`.
 
     Returns
     -------
-    MagnitudeFit whose error_max_dB is the largest excess over `upper` (0 where none), error_rms_dB its r.m.s.
+    MagnitudeFit with error_max_dB the largest excess over `upper` (0 if there is none), error_rms_dB its r.m.s. value.
 
     Raises
     ------
-    InputError : as `magnitude_fit`, and lower above upper.
+    InputError : as in `magnitude_fit`, or lower exceeds upper.
     """
     *_, last = covering_fits(omega, lower, upper, range(order % 2, order + 1, 2), target, min_damping, reach)
     return last
@@ -144,7 +144,7 @@ def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order:
 def covering_fits(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, orders: Iterable[int],
                   target: np.ndarray | None = None, min_damping: float = 0.1,
                   reach: float = 10.0) -> Iterator[MagnitudeFit]:
-    """`covering_fit` for increasing orders, one by one; each starts where the one two below ended."""
+    """Generate `covering_fit` for increasing orders; each starts from the least-squares fit of the same order."""
     omega, log_lower = _checked(omega, lower)
     _, log_upper = _checked(omega, upper)
     if np.any(log_lower > log_upper + 1e-12):
@@ -163,7 +163,7 @@ def covering_fits(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order
 
 def _chebyshev(layout: _Layout, x: np.ndarray, omega: np.ndarray, lower: np.ndarray, upper: np.ndarray,
                min_damping: float, reach: float) -> np.ndarray:
-    """Smallest t with lower <= log|H| <= upper + t, by sequential quadratic programming from x."""
+    """Minimise t subject to lower <= log|H| <= upper + t, by sequential quadratic programming from x."""
     def slack(y: np.ndarray) -> np.ndarray:
         value, _ = layout.log_magnitude(y[:-1], omega)
         return np.concatenate([value - lower, upper + y[-1] - value])
@@ -199,7 +199,7 @@ def _checked(omega: np.ndarray, magnitude: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _growth(omega: np.ndarray, log_target: np.ndarray, relative_degree: int, odd: int, min_damping: float,
             reach: float) -> Iterator[tuple[_Layout, np.ndarray]]:
-    """Least-squares fits of order relative_degree + odd, and of two more each time, without end."""
+    """Least-squares fits of order relative_degree + odd, then two orders higher each time; an infinite generator."""
     layout, x = _start(omega, log_target, odd, relative_degree)
     x = _least_squares(layout, x, omega, log_target, min_damping, reach, 300)
     while True:
@@ -214,7 +214,7 @@ def _growth(omega: np.ndarray, log_target: np.ndarray, relative_degree: int, odd
 
 
 def _start(omega: np.ndarray, log_target: np.ndarray, odd: int, relative_degree: int) -> tuple[_Layout, np.ndarray]:
-    """The part that carries the relative degree, and a lead-lag factor where the order is odd beyond it."""
+    """Initial factors: poles for the relative degree, and a lead-lag factor if order - relative_degree is odd."""
     layout = _Layout(0, relative_degree // 2, odd, odd + relative_degree % 2)
     middle = 0.5 * (np.log(omega[0]) + np.log(omega[-1]))
     x = np.zeros(layout.size)
@@ -227,7 +227,7 @@ def _start(omega: np.ndarray, log_target: np.ndarray, odd: int, relative_degree:
 
 def _grown(layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.ndarray
            ) -> list[tuple[_Layout, np.ndarray]]:
-    """Starting points with one biquad more: a bump at the largest error of either sign, and steps across the band."""
+    """Initial guesses with one more biquad: a peak or notch at the largest errors, or a step within the band."""
     value, _ = layout.log_magnitude(x, omega)
     error = log_target - value
     grown = _Layout(layout.zero_pairs + 1, layout.pole_pairs + 1, layout.real_zeros, layout.real_poles)

@@ -1,8 +1,8 @@
-"""System norms, measured on the realisation that is handed over.
+"""H-infinity and H2 norms, computed on the realisation as given.
 
-`hinf_norm` is the two-step method of Bruinsma and Steinbuch (Systems & Control Letters 14, 1990):
-a level is lifted by the midpoints between imaginary-axis eigenvalues of its Hamiltonian until none
-are left, so that the peak is found between any grid points.
+`hinf_norm` is the two-step method of Bruinsma and Steinbuch (Systems & Control Letters 14, 1990). The level is raised
+to the gain at the midpoints between imaginary-axis eigenvalues of its Hamiltonian, until the Hamiltonian has no
+imaginary eigenvalues. The peak is therefore found independently of a frequency grid.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.bilinear import continuous_image, sampled_frequency
 from avis_ctrl.lti.statespace import StateSpace
 
-# Angle [rad] from the imaginary axis within which an eigenvalue of the Hamiltonian is tried as a crossing.
+# Eigenvalues of the Hamiltonian within this angle [rad] of the imaginary axis are tried as crossings.
 NEAR_AXIS = 3e-2
-# Frequencies, as multiples of the peak's, that are searched once more before a peak is accepted.
+# Frequencies, as multiples of the peak frequency, that are searched once more before a peak is accepted.
 NEIGHBOURHOOD = np.geomspace(0.5, 2.0, 101)
 
 
 def decibels(gain: float) -> float:
-    """20 log10 of a gain; minus infinity for none."""
+    """20 log10 of a gain; minus infinity for a zero gain."""
     return float(20 * np.log10(gain)) if gain > 0 else -np.inf
 
 
 def in_dB(gain: np.ndarray | Sequence[float]) -> np.ndarray:
-    """20 log10 |gain| (n,) to be drawn; nan where it is zero or not finite."""
+    """20 log10 |gain| (n,) for plots; nan where the gain is zero or not finite."""
     size = np.abs(np.asarray(gain))
     known = np.isfinite(size) & (size > 0)
     return np.where(known, 20 * np.log10(np.where(known, size, 1.0)), np.nan)
 
 
 class PeakGain(NamedTuple):
-    """H-infinity norm and the frequency [rad/s] where it is reached (inf for the direct term)."""
+    """H-infinity norm and the frequency [rad/s] where it is attained (inf for the direct term)."""
 
     gain: float
     omega: float
 
 
 def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
-    """H-infinity norm of a stable system, to a relative tolerance; gain inf where it is unstable.
+    """H-infinity norm of a stable system to a relative tolerance; gain inf for an unstable system.
 
-    The value returned is a lower bound reached at `omega`; the true norm is at most
-    (1 + tolerance) times it. Continuous or discrete time.
+    The returned value is a lower bound attained at `omega`; the true norm is at most (1 + tolerance) times this value.
+    Continuous or discrete time.
     """
     if not system.is_stable():
         return PeakGain(np.inf, np.nan)
@@ -74,7 +74,7 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
             points = np.concatenate([edges, (edges[:-1] + edges[1:]) / 2, np.sqrt(edges[:-1] * edges[1:])])
             new_omega, new_level = _best(system, points)
         if new_level <= (1.0 + tolerance) * level and 0 < omega < np.inf:
-            # Where the poles span many decades, round-off can hide the crossings of a flat peak: search around it.
+            # If the poles span many decades, round-off can hide the crossings of a flat peak: search around the peak.
             near_omega, near = _best(system, omega * NEIGHBOURHOOD)
             if near > new_level:
                 new_omega, new_level = near_omega, near
@@ -86,10 +86,10 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
 
 
 def norm_is_below(system: StateSpace, level: float) -> bool:
-    """Whether the H-infinity norm of a continuous system is below a level; False where it is unstable.
+    """Whether the H-infinity norm of a continuous system is below a level; False for an unstable system.
 
-    Much quicker than the norm: where no singular value meets the level, one frequency decides for all (Boyd,
-    Balakrishnan and Kabamba 1989).
+    Much faster than `hinf_norm`: if no singular value crosses the level, one frequency decides for all frequencies
+    (Boyd, Balakrishnan and Kabamba 1989).
     """
     if not system.is_stable():
         return False
@@ -107,8 +107,9 @@ def norm_is_below(system: StateSpace, level: float) -> bool:
 
 
 def largest_singular_value(M: np.ndarray) -> np.ndarray:
-    """Largest singular value of each matrix (.., m, n), in closed form for 2 x 2, otherwise from M^H M: quicker than
-    singular value decompositions, and for the largest one as accurate."""
+    """Largest singular value of each matrix (.., m, n), in closed form for 2 x 2, otherwise from M^H M.
+
+    Faster than a singular value decomposition and as accurate for the largest singular value."""
     size = np.max(np.abs(M), axis=(-2, -1), initial=0.0)
     M = M / np.where(size > 0, size, 1.0)[..., None, None]
     rows, columns = M.shape[-2:]
@@ -142,7 +143,7 @@ def _balanced(system: StateSpace) -> StateSpace:
 
 
 def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
-    """Frequencies [rad/s] where a singular value of the response equals, or nearly, the level (above sigma_max(D))."""
+    """Frequencies [rad/s] where a singular value of the response (nearly) equals the level; level > sigma_max(D)."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = level ** 2 * np.eye(system.ninputs) - D.T @ D
     if not system.nstates or np.min(la.eigvalsh(R)) <= 0:
@@ -156,13 +157,13 @@ def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
                                        [-Q * np.outer(scale, scale), -(F / scale[:, None] * scale).T]]))
     size = np.maximum(np.abs(eigenvalues), 1e-12 * np.max(np.abs(eigenvalues)))
     # Round-off moves the crossings of a flat response far off the axis (a nearly multiple eigenvalue). The caller
-    # evaluates the response at every frequency returned, so one too many costs little and one too few the norm.
+    # evaluates the response at every returned frequency: an extra frequency costs little, a missing one the norm.
     on_axis = np.abs(eigenvalues.real) < NEAR_AXIS * size
     return np.unique(np.abs(eigenvalues[on_axis].imag))
 
 
 def symplectic_scale(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """State scaling d (powers of two): diag(d, 1/d) evens out the Hamiltonian [A R; -Q -A'] and keeps it one."""
+    """State scaling d (powers of two) such that diag(d, 1/d) balances [A R; -Q -A'] and keeps it Hamiltonian."""
     n = A.shape[0]
     magnitude = np.abs(np.block([[A, R], [-Q, -A.T]]))
     np.fill_diagonal(magnitude, 0.0)
@@ -172,7 +173,8 @@ def symplectic_scale(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
 
 
 def h2_norm(system: StateSpace) -> float:
-    """H2 norm of a stable system (root of the output variance under unit white noise); inf if it has none."""
+    """H2 norm (square root of the output variance for unit white noise); inf if the system is unstable or the
+    direct term of a continuous system is not zero."""
     if not system.is_stable():
         return np.inf
     if system.dt:

@@ -1,8 +1,7 @@
-"""Scalar rational functions kept as first- and second-order factors, which stay accurate where coefficients do not.
+"""Scalar rational functions stored as first- and second-order factors, which are more accurate than coefficients.
 
-A factor of second order is s^2 + 2 zeta w s + w^2, one of first order s + w; w > 0 and zeta > 0 put every
-pole and zero in the open left half plane, so that the function is stable, minimum phase and has a stable inverse
-(up to its zeros at infinity).
+The factors are s^2 + 2 zeta w s + w^2 and s + w. With w > 0 and zeta > 0 every pole and zero lies in the open left half
+plane. The function is then stable and minimum phase and has a stable inverse (apart from its zeros at infinity).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ Section = tuple[float, float]
 
 @dataclass(frozen=True)
 class Rational:
-    """gain * prod(zero factors) / prod(pole factors), proper, stable and minimum phase.
+    """Proper, stable and minimum-phase function gain * prod(zero factors) / prod(pole factors).
 
     Parameters
     ----------
@@ -57,7 +56,7 @@ class Rational:
 
     @property
     def relative_degree(self) -> int:
-        """Poles less zeros: the slope at high frequency in powers of 1/omega."""
+        """Number of poles minus number of zeros: the roll-off at high frequency in powers of 1/omega."""
         return self.order - 2 * len(self.zero_pairs) - len(self.real_zeros)
 
     def __call__(self, s: np.ndarray) -> np.ndarray:
@@ -79,7 +78,7 @@ class Rational:
         return np.abs(self(1j * np.asarray(omega, float)))
 
     def scaled(self, factor: float) -> Rational:
-        """The same shape with its gain multiplied."""
+        """The same function with its gain multiplied by a factor."""
         return replace(self, gain=self.gain * factor)
 
     def inverse(self) -> Rational:
@@ -95,7 +94,7 @@ class Rational:
         return _roots(self.pole_pairs, self.real_poles)
 
     def system(self, input: str = "u", output: str = "y") -> StateSpace:
-        """A scaled cascade realisation of minimal order."""
+        """Balanced cascade realisation of minimal order."""
         return cascade(self.zeros(), self.poles(), self.gain, input, output)
 
 
@@ -111,12 +110,12 @@ def second_order_roots(corner_Hz: float, damping: float) -> np.ndarray:
 
 def cascade(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np.ndarray, leading: float,
             input: str = "u", output: str = "y") -> StateSpace:
-    """leading * prod(s - z) / prod(s - p) as a chain of sections of first and second order, diagonally scaled.
+    """leading * prod(s - z) / prod(s - p) as a balanced cascade of first- and second-order sections.
 
-    A chain keeps widely spread roots accurate where one companion matrix would lose them. Each section takes
-    the nearest zeros for its poles, so that no partial product grows large.
+    A cascade keeps widely spread roots accurate; a single companion matrix would lose them. The poles of each section
+    are paired with the nearest zeros, so that no partial product becomes large.
 
-    Raises InputError when it is improper or a complex root lacks its conjugate.
+    Raises InputError if the function is improper or a complex root has no conjugate.
     """
     pole_sections, zero_sections = _real_sections(poles, "poles"), _real_sections(zeros, "zeros")
     if sum(len(z) for z in zero_sections) > sum(len(p) for p in pole_sections):
@@ -137,14 +136,14 @@ def cascade(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np
 
 
 def _section_size(numerator: np.ndarray, denominator: np.ndarray) -> float:
-    """Magnitude of a section at its own corner."""
+    """Magnitude of a section at its corner frequency."""
     w = abs(denominator[-1]) ** (1.0 / (denominator.size - 1)) or 1.0
     value = abs(np.polyval(numerator, 1j * w) / np.polyval(denominator, 1j * w))
     return float(value) if np.isfinite(value) and value > 0 else 1.0
 
 
 def _real_sections(roots: Sequence[complex] | np.ndarray, field: str) -> list[np.ndarray]:
-    """Conjugate pairs and real roots (two by two) as sections with real coefficients, slowest first."""
+    """Group roots into sections with real coefficients (conjugate pairs, real roots two by two), slowest first."""
     roots = np.atleast_1d(np.asarray(roots, complex))
     tolerance = 1e-9 * np.abs(roots)
     upper = roots[roots.imag > tolerance]
@@ -164,10 +163,10 @@ def _real_sections(roots: Sequence[complex] | np.ndarray, field: str) -> list[np
 
 
 def _matched(poles: list[np.ndarray], zeros: list[np.ndarray]) -> list[np.ndarray]:
-    """For each pole section the zeros that it carries, never more than its poles.
+    """Zeros assigned to each pole section, at most as many as its poles.
 
-    A zero section goes to the free pole section nearest in frequency; a pair of zeros that meets only single
-    poles left is split when it is real.
+    A zero section is assigned to the pole section nearest in frequency that has room for it. If no section has room for
+    a pair of zeros, the pair is split, provided that it is real.
     """
     taken: list[np.ndarray] = [np.zeros(0, complex) for _ in poles]
 

@@ -1,4 +1,4 @@
-"""Realisations: scaling, minimal parts, balanced truncation, discretisation."""
+"""State-space realisations: scaling, minimal realisation, balanced truncation, discretisation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from avis_ctrl.lti.statespace import StateSpace
 
 
 def balance(system: StateSpace) -> StateSpace:
-    """Diagonal state scaling (powers of two) that evens out [A B; C 0]; exact, transfer matrix unchanged."""
+    """Balance [A B; C 0] by a diagonal state scaling with powers of two; the transfer matrix is exactly unchanged."""
     n = system.nstates
     if not n:
         return system
@@ -61,8 +61,8 @@ def hankel_singular_values(system: StateSpace) -> np.ndarray:
 def balanced_truncation(system: StateSpace, order: int | None = None, tolerance: float | None = None) -> StateSpace:
     """Balanced truncation (square-root method; Tombs and Postlethwaite 1987) of a stable system.
 
-    Keeps `order` states, or those whose Hankel singular value exceeds `tolerance` times the largest.
-    The error is at most twice the sum of the values dropped.
+    Keeps at most `order` states, and only states whose Hankel singular value exceeds `tolerance` times the largest.
+    The H-infinity norm of the error is at most twice the sum of the discarded Hankel singular values.
     """
     if not system.nstates:
         return system
@@ -79,7 +79,7 @@ def balanced_truncation(system: StateSpace, order: int | None = None, tolerance:
 
 
 def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
-    """Removes states that inputs do not reach or outputs do not see (staircase by SVD on the balanced system)."""
+    """Remove uncontrollable and unobservable states (staircase algorithm by SVD on the balanced system)."""
     def reachable(A: np.ndarray, B: np.ndarray) -> np.ndarray:
         size = np.linalg.norm(A, 2)
         Q, s, _ = la.svd(B, full_matrices=False) if B.size else (np.zeros((A.shape[0], 0)), np.zeros(0), None)
@@ -103,11 +103,12 @@ def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
 
 
 def with_rate_input(system: StateSpace, name: str, times: int) -> StateSpace:
-    """A system of one input u with a second one, v, that acts as u = v/s^times, without an integrator.
+    """Add a second input v to a system of one input u, so that v acts as u = v/s^times, without adding integrators.
 
-    C inv(s - A) B/s = C inv(s - A) inv(A) B where the system has a zero at s = 0: each one takes an integration.
+    If the system has a zero at s = 0, the transfer function divided by s is C inv(s I - A) inv(A) B: each zero cancels
+    one integrator.
 
-    Raises InputError where the system has fewer zeros there, or a pole.
+    Raises InputError if the system has fewer than `times` zeros at s = 0, or a pole there.
     """
     B, D, size = system.B, system.D, float(np.max(np.abs(system.frequency_response(np.ones(1)))))
     for _ in range(times):
@@ -122,9 +123,9 @@ def with_rate_input(system: StateSpace, name: str, times: int) -> StateSpace:
 
 
 def discretise(system: StateSpace, dt: float, method: Literal["zoh", "tustin"] = "tustin") -> StateSpace:
-    """Sampled system of period dt [s]: zero-order hold on the inputs ("zoh"), or the bilinear map ("tustin").
+    """Discretise with sample time dt [s], by a zero-order hold on the inputs ("zoh") or the bilinear map ("tustin").
 
-    Raises InputError where the system is sampled already, dt is not positive, or the method is another one.
+    Raises InputError if the system is already sampled, dt is not positive, or the method is unknown.
     """
     if method not in ("zoh", "tustin"):
         raise InputError("expected 'zoh' or 'tustin'", field="method", value=method)
@@ -138,6 +139,6 @@ def discretise(system: StateSpace, dt: float, method: Literal["zoh", "tustin"] =
     if method == "zoh":
         block = la.expm(np.block([[system.A, system.B], [np.zeros((m, n + m))]]) * dt)
         return replace(system, A=block[:n, :n], B=block[:n, n:], dt=dt)
-    # In the units of the continuous states, which the bilinear map alone would divide by sqrt(dt).
+    # Keeps the units of the continuous states; the bilinear map alone would divide them by sqrt(dt).
     image = sampled_image(system, dt)
     return replace(image, B=image.B * np.sqrt(dt), C=image.C / np.sqrt(dt))

@@ -3,8 +3,8 @@
     x' = A x + B u        (dt = 0)      or      x[k+1] = A x[k] + B u[k]     (dt > 0)
     y  = C x + D u
 
-Plain numpy arrays, frozen and picklable, so that a system can cross a process boundary.
-Operators keep the signal names, which python-control's do not.
+A system consists of plain read-only numpy arrays. It can be pickled and so passed between processes.
+The operators keep the signal names; those of python-control do not.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
 Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
-# States that back substitution takes at once: the rest of its work is then one matrix product.
+# Block size (states) of the back substitution; all work outside the diagonal blocks is matrix products.
 RESOLVENT_BLOCK = 16
-# Points at which a response is checked, and the relative difference there that disqualifies it.
+# Number of points at which a response is checked, and the largest relative difference accepted there.
 RESOLVENT_PROBES, RESOLVENT_TOLERANCE = 6, 1e-6
 
 
@@ -50,11 +50,11 @@ class StateSpace:
     ----------
     A, B, C, D : (n, n), (n, n_u), (n_y, n), (n_y, n_u) real arrays.
     dt : sample time in seconds; 0 for continuous time.
-    inputs, outputs, states : names; numbered u0.., y0.., x0.. when absent.
+    inputs, outputs, states : names; u0.., y0.., x0.. by default.
 
     Raises
     ------
-    InputError : shapes that do not fit, entries that are not finite, names that repeat.
+    InputError : inconsistent shapes, entries that are not finite, repeated input or output names.
 
     Examples
     --------
@@ -99,7 +99,7 @@ class StateSpace:
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "inputs", _names(self.inputs, n_u, "u", "input"))
         object.__setattr__(self, "outputs", _names(self.outputs, n_y, "y", "output"))
-        # States are for reading only: after a connection two parts may bring the same name.
+        # State names are informative only: after a connection two parts may have states of the same name.
         states = tuple(self.states) if len(tuple(self.states)) == n else tuple(f"x{k}" for k in range(n))
         object.__setattr__(self, "states", states)
 
@@ -154,11 +154,11 @@ class StateSpace:
         return self(1.0 if self.dt else 0.0).real
 
     # -- algebra --------------------------------------------------------------------------
-    # numpy arrays and numbers on the left leave the operation to this class.
+    # Makes numpy arrays and numbers on the left defer to the operators of this class.
     __array_ufunc__ = None
 
     def __matmul__(self, other: Any) -> StateSpace:
-        """Series connection: `self @ other` feeds other's outputs into self's inputs, in order."""
+        """Series connection: `self @ other` feeds the outputs of other into the inputs of self, in order."""
         other = operand(other)
         if other is None:
             return NotImplemented
@@ -172,7 +172,7 @@ class StateSpace:
         return NotImplemented if left is None else left @ self
 
     def __mul__(self, other: Any) -> StateSpace:
-        """All outputs times a number; with a system the series connection, as `@`."""
+        """Multiply all outputs by a number; with a system, the series connection as `@`."""
         return self.scaled(float(other)) if isinstance(other, (int, float, np.number)) else self.__matmul__(other)
 
     def __rmul__(self, other: Any) -> StateSpace:
@@ -182,7 +182,7 @@ class StateSpace:
         return self.scaled(1 / float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
 
     def __add__(self, other: Any) -> StateSpace:
-        """Parallel connection of two systems with the same inputs and outputs; a number where there is one of each."""
+        """Parallel connection of two systems of equal shape; a number can be added to a scalar system."""
         other = operand(other)
         if other is None:
             return NotImplemented
@@ -204,7 +204,7 @@ class StateSpace:
         return -self + other
 
     def feedback(self, other: Any = 1.0, sign: int = -1) -> StateSpace:
-        """Closed loop from r to y of y = self u, u = r + sign other y. Raises InputError where it is not well posed."""
+        """Closed loop from r to y with y = self u, u = r + sign other y. Raises InputError if it is not well posed."""
         K = operand(other)
         if K is None or K.D.shape != self.D.shape[::-1] or sign not in (-1, 1):
             raise InputError(f"expected {self.noutputs} inputs and {self.ninputs} outputs, and sign -1 or 1",
@@ -215,9 +215,9 @@ class StateSpace:
                           self.states + K.states)
 
     def scaled(self, left: np.ndarray | float = 1.0, right: np.ndarray | float = 1.0) -> StateSpace:
-        """`left @ self @ right` with vectors read as diagonals, scalars as multiples of identity.
+        """`left @ self @ right`, where a vector represents a diagonal matrix and a scalar a multiple of the identity.
 
-        Square factors keep the signal names.
+        The signal names are kept if the factor is square.
         """
         L, R = _as_matrix(left, self.noutputs), _as_matrix(right, self.ninputs)
         outputs = self.outputs if L.shape[0] == self.noutputs else ()
@@ -226,7 +226,7 @@ class StateSpace:
 
     def renamed(self, inputs: Sequence[str] | dict[str, str] | None = None,
                 outputs: Sequence[str] | dict[str, str] | None = None) -> StateSpace:
-        """The same system under other signal names (a full list, or a map from old to new)."""
+        """The same system with new signal names (a full list, or a dict from old to new names)."""
         def new(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:
             if given is None:
                 return old
@@ -238,7 +238,7 @@ class StateSpace:
         return replace(self, inputs=new(self.inputs, inputs), outputs=new(self.outputs, outputs))
 
     def select(self, outputs: Selector | None = None, inputs: Selector | None = None) -> StateSpace:
-        """The subsystem from some inputs to some outputs, by name or position, in the order asked."""
+        """The subsystem of the selected inputs and outputs, by name or position, in the order given."""
         rows = positions(self.outputs, outputs, "output")
         cols = positions(self.inputs, inputs, "input")
         return StateSpace(self.A, self.B[:, cols], self.C[rows], self.D[np.ix_(rows, cols)], self.dt,
@@ -250,9 +250,9 @@ class StateSpace:
 
     # -- python-control -------------------------------------------------------------------
     def to_control(self) -> Any:
-        """The python-control StateSpace (imports control, which takes about two seconds).
+        """Convert to a python-control StateSpace (imports control, which takes about two seconds).
 
-        python-control forbids dots in signal names: they become underscores.
+        Dots in signal names become underscores, because python-control forbids dots.
         """
         import control
 
@@ -262,7 +262,7 @@ class StateSpace:
 
     @staticmethod
     def from_control(system: Any) -> StateSpace:
-        """From a python-control StateSpace or TransferFunction."""
+        """Convert a python-control StateSpace or TransferFunction."""
         if not hasattr(system, "A"):
             import control
 
@@ -278,22 +278,22 @@ class StateSpace:
 
 def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] = (),
          dt: float = 0.0) -> StateSpace:
-    """A static gain as a system without states."""
+    """Static gain, as a system without states."""
     D = np.atleast_2d(np.asarray(matrix, dtype=float))
     return StateSpace(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D, dt,
                       tuple(inputs), tuple(outputs))
 
 
 def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> StateSpace:
-    """A proper transfer function, coefficients by descending power of s, in a balanced companion form.
+    """System in balanced companion form from a proper transfer function (coefficients in descending powers of s).
 
-    Of several inputs and outputs, numerator[i][k] and denominator[i][k] are the coefficients from input k to output i,
-    as in python-control; one denominator for all may be given once. Entries of a column with one denominator share
-    their states.
+    For a matrix of transfer functions, numerator[i][k] and denominator[i][k] are the coefficients from input k to
+    output i, as in python-control. A common denominator may be given once. Entries of a column with the same
+    denominator share their states.
 
     Raises
     ------
-    InputError : an entry that is improper (more zeros than poles), a denominator of zero, tables that do not fit.
+    InputError : an improper entry (more zeros than poles), a zero denominator, tables of different shapes.
 
     Examples
     --------
@@ -325,7 +325,7 @@ def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Se
 
 
 def _table(given: Any, field: str) -> list[list[np.ndarray]]:
-    """Coefficients by output and input, from those of one entry or a table."""
+    """Table of coefficients by output and input, from a single entry or a table."""
     depth, first = 0, given
     while isinstance(first, (list, tuple)) or np.ndim(first):
         if not len(first):
@@ -341,7 +341,7 @@ def _table(given: Any, field: str) -> list[list[np.ndarray]]:
 
 
 def _proper(num: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both with a leading 1 in the denominator, of one length."""
+    """Numerator and denominator of equal length, normalised to a monic denominator."""
     if den.size == 0:
         raise InputError("the denominator is zero")
     if num.size > den.size:
@@ -350,14 +350,14 @@ def _proper(num: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _companion(nums: np.ndarray, den: np.ndarray) -> StateSpace:
-    """From one input to the outputs nums (n_y, n + 1) over den (n + 1,) with a leading 1."""
+    """Single-input system with numerators nums (n_y, n + 1) over the monic denominator den (n + 1,)."""
     n, D = den.size - 1, nums[:, :1]
     if n == 0:
         return gain(D)
     A, B = np.zeros((n, n)), np.zeros((n, 1))
     A[:-1, 1:] = np.eye(n - 1)
     A[-1], B[-1] = -den[:0:-1], 1.0
-    # Equal magnitudes along the chain: state k scaled by w0^k, w0 the geometric mean of the poles.
+    # State k is scaled by w0^k, with w0 the geometric mean of the poles, so that all states have similar magnitude.
     w0 = abs(den[-1]) ** (1.0 / n) if den[-1] else max(np.max(np.abs(np.roots(den)), initial=0.0), 1.0)
     system = StateSpace(A, B, (nums[:, 1:] - D * den[1:])[:, ::-1], D).similar(np.diag(w0 ** np.arange(n)))
     size = np.sqrt(np.linalg.norm(system.B) * np.linalg.norm(system.C)) or 1.0
@@ -365,7 +365,7 @@ def _companion(nums: np.ndarray, den: np.ndarray) -> StateSpace:
 
 
 def append(*systems: StateSpace) -> StateSpace:
-    """Block-diagonal stack of systems, with all their signals (numbered afresh where names repeat)."""
+    """Block-diagonal connection of systems with all their signals (default names if any name repeats)."""
     def joined(names: Iterable[Names]) -> Names:
         together = sum(names, ())
         return together if len(set(together)) == len(together) else ()
@@ -376,9 +376,9 @@ def append(*systems: StateSpace) -> StateSpace:
 
 
 def operand(given: Any) -> StateSpace | None:
-    """A system of this package or of python-control, a number or a matrix as a system; None for anything else.
+    """Convert a number, a matrix, or a system of this package or python-control to a StateSpace; None for other types.
 
-    python-control's StateSpace and TransferFunction are known by what they offer: importing it takes two seconds.
+    The types of python-control are recognised by their attributes, because importing the library takes two seconds.
     """
     if isinstance(given, StateSpace):
         return given
@@ -395,7 +395,7 @@ def _as_matrix(factor: np.ndarray | float, size: int) -> np.ndarray:
 
 
 def _common_dt(*systems: StateSpace) -> float:
-    # A static gain belongs to every clock.
+    # A static gain is compatible with any sample time.
     clocks = {s.dt for s in systems if s.nstates} or {s.dt for s in systems}
     if len(clocks) > 1:
         raise InputError(f"systems of different sample times cannot be connected: {sorted(clocks)} s")
@@ -403,7 +403,7 @@ def _common_dt(*systems: StateSpace) -> float:
 
 
 def positions(names: Names, asked: Selector | None, what: str) -> list[int]:
-    """Places of signals that are named or numbered, in the order asked; all for None."""
+    """Indices of signals given by name or number, in the order given; all signals for None."""
     if asked is None:
         return list(range(len(names)))
     if isinstance(asked, slice):
@@ -423,11 +423,12 @@ def positions(names: Names, asked: Selector | None, what: str) -> list[int]:
 
 
 def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """C inv(s I - A) B at many points s, through one complex Schur form and batched back substitution.
+    """C inv(s I - A) B at many points s, from one complex Schur form and batched back substitution.
 
-    A Schur form is accurate relative to the largest states: where slow states are much smaller (a controller with
-    fast poles does that) the response at low frequency can be lost. It is compared with elimination, which is
-    accurate state by state, at a few points, and replaced by it around those where they differ.
+    The Schur form is accurate only relative to the largest states. If slow states are much smaller, as in a
+    controller with fast poles, the response at low frequency can lose all accuracy. It is therefore compared at a few
+    points with Gaussian elimination, which is accurate for each state. Around points where the two differ, elimination
+    replaces it.
     """
     if points.size < 4:
         return _eliminated(A, B, C, points)
@@ -439,7 +440,7 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
     probes = order[place]
     exact = _eliminated(A, B, C, points[probes])
     size = np.linalg.norm(exact, axis=(1, 2))
-    # On a pole both are infinite: nothing to compare.
+    # At a pole both are infinite and cannot be compared.
     finite = np.isfinite(size)
     wrong = np.zeros(place.size)
     error = np.linalg.norm(response[probes[finite]] - exact[finite], axis=(1, 2))
@@ -450,7 +451,7 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
 
 
 def _eliminated(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """C inv(s I - A) B point by point; infinite where s is a pole."""
+    """C inv(s I - A) B point by point; inf where s is a pole."""
     identity, right = np.eye(A.shape[0]), B.astype(complex)
     response = np.full((points.size, C.shape[0], B.shape[1]), np.inf, complex)
     for k, s in enumerate(points):
@@ -460,7 +461,7 @@ def _eliminated(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray)
 
 
 def _back_substituted(T: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """C inv(s I - T) B for upper triangular T, by blocks of states for all points at once."""
+    """C inv(s I - T) B for upper triangular T, in blocks of states, for all points at once."""
     n, columns = B.shape
     x = np.zeros((n, points.size * columns), complex)
     pivots = np.repeat(points, columns) - np.diag(T)[:, None]

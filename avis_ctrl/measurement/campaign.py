@@ -1,6 +1,6 @@
 """A measurement campaign: several records of one rig, in memory or on disk.
 
-A record on disk is loaded whole or in pieces, so that one of many gigabytes never has to fit in memory.
+Records on disk are loaded whole or in pieces, so that a record of many gigabytes need not fit in memory.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ FLOOR_NAMES = ("vx", "vy", "vz")
 
 @dataclass(frozen=True)
 class RecordHeader:
-    """What a record says of itself (contract: campaign file).
+    """Metadata of a record (contract: campaign file).
 
     Attributes
     ----------
     name : such as "00".
-    sample_rate_Hz : of every channel.
+    sample_rate_Hz : sample rate of every channel.
     samples : number of samples.
-    u_names, y_names, floor_names : channels; floor_names is empty where the floor was not measured.
+    u_names, y_names, floor_names : names of the channels; floor_names is empty if the floor was not measured.
     u_unit, y_unit, floor_unit : units, "V" for commanded voltages; "V", "m/s", "m/s^2" or "m" for y.
-    excitation : "multisine" (periodic, from rest), "noise", "rest" (u = 0), "floor" (u = 0, floor shaken),
-        or "sine" (one frequency; not of the contract, for stepped-sine calibrations).
-    level_V : r.m.s. of the driven voltages, by which records at different levels are told apart.
+    excitation : "multisine" (periodic, from rest), "noise", "rest" (u = 0), "floor" (u = 0, floor shaken), or "sine"
+        (one frequency, for stepped-sine calibrations; not part of the contract).
+    level_V : r.m.s. of the driven voltages; it distinguishes records at different levels.
     start_s : time of the first sample, on the campaign's clock.
-    period_s : of a periodic record, otherwise None.
+    period_s : period of a periodic record, otherwise None.
 
     Raises
     ------
-    InputError : values that contradict each other.
+    InputError : inconsistent values.
     """
 
     name: str
@@ -82,7 +82,7 @@ class RecordHeader:
                              field=field, value=period_s)
 
     def part(self, start: int, stop: int) -> RecordHeader:
-        """Of samples start .. stop."""
+        """Header of samples start .. stop."""
         return replace(self, samples=stop - start, start_s=self.start_s + start / self.sample_rate_Hz)
 
     @property
@@ -91,19 +91,20 @@ class RecordHeader:
 
     @property
     def period_samples(self) -> int | None:
-        """Samples in a period; None where the record is not periodic."""
+        """Samples per period; None if the record is not periodic."""
         return None if self.period_s is None else round(self.period_s * self.sample_rate_Hz)
 
     @property
     def periods(self) -> int:
-        """Whole periods; 0 where the record is not periodic."""
+        """Number of whole periods; 0 if the record is not periodic."""
         return self.samples // self.period_samples if self.period_samples else 0
 
 
 def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
-    """(start, stop) of consecutive pieces, each sample once.
+    """(start, stop) of consecutive pieces that together cover every sample once.
 
-    longest : 2 or more; the last piece takes one more where a single sample, which is no record, would be left.
+    longest : maximum length, 2 or more. The last piece has one sample more if a single sample, which is not a valid
+        record, would otherwise remain.
     """
     if longest < 2:
         raise InputError("expected pieces of at least two samples", field="longest", value=longest)
@@ -113,7 +114,7 @@ def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
 
 
 def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: int = 0) -> None:
-    """Refuse NaN and Inf in (samples, channels), saying where: sample number counted from the start of the record."""
+    """Raise InputError for NaN or Inf in (samples, channels), with the sample number from the start of the record."""
     good = np.isfinite(array)
     if not good.all():
         row, column = np.argwhere(~good)[0]
@@ -122,23 +123,24 @@ def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: i
 
 
 class RecordSource(ABC):
-    """A record, wherever it lies."""
+    """A record, in memory or on disk."""
 
     header: RecordHeader
 
     @abstractmethod
     def load(self, start: int = 0, stop: int | None = None) -> Record:
-        """Samples start .. stop (end of the record by default) in memory.
+        """Load samples start .. stop (to the end of the record by default) into memory.
 
         Raises
         ------
-        InputError : samples that are not finite numbers, a file that ends early.
+        InputError : samples that are not finite numbers, a truncated file.
         """
 
     def pieces(self, longest: int) -> Iterator[Record]:
-        """The record in consecutive pieces; periodic ones are cut between periods.
+        """The record in consecutive pieces; periodic records are cut between periods.
 
-        longest : samples of a piece; the last one takes one more where a single sample would be left.
+        longest : maximum number of samples of a piece. The last piece has one sample more if a single sample would
+            otherwise remain.
         """
         step = longest
         if period := self.header.period_samples:
@@ -189,7 +191,7 @@ class Record(RecordSource):
 
 
 class Portion(RecordSource):
-    """Samples start .. stop of another record, still where they lie."""
+    """Samples start .. stop of another record, loaded on demand."""
 
     def __init__(self, whole: RecordSource, start: int, stop: int):
         self.whole, self.start, self.stop = whole, start, stop
@@ -204,12 +206,12 @@ class Portion(RecordSource):
 class Campaign:
     """Records of one rig.
 
-    rig : name of the rig; records : in order; source : file that they came from; notes : what the reader had to
-    assume or repair, one sentence each.
+    rig : name of the rig; records : in order; source : file from which they were read; notes : assumptions and repairs
+    of the reader, one sentence each.
 
     Raises
     ------
-    InputError : no record, records of different channels, units or sample rates.
+    InputError : no record; records that differ in channels, units or sample rate.
     """
 
     rig: str
@@ -245,19 +247,19 @@ class Campaign:
         return self.records[0].header.y_unit
 
     def named(self, name: str) -> RecordSource:
-        """The record of that name."""
+        """The record with this name."""
         for record in self.records:
             if record.header.name == name:
                 return record
         raise InputError(f"expected one of {[r.header.name for r in self.records]}", field="record", value=name)
 
     def only(self, names: tuple[str, ...]) -> Campaign:
-        """Some of the records."""
+        """Campaign with only the named records."""
         return replace(self, records=tuple(self.named(name) for name in names))
 
 
 def in_short(notes: tuple[str, ...]) -> tuple[str, ...]:
-    """Notes of a campaign, those that say the same of several records as one line."""
+    """Notes of a campaign, with equal notes on several records merged into one line."""
     of: dict[str, list[str]] = {}
     for note in notes:
         head, colon, text = note.partition(": ")
@@ -268,9 +270,10 @@ def in_short(notes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def digest(campaign: Campaign, longest: int = 1 << 20) -> str:
-    """SHA-256 of all headers and samples, for provenance: independent of the file format they came in.
+    """SHA-256 of all headers and samples, for provenance; independent of the file format.
 
-    longest : samples that are loaded at once; more than that many are hashed piece by piece, so that it enters.
+    longest : maximum number of samples loaded at once. Longer records are hashed piece by piece, so their digest
+        depends on this value.
     """
     total = hashlib.sha256(campaign.rig.encode())
     for record in campaign.records:

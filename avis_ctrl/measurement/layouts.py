@@ -1,4 +1,4 @@
-"""Which files are read, in words for `--help`: this module imports nothing, so that help answers at once."""
+"""Supported file formats, as text for `--help`. This module imports nothing, so that help appears at once."""
 
 FORMATS = """\
 Measurement files, recognised by their content:

@@ -1,9 +1,9 @@
-"""Plots in matplotlib: each function takes a system or a result and, if wanted, axes, and returns the axes.
+"""Plots in matplotlib. Each function takes a system or a result and optional axes, and returns the axes.
 
 bode, sigma : responses of any system (ours, python-control's StateSpace, TransferFunction or FRD).
 mu : both bounds over frequency, with the certified peak.
-transmissibility : floor to payload of the controllers of a design, with their certified worst cases.
-dk_history, order : the course of a mu synthesis; mu by the controller's order.
+transmissibility : floor to payload, for the controllers of a design, with their certified worst cases.
+dk_history, order : progress of a mu synthesis; mu against controller order.
 vc_curves : generic vibration criteria, with third-octave spectra.
 
 Examples

@@ -1,4 +1,4 @@
-"""Axes in, axes out: what the plots share."""
+"""Helpers shared by the plots."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ HERTZ = 2 * np.pi
 
 
 def axes_of(given: Any, rows: int = 1) -> Any:
-    """The axes given, or those of a new figure: one, or an array of `rows` under each other that share x.
+    """The given axes, or those of a new figure: a single one, or an array of `rows` stacked axes with a common x axis.
 
-    Raises InputError where another number of axes is given.
+    Raises InputError if `rows` is larger than 1 and another number of axes is given.
     """
     if given is None:
         from matplotlib import pyplot as plt
@@ -27,7 +27,7 @@ def axes_of(given: Any, rows: int = 1) -> Any:
 
 
 def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> Any:
-    """Labels, a light grid, and a legend, inside or above, where something has a name."""
+    """Add labels, a light grid and, if any curve has a label, a legend inside or above the axes."""
     if log:
         ax.set_xscale("log")
     if x:
@@ -42,7 +42,7 @@ def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> An
 
 
 def log_if_wide(ax: Any, values: np.ndarray) -> None:
-    """A logarithmic y axis, with plain numbers at 1, 2 and 5 of each decade, where values span more than a decade."""
+    """Make the y axis logarithmic, with labels at 1, 2 and 5 of each decade, if the values span more than a decade."""
     if values.max() <= 10 * values.min():
         return
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
@@ -54,7 +54,7 @@ def log_if_wide(ax: Any, values: np.ndarray) -> None:
 
 
 def whole_numbers(ax: Any) -> None:
-    """Ticks of the x axis at whole numbers only."""
+    """Integer ticks on the x axis."""
     from matplotlib.ticker import MaxNLocator
 
     ax.set_xscale("linear")

@@ -1,4 +1,4 @@
-"""Two figures of many points, less of both is better: the front of those that no other point beats."""
+"""Pareto front of points with two figures, both to be minimised."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ POINT, FRONT = "#56b4e9", "#0072b2"
 
 
 def pareto_front(values: np.ndarray) -> np.ndarray:
-    """Indices of the points (n, 2) that no other is at most equal to in both and below in one, in order of the first.
+    """Indices of the non-dominated points of (n, 2), sorted by the first figure.
 
-    Equal points are all in the front; those with a nan are not.
+    Equal points are all part of the front; points with a nan are not.
     """
     known = np.flatnonzero(np.all(np.isfinite(values), axis=1))
     order = known[np.lexsort(values[known].T[::-1])]
@@ -30,7 +30,7 @@ def pareto_front(values: np.ndarray) -> np.ndarray:
 
 def pareto(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (), ax: Any = None, title: str = ""
            ) -> Any:
-    """The points (n, 2), the front as a line, its points with their names.
+    """Plot the points (n, 2), the front as a line, and the names of the points on the front.
 
     labels : of both axes, with units. names : (n,) of the points. Returns the axes.
     """
@@ -44,7 +44,7 @@ def pareto(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (),
     ax.margins(0.08)
     middle = (np.nanmin(values[:, 0]) + np.nanmax(values[:, 0])) / 2 if front.size else np.nan
     for k in front if len(names) else ():
-        # Below and left of a point of the front there is none; the first ones have no room there.
+        # There are no points below and to the left of the front; near the left edge there is no room for a label.
         late = values[k, 0] > middle
         ax.annotate(names[k], values[k], textcoords="offset points", fontsize="x-small", color=FRONT,
                     **({"xytext": (-6, -4), "ha": "right", "va": "top"} if late else {"xytext": (6, 5)}))

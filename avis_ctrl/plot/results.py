@@ -1,4 +1,4 @@
-"""Plots of results: bounds of mu, transmissibility, the course of a synthesis, vibration criteria."""
+"""Plots of results: bounds of mu, transmissibility, progress of a synthesis, vibration criteria."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.plot.axes import HERTZ, axes_of, finish, log_if_wide, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
-# Colours of Okabe and Ito; controllers look as in the report.
+# Palette of Okabe and Ito; controllers have the same colours as in the report.
 COLOURS = {"passive": "#7a7a7a", "skyhook_classical": "#56b4e9", "skyhook": "#e69f00", "loops": "#d55e00",
            "hinf": "#009e73", "mu": "#0072b2"}
 LIMIT, LOWER = "#b3261e", "#e69f00"
@@ -22,7 +22,8 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     """Upper and lower bound of mu over frequency [Hz], with the bound of the peak and whether it is proved.
 
     peak : `MuPeak` (of `mu_peak` or `worst_case_gain`), a result of `robust_stability` or `robust_performance`, or a
-    design's `Bound`. Returns the axes. Raises InputError for a result without these curves, such as a `MuSynthesis`.
+        design's `Bound`. Returns the axes. Raises InputError for a result without these curves, such as a
+        `MuSynthesis`.
     """
     peak = getattr(peak, "mu", peak)
     if not hasattr(peak, "upper_curve"):
@@ -46,16 +47,17 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
 
 
 def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] | None = None) -> Any:
-    """Largest singular value floor to payload [dB] over frequency [Hz], nominal, with the range of sampled plants.
+    """Largest singular value from floor to payload [dB] over frequency [Hz]: nominal, and the range of sampled plants.
 
     Parameters
     ----------
     result : a design's result (of `avis_ctrl.design` or `run_design`).
-    controllers : names of those drawn; by default all. The certified worst-case peak of the last one is a dashed line.
+    controllers : names of the controllers to draw; all by default. The range of sampled plants and the certified
+        worst-case peak (dashed line) are drawn for the last controller.
 
     Raises
     ------
-    InputError : a controller that the result does not have.
+    InputError : a controller that is not in the result.
     """
     ax = axes_of(ax)
     result = getattr(result, "result", result)
@@ -93,7 +95,7 @@ def dk_history(history: Any, ax: Any = None) -> Any:
 
 
 def order(history: Any, ax: Any = None) -> Any:
-    """Peak mu of each controller over its number of states; `history` as for `dk_history`, or pairs (order, mu)."""
+    """Peak mu of each controller against its number of states; `history` as for `dk_history`, or pairs (order, mu)."""
     ax = axes_of(ax)
     rows = history if isinstance(history, (list, tuple)) and history and isinstance(history[0], tuple) else [
         (row.order, row.mu_upper) for row in _rows(history)]
@@ -130,7 +132,7 @@ def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
 
 
 def _rows(history: Any) -> list[Any]:
-    """Rows of the D-K history, those with finite numbers."""
+    """Rows of the D-K history with finite gamma and mu."""
     for name in ("result", "dk_history", "history"):
         history = getattr(history, name, history)
     rows = [row for row in history if np.isfinite(row.gamma) and np.isfinite(row.mu_upper)]

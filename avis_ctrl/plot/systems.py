@@ -1,4 +1,4 @@
-"""Responses of any linear system over frequency."""
+"""Frequency responses of linear systems."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.plot.axes import HERTZ, axes_of, finish
 from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
-# Random systems drawn of an uncertain one, and how.
+# Number of random samples drawn for an uncertain system, and their line style.
 SAMPLES, FAINT = 20, {"color": "#0072b2", "alpha": 0.3, "linewidth": 0.8}
 
 
 def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequency_Hz: np.ndarray | None = None,
          label: str | None = None, **line: Any) -> Any:
-    """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input and output.
+    """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input-output pair.
 
     Returns the two axes.
 
     Parameters
     ----------
-    system : StateSpace, or python-control's StateSpace, TransferFunction or FRD; of an UncertainSystem the nominal one
-        and 20 random ones.
-    omega, frequency_Hz : (n,) frequencies [rad/s], or in hertz; by default around the poles, or those of the FRD.
+    system : StateSpace, or python-control's StateSpace, TransferFunction or FRD; for an UncertainSystem the nominal
+        system and 20 random samples are drawn.
+    omega, frequency_Hz : (n,) frequencies [rad/s] or [Hz]; by default a range around the poles, or the frequencies of
+        the FRD.
     ax : two axes, magnitude and phase; by default those of a new figure.
-    label : of the curves in the legend; by default "output / input" where there are several.
+    label : label of the curves in the legend; by default "output / input" if there are several.
     line : options of matplotlib's `plot`.
 
     Raises
     ------
-    InputError : something that is no system; both omega and frequency_Hz.
+    InputError : an object that is not a system; both omega and frequency_Hz given.
     """
     top, bottom = axes = axes_of(ax, 2)
     if isinstance(system, UncertainSystem):
@@ -57,7 +58,7 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, freque
 
 def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequency_Hz: np.ndarray | None = None,
           label: str | None = None, **line: Any) -> Any:
-    """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, one pair of axes."""
+    """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, but a single axes object."""
     ax = axes_of(ax)
     if isinstance(system, UncertainSystem):
         return _family(sigma, system, _rad_s(omega, frequency_Hz), ax, label, line)
@@ -71,7 +72,7 @@ def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequ
 
 
 def _rad_s(omega: Any, frequency_Hz: Any, system: Any = None) -> Any:
-    """(n,) frequencies [rad/s]; those that show the system where none are given (None without a system)."""
+    """(n,) frequencies [rad/s]; if none are given, a range that suits the system (None without a system)."""
     if omega is not None and frequency_Hz is not None:
         raise InputError("expected omega or frequency_Hz", field="omega, frequency_Hz")
     if frequency_Hz is not None:

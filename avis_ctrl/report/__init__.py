@@ -1,7 +1,7 @@
-"""Reports of a design, of an identification and of a gap: a document each, and two renderers.
+"""Reports of a design, an identification and a gap (model against measurement), as HTML and as PDF.
 
-`content.document`, `identification.content.document`, `gap.content.document` and `gap.axis.document` say what a report
-holds.
+The contents are assembled by `content.document`, `identification.content.document`, `gap.content.document` and
+`gap.axis.document`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from avis_ctrl.report.pieces import Document
 
 
 def rendered(document: Document) -> tuple[bytes, bytes]:
-    """A document as one self-contained HTML file, and as PDF.
+    """Render a document as one self-contained HTML file and as PDF.
 
     Raises
     ------
-    ComputationError : the typesetter refuses.
+    ComputationError : the PDF cannot be typeset.
     """
     return html.render(document), pdf.render(document)

@@ -1,8 +1,8 @@
-"""The connection of a generalized plant, drawn from its parts and signals.
+"""Block diagram of a generalized plant, drawn from its parts and signals.
 
-The loop runs down the middle: controller, then the longest way from its command to its measurement. What the loop
-feeds stands to the right of it, what feeds the loop to the left, the unknown Delta beside what it perturbs. Parts
-that differ by axis or channel only are one box, with their number.
+The loop runs down the middle: the controller, then the longest path from its command to its measurement. Parts driven
+by the loop are placed to the right of it, parts that drive the loop to the left, and the uncertainty Delta next to the
+part that it perturbs. Parts that differ only by axis or channel are drawn as one box with their number.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ RIG_HEIGHT = 96.0
 DISTURBANCE, JUDGED = "#8a1c12", "#00548a"
 FILLS = {"rig": "#dbe8f6", "actuator": "#fdebc8", "sensor": "#d5f0e5", "weight": "#f6dfec", "allocation": "#eeeeee",
          "sum": "#ffffff", "controller": "#ffffff", "delta": "#fbd9d3"}
-Node = tuple[float, float, float]  # centre and width
+Node = tuple[float, float, float]  # centre (x, y) and width
 
 
 class BlockDiagram:
-    """Places boxes, then draws the signals between them."""
+    """Boxes and the signals between them; `chain` is the loop down the middle, from the controller K."""
 
     def __init__(self, plant: DesignPlant) -> None:
         self.families = Families(plant)
@@ -36,7 +36,7 @@ class BlockDiagram:
         self.canvas = Canvas(WIDTH, rows + 70)
 
     def svg(self) -> str:
-        """The drawing."""
+        """The diagram as SVG."""
         self._loop()
         drawn: set[tuple[str, str]] = set()
         for s in self.signals:
@@ -51,7 +51,7 @@ class BlockDiagram:
         return self.canvas.svg()
 
     def _longest_way(self) -> list[str]:
-        """From the reader of u to the source of y through as many parts as possible."""
+        """Longest path of parts from one that reads u to one that drives y."""
         after: dict[str, list[str]] = {}
         for s in self.signals:
             after.setdefault(s.source, []).extend(s.readers)
@@ -74,7 +74,7 @@ class BlockDiagram:
                 self._beside(name, taken)
 
     def _beside(self, name: str, taken: set[tuple[float, int]]) -> None:
-        """A part that a placed one feeds stands at its right, one row below; one that feeds it at its left."""
+        """Place a part: to the right, one row below its source in the chain, or else to the left of its reader."""
         feeding = ["K" if s.role == "u" else s.source for s in self.signals if name in s.readers]
         reading = [r for s in self.signals if s.source == name for r in s.readers]
         before = [self.rows[n] for n in feeding if n in self.nodes and n in self.chain]
@@ -93,7 +93,7 @@ class BlockDiagram:
         self.nodes[name] = (x, self._level(row), SMALL)
 
     def _level(self, row: int) -> float:
-        """Height of a row's middle; the rig's box is taller than the others."""
+        """Vertical centre of a row; the rig's box is taller than the others."""
         tall = [k for k, name in enumerate(self.chain) if self._height(name) > BOX_HEIGHT]
         rig = tall[0] if tall else len(self.chain)
         taller = (RIG_HEIGHT - BOX_HEIGHT) / 2
@@ -106,7 +106,7 @@ class BlockDiagram:
         return (source, reader) in zip(self.chain, self.chain[1:], strict=False)
 
     def _loop(self) -> None:
-        """The way down the middle, and the measurement back up to the controller."""
+        """The chain down the middle, and the measurement fed back to the controller at the top."""
         for upper, lower in zip(self.chain, self.chain[1:], strict=False):
             (x, y, _), (_, y2, _) = self.nodes[upper], self.nodes[lower]
             between = [s for s in self.signals if lower in s.readers and
@@ -139,13 +139,13 @@ class BlockDiagram:
             self.canvas.text(((x + width / 2 + x2 - width2 / 2) / 2, y - 7), s.name, 11)
 
     def _branch(self, begin: Point, end: Point) -> None:
-        """Off the way down, to the top of a box at the right."""
+        """Branch from the chain to the top of a box on the right."""
         level = begin[1] + 12
         self.canvas.circle((begin[0], level), 2.6, "#333333")
         self.canvas.line([(begin[0], level), (end[0], level), (end[0], end[1] - BOX_HEIGHT / 2)], arrow=True)
 
     def _external(self) -> None:
-        """Disturbances from the left, judged outputs to the right."""
+        """Disturbances entering from the left, performance outputs leaving to the right."""
         used: dict[tuple[str, str], int] = {}
         for s in self.signals:
             if s.role not in ("w", "z"):
@@ -164,7 +164,7 @@ class BlockDiagram:
                 self.canvas.text((x + width / 2 + 29, level + 4), self._label(s), 11, JUDGED, "start")
 
     def _delta(self) -> None:
-        """Delta from z to w: beside the rig at its left, between a weight and its chain at the right."""
+        """Delta from z to w: to the left of the rig, or on the right between a weight and its channel."""
         w = [s for s in self.signals if s.role == "w_delta"]
         z = {s.name[2:]: s for s in self.signals if s.role == "z_delta"}
         for s in w:
@@ -213,5 +213,5 @@ class BlockDiagram:
 
 
 def block_diagram(plant: DesignPlant) -> str:
-    """The connection of a design's plant as SVG."""
+    """Block diagram of a design's plant as SVG."""
     return BlockDiagram(plant).svg()

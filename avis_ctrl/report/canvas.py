@@ -1,4 +1,4 @@
-"""A small SVG canvas for drawings that are not graphs; all text is escaped, all numbers rounded."""
+"""A small SVG canvas for drawings other than plots; text is escaped, coordinates are rounded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FONT = "DejaVu Sans, Verdana, sans-serif"
 
 
 class Canvas:
-    """Collects shapes in a box of width x height; y points down."""
+    """SVG canvas of the given width and height; y points down."""
 
     def __init__(self, width: float, height: float) -> None:
         self.width, self.height = width, height
@@ -20,7 +20,7 @@ class Canvas:
 
     def line(self, points: Sequence[Point], colour: str = "#333333", width: float = 1.2, dash: str = "",
              arrow: bool = False) -> None:
-        """An open polygon, with an arrow head at its end if asked."""
+        """A polyline, optionally with an arrowhead at its end."""
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
         style = f' stroke-dasharray="{dash}"' if dash else ""
         self._shapes.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="{width}"{style}/>')
@@ -41,7 +41,7 @@ class Canvas:
 
     def rectangle(self, centre: Point, width: float, height: float, fill: str = "#ffffff", stroke: str = "#333333",
                   line: float = 1.2, corner: float = 0.0, dash: str = "") -> None:
-        """A rectangle about its centre."""
+        """A rectangle given by its centre."""
         style = f' stroke-dasharray="{dash}"' if dash else ""
         self._shapes.append(f'<rect x="{centre[0] - width / 2:.1f}" y="{centre[1] - height / 2:.1f}" '
                             f'width="{width:.1f}" height="{height:.1f}" rx="{corner}" fill="{fill}" '
@@ -61,6 +61,6 @@ class Canvas:
                             f'text-anchor="{anchor}"{weight}>{escape(text)}</text>')
 
     def svg(self) -> str:
-        """The drawing."""
+        """The drawing as SVG."""
         return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
                 f'width="{self.width:g}" height="{self.height:g}" font-family="{FONT}">{"".join(self._shapes)}</svg>')

@@ -1,4 +1,4 @@
-"""What the report says, once for all renderers."""
+"""Contents of the design report, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SECTIONS = (verdict, comparison, transmissibility, rig, generalized_plant, bound
 
 
 def document(result: DesignResult) -> Document:
-    """The report of a study."""
+    """The report of a design."""
     kept = joined([axis(name) for name in result.plant.axes])
     return document_of(result.design.title, f"Design report: {kept} of the rig {result.rig.name}", result.provenance,
                        (make(result) for make in SECTIONS))

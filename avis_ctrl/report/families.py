@@ -1,4 +1,4 @@
-"""Signals and parts that differ only by axis, channel or parameter, taken together for the eye."""
+"""Families of signals or parts that differ only by axis, channel or parameter, shown as one in diagram and table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ EXTERNAL = "external input"
 
 @dataclass(frozen=True)
 class PartFamily:
-    """Parts of one kind; `count` of them."""
+    """`count` parts of one kind whose names differ only by axis or channel."""
 
     name: str
     kind: str
@@ -22,7 +22,7 @@ class PartFamily:
 
 @dataclass(frozen=True)
 class SignalFamily:
-    """Signals of one role between the same families of parts."""
+    """Signals of one role whose names differ only by axis, channel or parameter."""
 
     name: str
     members: tuple[str, ...]
@@ -34,7 +34,7 @@ class SignalFamily:
 
 
 class Families:
-    """Names of a plant's axes, channels and parameters are replaced by a star."""
+    """Families of a plant: a star replaces axes and channels; the signals of all parameters form one family."""
 
     def __init__(self, plant: DesignPlant) -> None:
         self._stars = sorted([*plant.axes, *plant.actuators, *plant.sensors], key=len, reverse=True)
@@ -44,7 +44,7 @@ class Families:
         self.signals = self._signal_families(plant.full.signals)
 
     def of(self, name: str) -> str:
-        """The family of a signal or part."""
+        """Family name of a signal or part."""
         if name in self._parameters:
             return f"{name[:2]}parameters"
         for star in self._stars:

@@ -1,4 +1,4 @@
-"""Figures described as data, so that every backend draws the same curves with the same words."""
+"""Figures described as data, so that all backends draw the same curves with the same labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Scale = Literal["linear", "log"]
 
 @dataclass(frozen=True)
 class Style:
-    """How a thing looks wherever it appears; colours of Okabe and Ito, told apart by the colour-blind."""
+    """Line style. The colours are those of Okabe and Ito, which colour-blind readers can distinguish."""
 
     colour: str
     dash: Dash = "solid"
@@ -36,7 +36,7 @@ STYLES: dict[str, Style] = {
 
 
 def controller_style(name: str) -> Style:
-    """The look of a controller, the same in every figure."""
+    """Style of a controller, the same in every figure."""
     return STYLES.get(name, STYLES["plain"])
 
 
@@ -45,15 +45,15 @@ DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
 
 
 def numbered(k: int) -> Style:
-    """A style for the k-th of several alike things."""
+    """Style of the k-th of several similar curves."""
     return Style(PALETTE[k % len(PALETTE)], DASHES[k % len(DASHES)], 1.6)
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Label with its unit, scale and range (None: as the data asks).
+    """An axis: label with unit, scale and range (None: from the data).
 
-    ticks : places with words, instead of numbers. silent : grid lines only; a neighbour's numbers serve.
+    ticks : (position, text) in place of numbers. silent : no labels, only grid lines; a neighbouring panel has them.
     """
 
     label: str
@@ -68,10 +68,10 @@ HERTZ = Axis("frequency [Hz]", "log", (0.1, 100.0))
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """x, y (n,); a value that is not finite leaves a gap. Without a label it is not in the legend.
+    """A curve x, y (n,). Values that are not finite leave a gap; a curve with an empty label is not in the legend.
 
-    error : (n,) half lengths of error bars along `along`. bars : width of bars drawn from the axis, 0 for none.
-    hollow : points are rings.
+    error : (n,) half-lengths of the error bars in the direction `along`. bars : width of bars drawn from the axis, 0
+    for none. hollow : open markers.
     """
 
     x: np.ndarray
@@ -99,10 +99,10 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Heat:
-    """A field of coloured cells on a logarithmic colour scale; what is not finite and positive stays grey.
+    """A heat map on a logarithmic colour scale; cells that are not finite and positive are grey.
 
-    x_edges : (n + 1,). z : (rows, n), the rows at y = 0, 1, 2 ... label : of the colour bar. range : of the colours,
-    the same in all panels of a figure. neutral : value that is drawn white, between `low` (blue) and `high` (dark red).
+    x_edges : (n + 1,). z : (rows, n), the rows at y = 0, 1, 2 ... label : of the colour bar. range : (lowest, highest)
+    value of the colours, blue and dark brown, the same in all panels of a figure. neutral : value drawn in white.
     """
 
     x_edges: np.ndarray
@@ -113,13 +113,13 @@ class Heat:
 
     @property
     def logarithm(self) -> np.ndarray:
-        """(rows, n) log10 z; nan where there is none."""
+        """(rows, n) log10 z; nan where z is not finite and positive."""
         known = np.isfinite(self.z) & (self.z > 0)
         return np.where(known, np.log10(np.where(known, self.z, 1.0)), np.nan)
 
     @property
     def colours(self) -> list[tuple[float, str]]:
-        """Place on the logarithmic scale, 0 to 1, and colour."""
+        """Stops of the colour scale: position on the logarithmic scale, 0 to 1, and colour."""
         low, high, middle = (float(np.log10(v)) for v in (*self.range, self.neutral))
         white = (middle - low) / (high - low)
         return [(0.0, "#9ecae1"), (white, "#ffffff"),
@@ -127,12 +127,12 @@ class Heat:
 
     @property
     def decades(self) -> tuple[list[float], list[str]]:
-        """Ticks of the colour bar, in log10 z, with their words."""
+        """Ticks of the colour bar in log10 z, and their labels."""
         places, text = ticks_log(*self.range)
         return [float(np.log10(p)) for p in places], text
 
 
-# Shares of the way from white to the top of a colour scale; lightness falls steadily, so it reads in grey too.
+# Fractions of the way from white to the top of the colour scale. Lightness falls steadily: it also works in grey.
 WARM = ((0.25, "#fed98e"), (0.5, "#fe9929"), (0.75, "#cc4c02"), (1.0, "#662506"))
 NO_DATA = "#d9d9d9"
 
@@ -151,10 +151,10 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels under each other, or row by row in columns; one legend and a caption that says what is seen.
+    """Panels in one or several columns, filled row by row, with one legend and a caption.
 
-    height : of a panel, relative to the usual one. shared : the panels of a row or column have the same scales, and
-    stand close together.
+    height : of a panel, relative to the default. shared : the panels of a row or column have the same scales and are
+    placed close together.
     """
 
     name: str
@@ -165,7 +165,7 @@ class Figure:
     shared: bool = False
 
     def legend(self) -> list[Curve | Band]:
-        """What the legend shows: each label once, in order."""
+        """Entries of the legend: each label once, in order."""
         seen: dict[str, Curve | Band] = {}
         for panel in self.panels:
             things: list[Curve | Band] = [*panel.curves, *panel.bands]
@@ -175,33 +175,33 @@ class Figure:
         return list(seen.values())
 
     def heat(self) -> Heat | None:
-        """The first field, whose colour bar serves all."""
+        """The first heat map, whose colour bar applies to all panels."""
         return next((panel.heat for panel in self.panels if panel.heat is not None), None)
 
 
 def hertz(low: float = 0.1, high: float = 100.0) -> Axis:
-    """The frequency axis over a range."""
+    """Logarithmic frequency axis over a range [Hz]."""
     return Axis(HERTZ.label, "log", (low, high))
 
 
 def places(names: Sequence[str], label: str = "") -> tuple[np.ndarray, Axis]:
-    """A place for each name, (n,), and the axis that names them."""
+    """Positions 0, 1, 2 ... (n,) of names, and the axis labelled with the names."""
     x = np.arange(len(names), dtype=float)
     return x, Axis(label, "linear", (-0.6, len(names) - 0.4), tuple(zip(x.tolist(), names, strict=True)))
 
 
 def steps(edges: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A value (n,) for each band between edges (n + 1,) as a staircase."""
+    """Values (n,) of the bands between edges (n + 1,) as a staircase curve."""
     return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(values, float), 2)
 
 
 def level(low: float, high: float, value: float, label: str, style: Style = STYLES["limit"]) -> Curve:
-    """A horizontal line."""
+    """A horizontal line from x = low to high."""
     return Curve(np.array([low, high]), np.array([value, value]), label, style)
 
 
 def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:
-    """Labelled ticks of a logarithmic axis: decades, and 2 and 5 between them where there are few."""
+    """Ticks and labels of a logarithmic axis: decades, with 2 and 5 if there are few decades."""
     first, last = int(np.floor(np.log10(low) + 1e-9)), int(np.ceil(np.log10(high) - 1e-9))
     steps = (1, 2, 5) if last - first <= 2 else (1,)
     stride = 1 if last - first <= 8 else 2
@@ -211,7 +211,7 @@ def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:
 
 
 def log_range(panel: Panel) -> tuple[float, float]:
-    """Range of the y axis of a logarithmic panel, from the data where none is given."""
+    """Range of the y axis of a logarithmic panel, from the data if none is given."""
     if panel.y.range is not None:
         return panel.y.range
     values = [np.asarray(v, float) for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands),

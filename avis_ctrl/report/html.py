@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs nothing else: styles, figures and plotly.js are inside."""
+"""The report as one self-contained HTML file: styles, figures and plotly.js are embedded."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.pieces import Document, Formula
 from avis_ctrl.report.words import typeset
 
-# A formula, set by Typst as a drawing of its own.
+# Typst settings for a page that fits one formula.
 PAGE = "#set page(width: auto, height: auto, margin: 2pt, fill: none)\n#set text(size: 11pt)\n"
 
 
 def render(document: Document) -> bytes:
-    """The document as HTML; everything that is text is escaped by the template engine."""
+    """The document as HTML; the template engine escapes all text."""
     files = resources.files("avis_ctrl.report")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True,
                                      undefined=jinja2.StrictUndefined,
@@ -39,13 +39,13 @@ def render(document: Document) -> bytes:
 
 
 def in_script(value: object) -> str:
-    """JSON that no text inside can end the script element of."""
+    """JSON in which no text can close the enclosing script element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def formula_images(formulas: Sequence[Formula]) -> list[str]:
-    """Each formula as SVG, one page each of one compilation."""
+    """Each formula as SVG, all compiled together with one formula per page."""
     if not formulas:
         return []
     pages = "\n#pagebreak()\n".join(f"$ {one.typst} $" for one in formulas)
@@ -55,6 +55,6 @@ def formula_images(formulas: Sequence[Formula]) -> list[str]:
 
 
 def _own_names(svg: str, number: int) -> str:
-    """Glyph names made different between the drawings of one page; the outer namespace declarations are needless."""
+    """SVG with glyph names that are unique within the HTML page, without the namespace declarations."""
     svg = re.sub(r'\b(id="|href="#)g', rf"\g<1>f{number}g", svg)
     return re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")

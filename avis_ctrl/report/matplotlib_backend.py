@@ -19,12 +19,12 @@ from avis_ctrl.report.figures import NO_DATA, Axis, Band, Curve, Figure, Heat, P
 WIDTH_IN, LEFT_IN, RIGHT_IN, PLOT_IN = 6.7, 0.66, 0.14, 1.75
 TITLE_IN, FOOT_IN, LEGEND_IN = 0.2, 0.42, 0.18
 CHARACTER_IN, KEY_IN = 0.068, 0.5
-# A colour bar under the panels: with its numbers and label, and of itself.
+# Height of a colour bar under the panels: with its labels, and of the bar alone.
 BAR_IN, BAR_HEIGHT_IN = 0.5, 0.09
-# Mean width of a letter over its height.
+# Mean width of a letter relative to the font size.
 LETTER = 0.54
 LINES = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": (0, (5, 1.5, 1, 1.5))}
-# Same input, same bytes: element names follow from the salt, and no date is written.
+# Reproducible output: element ids derive from the salt, and no date is written.
 SETTINGS: Any = {"svg.fonttype": "none", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
                  "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
                  "axes.unicode_minus": True, "axes.formatter.useoffset": False, "path.simplify": True}
@@ -34,14 +34,14 @@ def svg(figure: Figure) -> str:
     """The figure as SVG."""
     with matplotlib.rc_context(SETTINGS):
         entries = figure.legend()
-        # As many columns as the longest label leaves room for.
+        # As many legend columns as the longest label allows.
         longest = max((len(e.label) for e in entries), default=0)
         keys = max(1, min(len(entries), int(WIDTH_IN / (KEY_IN + CHARACTER_IN * longest))))
         heat = figure.heat()
         legend = LEGEND_IN * -(-len(entries) // keys) if len(entries) > 1 else BAR_IN if heat else 0
         places, height = _places(figure, legend)
         canvas = Canvas(figsize=(WIDTH_IN, height))
-        # Fixed places: a layout engine would take most of the time of the whole report.
+        # Fixed positions: a layout engine would take most of the computing time of the whole report.
         for panel, place in zip(figure.panels, places, strict=True):
             _draw(canvas.add_axes(place), panel, figure, place[2] * WIDTH_IN)
         if heat:
@@ -56,15 +56,15 @@ def svg(figure: Figure) -> str:
 
 
 def _places(figure: Figure, legend: float) -> tuple[list[tuple[float, float, float, float]], float]:
-    """Left, bottom, width and height of each panel as shares of the canvas, and the canvas' height [in]."""
+    """Left, bottom, width and height of each panel as fractions of the canvas, and the canvas height [in]."""
     columns = figure.columns
     rows, plot = -(-len(figure.panels) // columns), PLOT_IN * figure.height
     words = max((len(word) for panel in figure.panels for _, word in panel.y.ticks), default=0)
     left = max(LEFT_IN, 0.12 + CHARACTER_IN * words + (0.16 if any(p.y.label for p in figure.panels) else 0.0))
     title, foot = (0.18, 0.04) if figure.shared else (TITLE_IN, FOOT_IN)
-    # Names of places may stand in several rows, with the axis' label under them.
+    # Tick labels may have several rows, with the axis label below them.
     foot += LEGEND_IN * max((word.count("\n") for panel in figure.panels for _, word in panel.x.ticks), default=0)
-    # Panels that share their scales need room for numbers at the edges only.
+    # Panels with shared scales have tick labels at the outer edges only.
     beside = 0.05 if figure.shared else left + RIGHT_IN
     width = (WIDTH_IN - left - RIGHT_IN - beside * (columns - 1)) / columns
     below = FOOT_IN if figure.shared else 0.0
@@ -143,7 +143,7 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
 
 
 def _fitting(text: str, room: float, most: float) -> float:
-    """Points of a text's letters in so many inches."""
+    """Font size [pt] at which a text fits into `room` inches, between 5.5 and `most`."""
     return max(5.5, min(most, 72 * room / (LETTER * max(len(text), 1))))
 
 

@@ -1,4 +1,4 @@
-"""The report as PDF, compiled by Typst from a fixed template; all content reaches it as data, never as markup."""
+"""The report as PDF, compiled by Typst from a fixed template; the content is passed as data, never as markup."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from avis_ctrl.report.pieces import (
 from avis_ctrl.report.words import typeset
 from avis_ctrl.study.workers import each
 
-# Of the text: a drawing leaves room for what it explains on the same page.
+# Relative to the text width: a drawing leaves room on its page for the text that it illustrates.
 DRAWING_WIDTH = 0.72
 
 
@@ -39,7 +39,7 @@ def render(document: Document) -> bytes:
 
     Raises
     ------
-    ComputationError : the typesetter refuses, with what it says.
+    ComputationError : the typesetter fails; its message is the cause.
     """
     figures = [one for one in document.figures() if isinstance(one, Figure)]
     drawn = dict(zip(map(id, figures), each(matplotlib_backend.svg, figures), strict=True))
@@ -47,7 +47,7 @@ def render(document: Document) -> bytes:
         {"title": s.title, "alone": s.alone, "pieces": [_piece(p, drawn) for p in s.pieces]}
         for s in document.sections]}
     template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
-    # The drawings' sans-serif text is set in the font that matplotlib brings, the same on every machine.
+    # Sans-serif text of the drawings uses the font bundled with matplotlib, the same on every machine.
     folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
     fonts = typst.Fonts(include_system_fonts=False, include_embedded_fonts=True, font_paths=[str(folder)])
     try:
@@ -56,12 +56,12 @@ def render(document: Document) -> bytes:
     except typst.TypstError as error:
         raise ComputationError("the PDF report was not typeset", cause=str(error),
                                next_step="the HTML report has the same content") from error
-    assert isinstance(made, bytes)  # one PDF, whatever its number of pages
+    assert isinstance(made, bytes)  # one PDF for any number of pages
     return made
 
 
 def _piece(piece: Piece, drawn: Mapping[int, str]) -> dict[str, Any]:
-    """drawn : SVG of each figure by its id."""
+    """A piece as plain data for the template. drawn : SVG of each figure by its id."""
     match piece:
         case Heading(text):
             return {"kind": "heading", "text": typeset(text)}

@@ -1,6 +1,6 @@
-"""The report as a list of typed pieces, written once and drawn by each renderer.
+"""Typed pieces of a report, independent of the renderer.
 
-Every text is plain: a renderer escapes it. Only `Formula.typst` is markup, and it comes from this package alone.
+All texts are plain; the renderer escapes them. Only `Formula.typst` is markup, and it comes from this package alone.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from avis_ctrl.report.figures import Figure
 
 @dataclass(frozen=True)
 class Mark:
-    """A table cell with a verdict: coloured, and in words for whoever sees no colour."""
+    """A table cell with a verdict, shown by colour and in words for readers who cannot see the colour."""
 
     text: str
     good: bool
@@ -32,7 +32,7 @@ class Heading:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """Text. "verdict" stands out, coloured by `good`, or as a warning by `half`; "note" stands back."""
+    """A paragraph. "verdict" is highlighted, coloured by `good` or as a warning by `half`; "note" is small print."""
 
     text: str
     kind: Literal["text", "verdict", "note"] = "text"
@@ -42,7 +42,7 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Bullets:
-    """Short lines under each other."""
+    """A bulleted list."""
 
     items: tuple[str, ...]
 
@@ -52,7 +52,7 @@ class Formula:
     """A displayed formula.
 
     typst : in Typst's mathematical notation.
-    words : how it is read aloud.
+    words : spoken form, for screen readers.
     """
 
     typst: str
@@ -63,7 +63,7 @@ class Formula:
 class Table:
     """A table.
 
-    align : one letter a column, l, c or r.
+    align : one letter per column: l, c or r. Missing letters are l for the first column and r for the others.
     """
 
     caption: str
@@ -72,13 +72,13 @@ class Table:
     align: str = ""
 
     def alignment(self, column: int) -> str:
-        """l, c or r."""
+        """Alignment of a column: l, c or r."""
         return self.align[column] if column < len(self.align) else ("l" if column == 0 else "r")
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A drawing that is not a graph, as SVG with escaped text."""
+    """A drawing other than a plot, as SVG with escaped text. alternative : description for screen readers."""
 
     name: str
     caption: str
@@ -88,7 +88,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Fold:
-    """Pieces that are there to be looked up: closed at first on a screen, in small print on paper."""
+    """Reference material: collapsed at first on a screen, in small print on paper."""
 
     title: str
     pieces: tuple[Piece, ...]
@@ -99,7 +99,7 @@ Piece = Heading | Paragraph | Bullets | Formula | Table | Figure | Drawing | Fol
 
 @dataclass(frozen=True)
 class Section:
-    """A numbered section. alone : on a page of its own, to be read without the rest."""
+    """A numbered section. alone : on a page of its own, so that it can be read by itself."""
 
     title: str
     anchor: str
@@ -107,7 +107,7 @@ class Section:
     alone: bool = False
 
     def flat(self) -> list[Piece]:
-        """All pieces in order, those inside folds in their place."""
+        """All pieces in order; those of a fold follow it."""
         return [q for p in self.pieces for q in ((p, *p.pieces) if isinstance(p, Fold) else (p,))]
 
 
@@ -130,5 +130,5 @@ class Document:
 
 
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]], align: str = "") -> Table:
-    """A table from any sequences."""
+    """A `Table` from any sequences."""
     return Table(caption, tuple(header), tuple(tuple(row) for row in rows), align)

@@ -1,4 +1,4 @@
-"""Figures as interactive graphs for the HTML report: plain JSON for plotly.js, no Python objects of plotly."""
+"""Interactive figures of the HTML report as plain JSON for plotly.js, without Python objects of plotly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PANEL_PX, LEGEND_ROW_PX = 300, 22
 
 
 def graph(figure: Figure) -> dict[str, Any]:
-    """Traces and layout of a figure, as plotly.js takes them; `narrow` is the layout for a narrow screen."""
+    """Traces and layout of a figure for plotly.js; `narrow` is the layout for a narrow screen."""
     traces: list[dict[str, Any]] = []
     shown: set[str] = set()
     for k, panel in enumerate(figure.panels):
@@ -41,7 +41,7 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
         "annotations": [], "showlegend": len(figure.legend()) > 1}
     if (heat := figure.heat()) is not None:
         layout["coloraxis"] = _colour_bar(heat)
-    # As many pixels as title and numbers need, however low the panels are.
+    # Room for title and tick labels: the same number of pixels whatever the height of the panels.
     gap = (0.14 if figure.shared else 0.26 / figure.height) / rows if rows > 1 else 0.0
     between = 0.0 if columns == 1 else 0.012 if figure.shared else 0.11
     width = (1.0 - between * (columns - 1)) / columns
@@ -66,13 +66,13 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
 
 @cache
 def library() -> str:
-    """plotly.js of the installed plotly package, gzip in base64: a third of its size, unpacked by the browser."""
+    """plotly.js of the installed plotly package, gzipped and base64-encoded to a third of its size."""
     code = (resources.files("plotly") / "package_data" / "plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(code, 9, mtime=0)).decode()
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
-    """Six digits are more than a screen shows; what is not finite is a gap."""
+    """Values to six digits, more than a screen resolves; None, a gap, for values that are not finite."""
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, float)]
 
 
@@ -84,7 +84,7 @@ def _curve(curve: Curve) -> dict[str, Any]:
 
 
 def _more(curve: Curve) -> dict[str, Any]:
-    """Error bars, and bars in the place of a line."""
+    """Hollow markers, error bars, and bars in place of a line."""
     more: dict[str, Any] = {}
     if curve.hollow:
         more["marker"] = {"size": 8, "color": curve.style.colour, "symbol": "circle-open", "line": {"width": 1.6}}
@@ -135,7 +135,7 @@ def _axis(axis: Axis, limits: tuple[float, float] | None) -> dict[str, Any]:
         found |= {"tickvals": values, "ticktext": text, "tickmode": "array"}
     if axis.ticks:
         found |= {"tickvals": [place for place, _ in axis.ticks], "tickmode": "array",
-                  # Names in several rows keep theirs; a name put into a lower row does not need it here.
+                  # Line breaks inside a name are kept; leading ones, which stagger the names, are not needed here.
                   "ticktext": [_text(word.strip("\n")).replace("\n", "<br>") for _, word in axis.ticks]}
     if axis.silent:
         found |= {"showticklabels": False, "title": {"text": ""}}
@@ -148,5 +148,5 @@ def _title(panel: Panel, top: float, left: float, small: bool) -> dict[str, Any]
 
 
 def _text(text: str) -> str:
-    """plotly.js reads a few HTML tags in its texts; none is meant."""
+    """Text with HTML escaped, since plotly.js interprets a few tags."""
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -1,4 +1,4 @@
-"""The records of a campaign as a table, alike in all reports."""
+"""Table of the records of a measurement campaign, the same in all reports."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from avis_ctrl.report.pieces import Bullets, Heading, Piece, Table, table
 
 
 def records(campaign: Campaign, use: Mapping[str, str], divided: str) -> Table:
-    """A row for each record; use : by name of the record, what it was used for; divided : how that was chosen."""
+    """One row per record. use : purpose of each record by name. divided : how the records were divided."""
     rows = []
     for record in campaign.records:
         h = record.header
@@ -28,6 +28,6 @@ def records(campaign: Campaign, use: Mapping[str, str], divided: str) -> Table:
 
 
 def remarks(campaign: Campaign) -> list[Piece]:
-    """What the reader assumed; nothing where the file said all."""
+    """Assumptions made in reading the file; empty if there are none."""
     told = tuple(in_short(campaign.notes))
     return [Heading("Notes on the measurement file"), Bullets(told)] if told else []

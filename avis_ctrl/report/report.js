@@ -17,7 +17,7 @@
     const axes = Object.fromEntries(Object.entries(layout).filter(([k]) => /^[xy]axis/.test(k))
       .map(([k, v]) => [k, { ...axis, ...v }]));
     const entries = data.filter(t => t.showlegend).length;
-    // The legend stands under the graph in rows of one on a phone and of about three elsewhere.
+    // The legend is below the graph, with one entry per row on a phone and about three elsewhere.
     const rows = layout.showlegend ? (phone ? entries : Math.ceil(entries / 3)) : 0;
     const plot = layout.height - 110, foot = 58 + 20 * rows;
     Plotly.newPlot(frame, data, {

@@ -1,4 +1,4 @@
-"""Panels of measured frequency responses with those of models over them, alike in all reports."""
+"""Panels that compare measured frequency responses with models, the same in all reports."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz
 
 FLOOR = ("vx", "vy", "vz")
 MEASURED, SCATTER, TWO_SIGMA = Style("#222222"), Style("#7a7a7a"), Style("#222222", "dot", 1.4)
-# Points of a measured response in a panel.
+# Maximum number of points of a measured response in a panel.
 MOST_POINTS = 60
 
-# Label, response (n, n_y, n_u), look.
+# Label, response (n, n_y, n_u), style.
 Model = tuple[str, np.ndarray, Style]
 
 
 def drives(seen: MeasuredOverlay) -> list[int]:
-    """Columns of the drives; those of the floor only where there are no others."""
+    """Columns of the drives, or of the floor inputs if there are no drives."""
     return [j for j, name in enumerate(seen.inputs) if name not in FLOOR] or list(range(len(seen.inputs)))
 
 
 def unit(seen: MeasuredOverlay, j: int) -> str:
-    """Of a column: floor columns are per m/s whatever the drives' unit is, which stands first."""
+    """Unit of column j: per m/s for floor inputs, otherwise per unit of the drives, the first one in `seen.unit`."""
     output, _, inputs = seen.unit.partition(" per ")
     per = "m/s" if seen.inputs[j] in FLOOR else inputs.partition(";")[0]
     return words.unit(f"{output}/{f'({per})' if '/' in per or ' ' in per else per}")
 
 
 def frequencies(seen: MeasuredOverlay) -> Axis:
-    """The axis of all panels of an overlay."""
+    """Frequency axis of all panels of an overlay."""
     return hertz(float(seen.frequency_Hz[0]), float(seen.frequency_Hz[-1]))
 
 
 def thin(count: int, most: int) -> np.ndarray:
-    """Indices of at most so many of `count` points, evenly."""
+    """Indices of at most `most` of `count` points, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def title(seen: MeasuredOverlay, i: int, j: int) -> str:
-    """Of a panel."""
+    """Title of a panel."""
     return f"{seen.outputs[i]} from {seen.inputs[j]}"
 
 
 def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
-    """Measured points with two standard deviations to each side, and a line for each model."""
+    """Measured points with a band of two standard deviations to each side, and a line for each model."""
     f, size, two = seen.frequency_Hz, np.abs(seen.measured[:, i, j]), 2 * seen.measured_std[:, i, j]
     keep, lines = thin(len(f), MOST_POINTS), [(label, np.abs(G[:, i, j]), style) for label, G, style in models]
     low = 0.5 * float(min(np.quantile(size, 0.02), *(line.min() for _, line, _ in lines)))
@@ -60,7 +60,7 @@ def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) ->
 
 
 def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
-    """Magnitude of measured less model, complex, for each model; with noise alone 86 % lie below the dotted line."""
+    """Magnitude of the complex difference measured - model; by noise alone 86 % lie below the dotted line."""
     f, two = seen.frequency_Hz, 2 * seen.measured_std[:, i, j]
     lines = [(label, np.abs(seen.measured[:, i, j] - G[:, i, j]), style) for label, G, style in models]
     values = np.concatenate([two, *(line for _, line, _ in lines)])

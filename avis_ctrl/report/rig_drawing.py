@@ -1,4 +1,4 @@
-"""The rig seen from above and along x, from its named points."""
+"""Drawing of the rig from its named points: top view, and side view along x."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ View = Callable[[np.ndarray], Point]
 
 
 def rig_drawing(rig: Rig) -> str:
-    """Top view above side view, to one scale."""
+    """Top view above side view, to the same scale."""
     points = rig.points()
     places = np.array([p.position for p in points.values()])
     reach = np.maximum(np.abs(places).max(axis=0), [0.0, rig.edge_m, 0.0])
@@ -62,7 +62,7 @@ def _elements(canvas: Canvas, rig: Rig, at: View) -> None:
 
 
 def _pointed(canvas: Canvas, place: Point, direction: np.ndarray, colour: str, shift: float) -> None:
-    """An arrow in the plane, or a circled dot for what points at the eye."""
+    """An arrow in the plane of the drawing, or a circled dot for a direction normal to it."""
     across = np.array([direction[0], -direction[1]])
     if np.linalg.norm(across) < 0.3:
         canvas.circle(place, 5.5, "#ffffff", colour, 1.6)
@@ -78,7 +78,7 @@ def _mark(canvas: Canvas, place: Point, name: str, kind: str) -> None:
     colour = MASS if kind == "centre of mass" else MARK
     canvas.line([(x - 6, y), (x + 6, y)], colour, 1.6)
     canvas.line([(x, y - 6), (x, y + 6)], colour, 1.6)
-    # Marks may coincide: each kind has its own side for its name.
+    # Marks may coincide, so each kind has its name on a different side.
     sides: dict[str, tuple[float, float, Anchor]] = {"centre of mass": (9, 4, "start"), "load": (0, -10, "middle"),
                                                      "measured point": (0, 18, "middle")}
     dx, dy, anchor = sides[kind]
@@ -86,7 +86,7 @@ def _mark(canvas: Canvas, place: Point, name: str, kind: str) -> None:
 
 
 def _labels(canvas: Canvas, rig: Rig, at: View) -> None:
-    """Names by place: isolator, actuators, sensors under each other, on the outer side."""
+    """Names of isolator, actuators and sensors at each place, stacked on its outer side."""
     groups: dict[tuple[int, int], dict[str, list[str]]] = {}
     for name, place in rig.points().items():
         if place.kind in ("isolator", "actuator", "sensor"):
@@ -128,7 +128,7 @@ def _side(canvas: Canvas, rig: Rig, reach: np.ndarray, at: View) -> None:
 
 
 def _lever(canvas: Canvas, rig: Rig, at: View) -> None:
-    """The arm that turns phi_x into a displacement of the edge."""
+    """The lever arm that converts phi_x into a displacement of the edge."""
     (x0, y0), (x1, _) = at(np.zeros(3)), at(np.array([0.0, rig.edge_m, 0.0]))
     canvas.line([(x1, y0 - 9), (x1, y0 + 9)], MARK, 1.2)
     canvas.line([(x0, y0), (x1, y0)], MARK, 1.4, arrow=True)

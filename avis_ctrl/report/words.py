@@ -1,4 +1,4 @@
-"""Numbers as people read them: what is not finite is said in words."""
+"""Numbers, units and names as text; values that are not finite are given in words."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from avis_ctrl.uncertain_value import rounded
 
 AXIS_WORDS = {"phi_x_edge": "phi_x (edge)", "phi_y_edge": "phi_y (edge)", "phi_z_edge": "phi_z (edge)"}
 
-# A typed power of ten, not inside a word.
+# A power of ten such as 1.2e-5, not inside a word.
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)(?!\w)")
 _MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
 
 
 def typeset(text: str) -> str:
-    """Text as printed: signs in place of their typed forms, and no power of ten for a number below 100 000."""
+    """Text with the signs ± and −, and without powers of ten for numbers from 1 to 100 000."""
     return _MINUS.sub("−", _POWER.sub(_power, text.replace(" +- ", " ± ")))
 
 
@@ -27,7 +27,7 @@ def _power(typed: re.Match[str]) -> str:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with so many digits; thousands not as powers of ten."""
+    """A number with significant digits; powers of ten only below 0.001 and from 100 000 on."""
     if np.isnan(value):
         return "not computed"
     if np.isinf(value):
@@ -49,12 +49,12 @@ def with_std(value: float, std: float) -> tuple[str, str]:
 
 
 def bound(value: float, digits: int = 3) -> str:
-    """A bound of mu or of a gain; infinite where the set holds an unstable plant."""
+    """A bound of mu or of a gain; infinite if the set contains an unstable plant."""
     return "unstable" if np.isinf(value) else number(value, digits)
 
 
 def percent(share: float, digits: int = 3) -> str:
-    """A fraction in per cent; below a hundred-thousandth it is stated as that."""
+    """A fraction in per cent; "< 0.001 %" if it is smaller."""
     if not np.isfinite(share):
         return "not computed"
     return "< 0.001 %" if 0 < share < 1e-5 else f"{number(100 * share, digits)} %"
@@ -89,19 +89,19 @@ def hertz(omega: float) -> str:
 
 
 def limits(volts: Mapping[str, float]) -> str:
-    """Limits of drives by name: one voltage where all are alike."""
+    """Voltage limits of the drives: one number if all are equal, otherwise by name."""
     if len(set(volts.values())) == 1:
         return f"{number(next(iter(volts.values())))} V"
     return ", ".join(f"{name} {number(value)} V" for name, value in volts.items())
 
 
 def axis(name: str) -> str:
-    """An axis as it is called in text."""
+    """Name of an axis in text."""
     return AXIS_WORDS.get(name, name)
 
 
 def unit(text: str) -> str:
-    """A unit with its powers raised."""
+    """A unit with superscript powers."""
     return text.replace("^2", "²").replace("^3", "³")
 
 
@@ -111,10 +111,10 @@ def yes(value: bool) -> str:
 
 
 def sentence(text: str) -> str:
-    """Text that begins with a capital letter and ends with a stop."""
+    """Text as a sentence: capital first letter and a full stop at the end."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def joined(names: list[str] | tuple[str, ...]) -> str:
-    """a, b and c."""
+    """Names as "a, b and c"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else list(names))

@@ -1,4 +1,4 @@
-"""The two rigs: rigid-body mechanics, linear and nonlinear, their files and their subsystems."""
+"""Rigs (isolation tables): rigid-body mechanics, linear and nonlinear, rig files, and reduced models."""
 
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics

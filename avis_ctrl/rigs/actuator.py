@@ -1,8 +1,4 @@
-"""Actuator chains: from the voltage that the controller computes to the force on the payload.
-
-Loop delay (computation and sampling), amplifier lag, force constant, and back-EMF as a damper between payload
-and chassis. The voltage limit is a number for the simulation and for control-effort weights.
-"""
+"""Pade approximations of the loop delay and of the zero-order hold, in state space."""
 
 from __future__ import annotations
 
@@ -17,7 +13,7 @@ from avis_ctrl.lti.statespace import StateSpace, gain, tf
 
 
 def pade_coefficients(order: int) -> np.ndarray:
-    """Coefficients, by descending power of x, of N with N(-x)/N(x) the [n/n] Pade approximant of exp(-x)."""
+    """Coefficients of N(x), by descending power, where N(-x)/N(x) is the [n/n] Pade approximant of exp(-x)."""
     return np.array([comb(order, k) * factorial(2 * order - k) / factorial(2 * order)
                      for k in range(order, -1, -1)])
 
@@ -25,8 +21,8 @@ def pade_coefficients(order: int) -> np.ndarray:
 def pade_delay(delay_s: float, order: int = 2, input_name: str = "u", output_name: str = "y") -> StateSpace:
     """All-pass Pade approximation of exp(-s T), in coordinates where both Gramians are the identity.
 
-    An all-pass system has equal Gramians up to scale, so these coordinates are balanced: the realisation stays
-    well conditioned at any delay, where a companion form in powers of 1/T would not.
+    The Gramians of an all-pass system are inverses of each other, so these coordinates are balanced. The realisation
+    is well conditioned for any delay, unlike a companion form in powers of 1/T.
 
     Raises
     ------
@@ -48,15 +44,15 @@ def pade_delay(delay_s: float, order: int = 2, input_name: str = "u", output_nam
 
 def zero_order_hold(sample_time_s: float, order: int = 2, input_name: str = "u",
                     output_name: str = "y") -> StateSpace:
-    """Continuous model (1 - exp(-s T))/(s T) of a zero-order hold, the exponential by its Pade approximant.
+    """Continuous model (1 - exp(-s T))/(s T) of a zero-order hold, with the Pade approximant of the exponential.
 
-    The zero of the numerator at s = 0 cancels on paper, so that the gain at rest is exactly 1.
+    The factor s of the numerator is cancelled analytically, so that the gain at zero frequency is exactly 1.
     """
     require_positive(sample_time_s, "sample_time_s")
     if not (isinstance(order, int) and 1 <= order <= 10):
         raise InputError("a whole number from 1 to 10", field="pade_order", value=order)
     denominator = pade_coefficients(order)
-    # N(x) - N(-x) keeps twice the odd powers; divided by x they move down by one.
+    # N(x) - N(-x) is twice the odd part of N; division by x lowers each power by one.
     odd = np.where(np.arange(order, -1, -1) % 2 == 1, 2.0 * denominator, 0.0)
     unit = tf(list(odd[:-1]), list(denominator))
     root = np.sqrt(1.0 / sample_time_s)

@@ -1,6 +1,6 @@
-"""A payload on isolators along earth axes, with drives and sensors in the isolators or anywhere.
+"""A payload on isolators that act along the earth axes, with drives and sensors in the isolators or anywhere else.
 
-The air-mount AVIS (Rademakers, TU/e 2005) is one: four isolators, eight linear motors and six geophones in them.
+An example is the air-mount AVIS (Rademakers, TU/e 2005), with eight linear motors and six geophones in four isolators.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
 
 AXES = ("x", "y", "z")
-# A drive or sensor no further from a mount's attachment than this [m], and no further from an earth axis than this
-# [rad], sits in the mount: many tolerances of its place and direction, and much less than mounts are apart.
+# Maximum distance from a mount's attachment [m] and maximum angle to an earth axis [rad] of a drive or sensor in the
+# mount: many tolerances of position and direction, but much less than the distance between mounts.
 IN_MOUNT_m, IN_MOUNT_rad = 0.03, 0.3
-# Derivative (3, 6) of `point_map` by each coordinate of the point.
+# Derivative (3, 6) of `point_map` with respect to each coordinate of the point.
 _ARM = tuple(point_map(unit) - point_map(np.zeros(3)) for unit in np.eye(3))
 INERTIA = ("J1", "J2", "J3", "J12", "J13", "J23")
 _ISOLATOR_PARAMETER = re.compile(r"isolator(\d+)\.(k|c|p)_([xyz])")
@@ -36,10 +36,10 @@ _WORDS = {"k": "stiffness", "c": "damping", "p": "position of the attachment"}
 class Isolator:
     """Air mount: spring and damper along each earth axis (eqs. 2.15-2.16).
 
-    position [m] : attachment p_i on the payload, from its geometric centre.
+    position [m] : attachment p_i on the payload, relative to its geometric centre.
     stiffness [N/m], damping [N s/m] : along x, y, z.
-    chassis_offset [m] : c_i - p_i, attachment on the chassis from that on the payload; the source
-        takes them equal (Table 3.1).
+    chassis_offset [m] : c_i - p_i, attachment on the chassis relative to that on the payload; zero in the
+        source (Table 3.1).
     """
 
     position: tuple[float, ...]
@@ -64,10 +64,10 @@ class AvisTable(Rig):
 
     inertia : (J1, J2, J3, J12, J13, J23) [kg m^2] about the centre of mass; the last three are the
         entries of the inertia tensor itself, J12 = -integral of x y dm.
-    centre_of_mass : [m] from the geometric centre.
-    motors, geophones : in the isolators, at the positions of these. drives, instruments : at positions of their own.
-        `all_drives` and `sensors` are both together, in this order.
-    limit_V : voltage limit of drives that have no limit of their own.
+    centre_of_mass : [m] relative to the geometric centre.
+    motors, geophones : in the isolators, at the isolators' positions. drives, instruments : at any positions.
+        `all_drives` and `sensors` return both kinds, in this order.
+    limit_V : voltage limit of all drives without an individual limit.
     """
 
     name: str
@@ -88,7 +88,7 @@ class AvisTable(Rig):
     electronics: Electronics = field(default_factory=Electronics)
 
     def __post_init__(self) -> None:
-        self.mounted_body()  # refuses a mass or an inertia that is not positive
+        self.mounted_body()  # raises for a mass or an inertia that is not positive
 
     @property
     def edge_m(self) -> float:
@@ -101,7 +101,7 @@ class AvisTable(Rig):
 
     @cached_property
     def all_drives(self) -> tuple[Drive, ...]:
-        """Motors of the isolators, then the drives at places of their own."""
+        """Motors of the isolators, then the drives at other positions."""
         motors = (Drive(motor.name, self._at(motor.isolator), _unit(motor.axis), motor.constant_N_per_V)
                   for motor in self.motors)
         return (*motors, *self.drives)
@@ -130,7 +130,7 @@ class AvisTable(Rig):
         return np.array([[J1, J12, J13], [J12, J2, J23], [J13, J23, J3]])
 
     def parameters(self) -> dict[str, Parameter]:
-        """mass, J1.., com_x.., isolator1.k_x.., isolator1.c_x.., isolator1.p_x.., actuator.Ay1.. (1-based)."""
+        """mass, J1.., com_x.., isolator1.k_x.. (k, c, p; 1-based), actuator.NAME, place.NAME.x.., direction.NAME.x.."""
         return dict(self._parameters)
 
     @cached_property
@@ -176,7 +176,7 @@ class AvisTable(Rig):
         return [("M", "", M)]
 
     def _channel_slope(self, kind: str, channel: str, axis: str) -> list[tuple[str, str, np.ndarray]]:
-        """By a coordinate of a channel's place, or a component of its direction."""
+        """Derivative with respect to a coordinate of a channel's position or a component of its direction."""
         one, k = self._by_name[channel], AXES.index(axis)
         if kind == "place":
             slope = _ARM[k].T @ one.direction
@@ -188,7 +188,7 @@ class AvisTable(Rig):
         return [("T" if drive else "R", channel, slope * one.constant_N_per_V if drive else slope)]
 
     def _isolator_slopes(self, number: int, kind: str, k: int) -> list[tuple[str, str, np.ndarray]]:
-        """By stiffness, damping or position of an isolator along an axis; what is attached to it moves along."""
+        """Derivatives with respect to stiffness, damping or position of an isolator with its motors and geophones."""
         one, arm = self.isolators[number - 1], _ARM[k]
         G, G_c = point_map(one.position), point_map(np.add(one.position, one.chassis_offset))
         if kind != "p":
@@ -209,13 +209,13 @@ class AvisTable(Rig):
         return {one.name: one for one in (*self.all_drives, *self.instruments)}
 
     def mount_of(self, channel: str) -> tuple[str, float] | None:
-        """Mount and earth axis ("isolator1.x") that a drive or sensor sits in, and the sign of its direction along that
-        axis; None for one that sits in none."""
+        """Mount and earth axis ("isolator1.x") of a drive or sensor, and the sign of its direction along the axis; None
+        if it is not in a mount."""
         found, inside = self._nearest_mounts[channel]
         return found if inside else None
 
     def nearest_mount(self, channel: str) -> tuple[str, float]:
-        """The same of the mount that is nearest, however far; a fit may move a channel on its way."""
+        """As `mount_of`, but of the nearest mount at any distance: a fit may move a channel out of its mount."""
         return self._nearest_mounts[channel][0]
 
     @cached_property
@@ -230,7 +230,7 @@ class AvisTable(Rig):
         return found
 
     def with_channels_apart(self) -> AvisTable:
-        """The same table with each motor and geophone at a place of its own, which does not move with the isolator."""
+        """The same table with motors and geophones at positions that do not move with the isolators."""
         return replace(self, motors=(), drives=self.all_drives, geophones=None,
                        instruments=(*self._attached(), *self.instruments))
 
@@ -256,7 +256,7 @@ class AvisTable(Rig):
     def mounted_body(self) -> MountedBody:
         return self._body
 
-    # A fit asks for the same table again and again.
+    # Cached, because a fit uses the same table many times.
     @cached_property
     def _body(self) -> MountedBody:
         mounts = tuple(
@@ -268,7 +268,7 @@ class AvisTable(Rig):
         return MountedBody(self.mass, self.inertia_matrix(), np.array(self.centre_of_mass), mounts, actuators)
 
     def equations_of_motion(self) -> EquationsOfMotion:
-        """Eq. 2.36 with the chassis motion kept; about the geometric centre."""
+        """Eq. 2.36 with the chassis motion included, about the geometric centre."""
         return self._equations
 
     @cached_property
@@ -282,7 +282,7 @@ class AvisTable(Rig):
         return found | {"centre of mass": Place(np.array(self.centre_of_mass), "centre of mass")}
 
     def sensors(self) -> tuple[Sensor, ...]:
-        """The geophones in the isolators (fig. 2.2), then the instruments at places of their own."""
+        """The geophones in the isolators (fig. 2.2), then the instruments at other positions."""
         return self._sensors
 
     @cached_property
@@ -316,13 +316,13 @@ class AvisTable(Rig):
 
 
 def _across(direction: Triple) -> tuple[int, int]:
-    """The two smallest components of a unit vector, which the third one follows."""
+    """Indices of the two smallest components of a unit vector; they determine the third."""
     first, second, _ = (int(k) for k in np.argsort(np.abs(direction), kind="stable"))
     return min(first, second), max(first, second)
 
 
 def _moved(one: Any, values: Mapping[str, float]) -> Any:
-    """A drive or instrument at another place and in another direction."""
+    """A drive or instrument with its position and direction changed."""
     place = tuple(values.get(f"place.{one.name}.{axis}", old) for axis, old in zip(AXES, one.position, strict=True))
     across = _across(one.direction)
     if not any(f"direction.{one.name}.{AXES[k]}" in values for k in across):

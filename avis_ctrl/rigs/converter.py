@@ -1,4 +1,4 @@
-"""Analogue-to-digital converter: rounding to its codes, clipping, and the noise that rounding makes."""
+"""Analogue-to-digital converter: quantisation, clipping and quantisation noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from avis_ctrl.errors import InputError
 def quantise(voltage: float, lsb: float, lower: float, upper: float) -> float:
     """One sample through a mid-tread quantiser [V]: clipped to [lower, upper], rounded to a multiple of lsb.
 
-    Scalar and free of Python objects, so that numba.njit(quantise) serves inside a compiled simulation.
+    Scalar and free of Python objects, so that numba.njit(quantise) can be used in a compiled simulation.
     """
     if voltage >= upper:
         return upper
@@ -23,7 +23,7 @@ def quantise(voltage: float, lsb: float, lower: float, upper: float) -> float:
 
 
 def bits_of(value: object) -> int:
-    """The number of bits of a converter, from 1 to 32: none that is made has more. Raises ValueError otherwise."""
+    """A valid number of bits, 1 to 32 (no real converter has more). Raises ValueError otherwise."""
     if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 32:
         return value
     raise ValueError("expected a whole number of bits from 1 to 32")
@@ -35,7 +35,7 @@ class Converter:
 
     Raises
     ------
-    InputError : bits that `bits_of` refuses, or a range or rate that is not positive.
+    InputError : bits other than a whole number from 1 to 32, or a range or rate that is not positive.
     """
 
     bits: int
@@ -52,7 +52,7 @@ class Converter:
 
     @property
     def lsb_V(self) -> float:
-        """Voltage of one code."""
+        """Voltage of one code step, the least significant bit."""
         return 2.0 * self.range_V / 2 ** self.bits
 
     @property
@@ -73,15 +73,15 @@ class Converter:
 
     @property
     def noise_rms_V(self) -> float:
-        """R.m.s. rounding error, lsb / sqrt(12), of a signal that moves by several codes (Widrow 1956)."""
+        """R.m.s. quantisation error lsb / sqrt(12) of a signal that varies by several codes (Widrow 1956)."""
         return self.lsb_V / np.sqrt(12.0)
 
     @property
     def noise_density_V_rtHz(self) -> float:
-        """One-sided density of the rounding error, spread evenly from 0 to half the sample rate."""
+        """One-sided density of the quantisation error, white from 0 to half the sample rate."""
         return white_density(self.noise_rms_V, self.sample_rate_Hz)
 
 
 def white_density(rms: float, sample_rate_Hz: float) -> float:
-    """One-sided density [unit/sqrt(Hz)] of noise of that r.m.s., white from 0 to half the sample rate."""
+    """One-sided density [unit/sqrt(Hz)] of white noise with this r.m.s. from 0 to half the sample rate."""
     return float(rms * np.sqrt(2.0 / sample_rate_Hz))

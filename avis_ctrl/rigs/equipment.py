@@ -1,7 +1,4 @@
-"""The numbers of the sensors, the acquisition and the site that a rig file holds.
-
-Only the numbers: their dynamics are built elsewhere from these.
-"""
+"""Data of sensors, acquisition and site in a rig file; their dynamics are built elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import numpy as np
 class Geophones:
     """Geophones in the isolators, their compensation filter and preamplifier (Rademakers, section 2.1.1).
 
-    isolator is 1-based, axis one of x, y, z; sensitivity_Vs_per_m one value per channel.
+    isolator : 1-based number. axis : x, y or z. sensitivity_Vs_per_m : one value per channel.
     """
 
     names: tuple[str, ...]
@@ -30,7 +27,7 @@ class Geophones:
 
 @dataclass(frozen=True)
 class Accelerometers:
-    """Accelerometers at actuators, along the actuators' axes, with the clock of their loop."""
+    """Accelerometers at actuators, along the actuators' axes, with sample rate and delay of their control loop."""
 
     at: tuple[str, ...]
     sensitivity_Vs2_per_m: float
@@ -43,7 +40,7 @@ class Accelerometers:
 
 @dataclass(frozen=True)
 class Acquisition:
-    """Converter: range is +-adc_range_V; loop_delay_s from sample to actuator voltage."""
+    """Converter with the range +-adc_range_V. loop_delay_s : from sample to actuator voltage."""
 
     sample_rate_Hz: float
     adc_bits: int
@@ -53,7 +50,7 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Ambient:
-    """What is normal on site: floor velocity per direction, 0.5-60 Hz, and sensor noise per channel."""
+    """Normal conditions on site: r.m.s. floor velocity per direction, 0.5-60 Hz, and sensor noise per channel."""
 
     floor_velocity_rms_m_per_s: float
     sensor_noise_rms_V: float
@@ -61,21 +58,21 @@ class Ambient:
 
 @dataclass(frozen=True)
 class Electronics:
-    """Offset, 1/f noise and anti-alias filter of the channels, the same in each.
+    """Offset, 1/f noise and anti-alias filter of the channels, the same for all channels.
 
-    Defaults are those of data sheets. Amplifier: INA128 (Texas Instruments, SBOS051), offset at its input typically
-    10 uV + 100 uV / G with the gain G; 10 nV/sqrt(Hz) at 10 Hz and 8 nV/sqrt(Hz) at 1 kHz, hence 1/f noise of
-    19 nV/sqrt(Hz) at 1 Hz. Converter: an offset of two codes, which data sheets of converters by successive
-    approximation state as the largest; no 1/f noise beside its rounding, which is white.
+    The defaults are from data sheets. Amplifier: INA128 (Texas Instruments, SBOS051), input offset typically
+    10 uV + 100 uV / G at gain G; 10 nV/sqrt(Hz) at 10 Hz and 8 nV/sqrt(Hz) at 1 kHz, hence 1/f noise of
+    19 nV/sqrt(Hz) at 1 Hz. Converter: offset of two codes, the maximum stated in data sheets of
+    successive-approximation converters; no 1/f noise in addition to the white rounding noise.
 
     Attributes
     ----------
-    sensor_offset_V : largest offset of a sensor with its amplifier, at the converter, of either sign; None for that of
-        the data sheet with the sensor's preamplifier gain.
-    sensor_flicker_corner_Hz : frequency at which the density of a sensor's 1/f noise is that of its white noise; None
-        for the 1/f noise of the data sheet with the sensor's preamplifier gain.
-    converter_offset_V : largest offset of the converter, of either sign; None for two codes (zero without a converter).
-    converter_flicker_corner_Hz : as that of the sensors, relative to the converter's rounding noise.
+    sensor_offset_V : maximum offset of a sensor with its amplifier, at the converter, of either sign; None for the data
+        sheet's value with the sensor's preamplifier gain.
+    sensor_flicker_corner_Hz : frequency at which a sensor's 1/f noise density equals its white noise density; None for
+        the data sheet's 1/f noise with the sensor's preamplifier gain.
+    converter_offset_V : maximum offset of the converter, of either sign; None for two codes (zero without a converter).
+    converter_flicker_corner_Hz : the same for the converter's 1/f noise and its rounding noise; 0 for no 1/f noise.
     anti_alias_order, anti_alias_corner_Hz : Butterworth low-pass before the converter; order 0 for none.
     """
 
@@ -87,15 +84,15 @@ class Electronics:
     anti_alias_corner_Hz: float | None = None
 
     def offset_V(self, preamplifier_gain: float, code_V: float) -> float:
-        """Largest offset of one channel, amplifier and converter together; code_V : volts of one code."""
+        """Maximum offset of one channel, amplifier and converter together. code_V : volts per code."""
         sensor = 10e-6 * preamplifier_gain + 100e-6 if self.sensor_offset_V is None else self.sensor_offset_V
         return sensor + (2 * code_V if self.converter_offset_V is None else self.converter_offset_V)
 
     def flicker_rms_V(self, preamplifier_gain: float, noise_rms_V: float, rounding_rms_V: float, sample_rate_Hz: float
                       ) -> float:
-        """R.m.s. of one sample of white noise with the density that the 1/f noise of a channel has at 1 Hz.
+        """R.m.s. per sample of a white noise whose density is that of the channel's 1/f noise at 1 Hz.
 
-        noise_rms_V, rounding_rms_V : of one sample, of the sensor's white noise and of the converter's rounding.
+        noise_rms_V, rounding_rms_V : r.m.s. per sample of the sensor's white noise and of the converter's rounding.
         """
         if self.sensor_flicker_corner_Hz is None:
             sensor = 19e-9 * preamplifier_gain * np.sqrt(sample_rate_Hz / 2)
@@ -108,7 +105,7 @@ class Electronics:
         n = self.anti_alias_order
         angles = np.pi * (2 * np.arange(n) + n + 1) / (2 * max(n, 1))
         poles = 2 * np.pi * (self.anti_alias_corner_Hz or 0.0) * np.exp(1j * angles)
-        # Exact pairs, and a real pole without a trace of an imaginary part.
+        # Exact conjugate pairs, and a real pole without round-off in its imaginary part.
         upper = [complex(pole) for pole in poles[:n // 2]]
         real = [complex(-abs(poles[n // 2]))] if n % 2 else []
         return (*upper, *real, *(pole.conjugate() for pole in upper))

@@ -1,4 +1,4 @@
-"""Files of keys and values: read, and what is wrong with them as one line for a person."""
+"""Reading of TOML and JSON files, with each error reported as one readable line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNITS = {"kg", "g", "t", "lb", "m", "mm", "cm", "um", "in", "N", "kN", "mN", "N
           "deg", "V", "mV", "kV", "Hz", "kHz", "rtHz", "s", "ms", "us", "s2", "Vs", "Vs2", "kgm2", "gmm2", "kgmm2",
           "gcm2"}
 
-# What pydantic says, such as "Input should be greater than or equal to 1", in the words of these messages.
+# Wording of pydantic, such as "Input should be greater than or equal to 1", replaced by that of these messages.
 _PLAIN = (("^Input should be ", "expected "), ("expected a valid number", "expected a number"),
           ("expected a valid integer", "expected a whole number"),
           ("expected a valid string", "expected text in quotes"),
@@ -32,13 +32,13 @@ _PLAIN = (("^Input should be ", "expected "), ("expected a valid number", "expec
 
 
 class Section(BaseModel):
-    """A section of a file: its keys and no others, each of the type that it says."""
+    """A section of a file: only the declared keys, each of its declared type."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 def validated(model: type[Content], content: object, file: object = None) -> Content:
-    """The content as a model of a file; the complaint names the file where there is one. Raises InputError."""
+    """Content validated against a model. Raises InputError, which names the file if it is given."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -47,11 +47,11 @@ def validated(model: type[Content], content: object, file: object = None) -> Con
 
 
 def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputError:
-    """The complaint that says most, as an `InputError` with field, value and what was expected.
+    """The most informative validation error, as an `InputError` with field, value and what was expected.
 
-    `model` is what the content was validated against; its keys are what an unknown one is compared with.
+    `model` is the model of the content; an unknown key is compared with its keys.
     """
-    # An unknown key explains the missing one beside it, so it comes first.
+    # An unknown key explains the missing key next to it, so it comes first.
     problems = error.errors()
     problem = min(problems, key=lambda one: one["type"] != "extra_forbidden")
     *parents, last = problem["loc"] or ("file",)
@@ -74,14 +74,14 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
 
 
 def _dotted(place: Sequence[int | str]) -> str:
-    """("isolator", 1, "position_m") as isolator[2].position_m, counted from 1 as the sources do."""
+    """("isolator", 1, "position_m") as isolator[2].position_m, counted from 1 as in the sources."""
     words = (f"[{part + 1}]" if isinstance(part, int) else f".{part if part.isprintable() else repr(part)}"
              for part in place)
     return "".join(words).lstrip(".")
 
 
 def _unknown_key(key: str, absent: Sequence[str], known: Sequence[str]) -> str:
-    """What to write instead of `key`: rather one of the keys that are `absent` than any that is `known`."""
+    """Suggested replacement of an unknown key: preferably one of the missing keys `absent`, else a `known` key."""
     if same := [name for name in known if _stem(name) == _stem(key)]:
         return f"the unit in this key is wrong; expected {same[0]}"
     for names in (absent, known):
@@ -109,7 +109,7 @@ def _known_keys(model: type[BaseModel], parents: Sequence[int | str]) -> list[st
 
 
 def _kind_of_entry(model: type[BaseModel], parents: Sequence[int | str], key: str) -> str:
-    """What is missing: a key with a value, or a section of keys."""
+    """Kind of a missing entry: "key" (with a value) or "section" (of keys)."""
     for part in (one for one in (*parents, key) if isinstance(one, str)):
         annotation = model.model_fields[part].annotation if part in model.model_fields else None
         inner = _model_within(annotation)
@@ -127,17 +127,17 @@ def _model_within(annotation: Any) -> type[BaseModel] | None:
 
 
 def read_toml(path: Path, expected: str) -> dict[str, Any]:
-    """The table of a TOML file; `expected` says what the file should have been.
+    """Content of a TOML file. expected : description of the expected file, for messages.
 
     Raises
     ------
-    InputError : one line naming the file: it is not there, cannot be read, is not TOML in UTF-8.
+    InputError : the file does not exist, cannot be read, or is not TOML in UTF-8; one line that names the file.
     """
     return _read(path, tomllib.loads, "TOML", expected)
 
 
 def read_json(path: Path, form: str, expected: str = "a file of avis design") -> dict[str, Any]:
-    """The content of a JSON file whose key `format` is `form`; otherwise as `read_toml`."""
+    """Content of a JSON file whose key `format` must be `form`; errors as in `read_toml`."""
     content = _read(path, json.loads, "JSON", expected)
     found = content.get("format") if isinstance(content, dict) else None
     if found != form:
@@ -147,7 +147,7 @@ def read_json(path: Path, form: str, expected: str = "a file of avis design") ->
 
 def _read(path: Path, parse: Callable[[str], Any], language: str, expected: str) -> Any:
     try:
-        # Editors on Windows begin a file with a byte-order mark.
+        # Editors on Windows may start a file with a byte-order mark.
         return parse(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"no such file; expected {expected}", file=path) from None

@@ -1,8 +1,8 @@
-"""Floor motion as amplitude spectral densities: measured files, conversions, r.m.s. in third octaves.
+"""Amplitude spectral densities of floor motion, and their r.m.s. in bands and third octaves.
 
 An amplitude spectral density (ASD) is one-sided, per square root of Hz: the variance in a band is the integral of
-its square over frequency in Hz. Between points an ASD is taken as a power law (a straight line in
-double-logarithmic axes) and integrated exactly.
+its square over frequency in Hz. Between points an ASD follows a power law (a straight line in double-logarithmic
+axes), which is integrated exactly.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DERIVATIVES: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration":
 
 
 def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd") -> None:
-    """Raise InputError unless these are two vectors of one length, increasing and positive, and positive."""
+    """Raise InputError unless both are finite positive vectors (n,), n >= 2, and the frequencies increase."""
     if np.ndim(frequency_Hz) != 1 or np.shape(frequency_Hz) != np.shape(asd) or np.size(asd) < 2:
         raise InputError(f"two vectors of one length, at least 2 points; got {np.shape(frequency_Hz)} and "
                          f"{np.shape(asd)}", field=field)
@@ -32,7 +32,7 @@ def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd"
 def band_rms(frequency_Hz: np.ndarray, asd: np.ndarray, low_Hz: float, high_Hz: float) -> float:
     """R.m.s. between two frequencies inside the data, exact for the piecewise power law through the points.
 
-    Raises InputError where the band is empty or leaves the data.
+    Raises InputError if the band is empty or not inside the data.
     """
     check_spectrum(frequency_Hz, asd)
     f, a = np.asarray(frequency_Hz, float), np.asarray(asd, float)
@@ -44,7 +44,7 @@ def band_rms(frequency_Hz: np.ndarray, asd: np.ndarray, low_Hz: float, high_Hz: 
     points = np.concatenate([[low_Hz], f[inside], [high_Hz]])
     power = np.exp(2 * np.interp(np.log(points), np.log(f), np.log(a)))
     ratio = np.log(points[1:] / points[:-1])
-    # integral of c f^m over one piece; the exponent m + 1 may vanish, where it is a logarithm
+    # Integral of c f^m over one piece; it is a logarithm if the exponent m + 1 vanishes.
     exponent = np.log(power[1:] / power[:-1]) / ratio + 1.0
     growth = exponent * ratio
     pieces = power[:-1] * points[:-1] * ratio * np.where(np.abs(growth) < 1e-9, 1.0 + growth / 2,
@@ -53,9 +53,9 @@ def band_rms(frequency_Hz: np.ndarray, asd: np.ndarray, low_Hz: float, high_Hz: 
 
 
 def third_octave_midbands(low_Hz: float, high_Hz: float) -> np.ndarray:
-    """Exact midbands 1000 * 10^(k/10) Hz (IEC 61260-1:2014, base ten) from low_Hz to high_Hz, nominal names included.
+    """Exact midbands 1000 * 10^(k/10) Hz (IEC 61260-1:2014, base ten) from low_Hz to high_Hz, inclusive.
 
-    The limits are taken as nominal: 8 Hz means the band at 7.943 Hz.
+    The limits are nominal midbands: 8 Hz means the band at 7.943 Hz.
     """
     if not (np.isfinite(low_Hz) and np.isfinite(high_Hz) and 0 < low_Hz <= high_Hz):
         raise InputError("0 < low_Hz <= high_Hz", field="band_Hz", value=(low_Hz, high_Hz))
@@ -71,9 +71,9 @@ def third_octave_edges(midband_Hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def third_octave_rms(frequency_Hz: np.ndarray, asd: np.ndarray,
                      midband_Hz: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Midbands [Hz] and the r.m.s. in each, for every third octave that lies wholly inside the data.
+    """Midbands [Hz] and r.m.s. of the given third octaves, by default of all that lie entirely inside the data.
 
-    Raises InputError where a band asked for leaves the data, or none fits.
+    Raises InputError if a given band is not inside the data, or if no band is.
     """
     check_spectrum(frequency_Hz, asd)
     if midband_Hz is None:

@@ -1,6 +1,6 @@
-"""Floor motion as a model: a rational shaping filter fitted to a measured spectrum, and time series made from it.
+"""Models of floor motion: rational shaping filters fitted to measured spectra, and time series generated from them.
 
-The filter takes white noise of unit intensity (E[w(t) w(t')] = delta(t - t')) to displacement [m]. Its H2 norm is the
+The filter maps white noise of unit intensity (E[w(t) w(t')] = delta(t - t')) to displacement [m]. Its H2 norm is the
 r.m.s., and the one-sided ASD per square root of Hz is sqrt(2) |H(j 2 pi f)|.
 """
 
@@ -28,10 +28,10 @@ class SpectrumModel:
 
     Parameters
     ----------
-    name, source : what it models, and whose measurement it was fitted to.
-    shape : unit-intensity white noise -> displacement [m]; relative degree 2 at least, so that velocity is proper.
-    low_Hz, high_Hz : the band over which it was fitted; nothing is claimed outside.
-    error_rms_dB, error_max_dB : of the fit, against the smoothed measurement.
+    name, source : name of the model, and source of the measurement that it was fitted to.
+    shape : unit-intensity white noise -> displacement [m]; relative degree at least 2: velocity is strictly proper.
+    low_Hz, high_Hz : the band of the fit; the model is not valid outside.
+    error_rms_dB, error_max_dB : error of the fit relative to the smoothed measurement.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class SpectrumModel:
 
     def scaled_to_rms(self, rms: float, low_Hz: float, high_Hz: float,
                       quantity: Quantity = "velocity") -> SpectrumModel:
-        """The same shape with the r.m.s. wanted in a band."""
+        """The same shape, scaled to an r.m.s. in a band."""
         require_positive(rms, "rms")
         factor = rms / self.rms(low_Hz, high_Hz, quantity)
         return replace(self, name=f"{self.name}, scaled by {factor:.4g}", shape=self.shape.scaled(factor))
@@ -82,13 +82,13 @@ class SpectrumModel:
 
 
 def shipped_spectra() -> dict[str, SpectrumModel]:
-    """The models carried in the package, by name: fitted parameters and the source of the measurement."""
+    """The models shipped with the package, by name."""
     text = resources.files("avis_ctrl.rigs").joinpath("data/floor_spectra.toml").read_text(encoding="utf-8")
     return {name: spectrum_from_table(name, table) for name, table in tomllib.loads(text).items()}
 
 
 def shipped_spectrum(name: str) -> SpectrumModel:
-    """One model carried in the package; InputError names those there are."""
+    """A model shipped with the package; the InputError for an unknown name lists the known ones."""
     spectra = shipped_spectra()
     if name not in spectra:
         raise InputError(f"one of {sorted(spectra)}", field="spectrum", value=name)
@@ -96,7 +96,7 @@ def shipped_spectrum(name: str) -> SpectrumModel:
 
 
 def spectrum_from_table(name: str, table: dict) -> SpectrumModel:
-    """A model from its TOML table: corner frequencies in Hz, dampings, low-frequency ASD."""
+    """A model from its TOML table: corner frequencies in Hz, damping ratios, static ASD."""
     def pairs(key: str) -> tuple[tuple[float, float], ...]:
         return tuple((2 * np.pi * float(f), float(z)) for f, z in table.get(key, []))
 
@@ -115,7 +115,7 @@ def spectrum_from_table(name: str, table: dict) -> SpectrumModel:
 
 
 class FloorRecord(NamedTuple):
-    """A realised floor motion: time [s], displacement [m], velocity [m/s], each (n,)."""
+    """A realisation of floor motion: time [s], displacement [m], velocity [m/s], each (n,)."""
 
     time: np.ndarray
     displacement: np.ndarray
@@ -125,13 +125,13 @@ class FloorRecord(NamedTuple):
 def realise(spectrum: SpectrumModel, duration_s: float, dt: float, rng: np.random.Generator) -> FloorRecord:
     """A Gaussian time series with the spectrum of the model, exact at every line of its Fourier transform.
 
-    Each line k/duration draws an independent complex Gaussian amplitude of variance S(f) df; the inverse FFT
-    gives displacement, and j 2 pi f times the same amplitudes velocity. Lines below the model's low_Hz and
-    the Nyquist line are zero, so that nothing drifts. The record repeats after `duration_s`.
+    Each line k/duration has an independent complex Gaussian amplitude of variance S(f) df. The inverse FFT gives the
+    displacement; the same amplitudes times j 2 pi f give the velocity. Lines below the model's low_Hz and the Nyquist
+    line are zero, so that there is no drift. The record is periodic in `duration_s`.
 
     Raises
     ------
-    InputError : a duration or step that is not positive, or a record too short to hold a line of the band.
+    InputError : a duration or step that is not positive, or a record without a spectral line in the band.
     """
     require_positive(duration_s, "duration_s")
     require_positive(dt, "dt")
@@ -143,7 +143,7 @@ def realise(spectrum: SpectrumModel, duration_s: float, dt: float, rng: np.rando
     active = frequency >= spectrum.low_Hz * (1 - 1e-9)
     if n % 2 == 0:
         active[-1] = False
-    # x[m] = sum over k of Re(c_k exp(j 2 pi k m / n)) with E|c_k|^2 = 2 S df; irfft wants n/2 times c_k.
+    # x[m] = sum over k of Re(c_k exp(j 2 pi k m / n)) with E|c_k|^2 = 2 S df; irfft expects n/2 times c_k.
     line_rms = np.zeros(frequency.size)
     line_rms[active] = spectrum.asd(frequency[active]) * np.sqrt(1.0 / (n * dt))
     draw = rng.standard_normal((2, frequency.size))

@@ -1,8 +1,8 @@
-"""Real geophones from SEED RESP text files, and whether each file agrees with its own name.
+"""Commercial geophones read from SEED RESP text files, and a check of each file against its name.
 
 A file of the IRIS Nominal Response Library is named RESP.<network>.<station>.<location>.<channel>.<model>.<...>.
-What follows the model is coil ohm, shunt ohm (or NONE), corner Hz, gain V s/m; models without a shunt give only corner
-and gain, and the GS-11D gives its corner first. An underscore stands for the decimal point.
+The model is followed by coil [ohm], shunt [ohm] (or NONE), corner [Hz] and gain [V s/m]. Models without a shunt have
+only corner and gain; the GS-11D has its corner first. An underscore represents the decimal point.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ VELOCITY_UNIT, VOLT_UNIT = "M/S", "V"
 
 @dataclass(frozen=True)
 class CatalogueEntry:
-    """One RESP file: what its lines say, and what its name says.
+    """Data of one RESP file, from its content and from its name.
 
-    `corner_Hz`, `damping` and `gain_Vs_per_m` come from poles and stage gains; the fields that start with `named_`, the
-    coil and the shunt from the file's name (None: not given there).
+    `corner_Hz`, `damping` and `gain_Vs_per_m` are from poles and stage gains. The fields that start with `named_`, the
+    coil and the shunt are from the file's name (None: not given there).
     """
 
     file: str
@@ -41,10 +41,10 @@ class CatalogueEntry:
 
 
 def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[str]:
-    """What in the file contradicts its name or itself, in words with both numbers; empty when all agrees.
+    """Contradictions between a file and its name or within the file, in words with both numbers; empty if none.
 
-    Compared, each to the relative tolerance: corner from the poles, gain, the product of the stage gains with the
-    overall sensitivity, and the normalisation factor with the poles' response at its frequency.
+    Compared, each to the relative tolerance: corner (from the poles) and gain with the name, product of the stage gains
+    with the overall sensitivity, normalisation factor with the poles' response at its frequency.
     """
     s = 2j * np.pi * entry.normalisation_Hz
     w = 2 * np.pi * entry.corner_Hz
@@ -58,12 +58,12 @@ def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[s
 
 
 def read_response(path: str | Path) -> CatalogueEntry:
-    """One RESP file of a second-order velocity sensor.
+    """Read the RESP file of a second-order velocity sensor.
 
     Raises
     ------
     InputError : unreadable or truncated, a wrong unit or transfer-function type, poles or zeros that are missing,
-        not finite, unstable or not a conjugate pair, a name that cannot be read.
+        not finite, unstable or not a conjugate pair, a name that cannot be parsed.
     """
     path = Path(path)
     try:
@@ -101,7 +101,7 @@ def _parse(text: str, name: str) -> CatalogueEntry:
 
 
 def _poles_and_zeros_stage(text: str) -> str:
-    """The lines of the first stage's blockette 53 and what follows, or the complaint that they are not there."""
+    """Text from blockette 53 of the first stage on; InputError if it is missing."""
     start = text.find("B053F03")
     if start < 0:
         raise InputError("a poles-and-zeros stage (is the file truncated?)", field="B053F03")
@@ -149,7 +149,7 @@ def _stage_gains(text: str) -> dict[int, float]:
 
 
 def _from_name(name: str) -> dict[str, float | None]:
-    """Coil, shunt, corner and gain as the file's name states them; None for what it leaves out."""
+    """Coil, shunt, corner and gain as stated in the file's name; None for missing values."""
     parts = name.split(".")
     if len(parts) not in (8, 10):
         raise InputError("a name RESP.network.station.location.channel.model[.coil.shunt].corner.gain", field="name",
@@ -162,7 +162,7 @@ def _from_name(name: str) -> dict[str, float | None]:
         order = ["coil", "shunt", "corner", "gain"]
     named: dict[str, float | None] = {"coil": None, "shunt": None}
     for what, word in zip(order, parts[6:], strict=True):
-        # A letter after the corner tells elements of one model apart (HG-6 4.5A, 4.5B).
+        # A letter after the corner distinguishes elements of one model (HG-6 4.5A, 4.5B).
         number = re.sub(r"[A-Z]$", "", word).replace("_", ".")
         named[what] = None if word == "NONE" else _float(number, f"name ({what})")
     return named

@@ -19,10 +19,10 @@ from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix
 
 _ROOT_HALF = np.sqrt(0.5)
-# Signs of (x, y) of the corners that actuator A_i and spring i stand at, and of the force of A5..A8.
+# Signs of (x, y): corners at which actuator A_i and spring i are placed, and force directions of A5..A8.
 CORNERS = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 _PUSH = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
-# A5..A8 stand at (+-1/2, +-1/2) (L4 + L5): E fixes the lines of action only, not the places along them.
+# A5..A8 are placed at (+-1/2, +-1/2) (L4 + L5): E determines only their lines of action, not the points along them.
 _STAND = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -31,10 +31,10 @@ class Load:
     """Equipment on the plate: centre of mass (L7, L8, L9) [m] from the plate's, inertia about its own [kg m^2].
 
     Ixy, Ixz, Iyz are products of inertia with the sign of eq. 11 (the tensor has -Ixy). Table 2 prints
-    I_xx + I^e_xx; the terms m_e L^2 of eq. 16 come on top. Only this reading is admissible with
-    the table's "actual values": it leaves I^e = (0.115, 0.115, 0.230) with Ixy = 0.115, principal moments
-    (0, 0.230, 0.230), a slender rod under 45 degrees, on the edge of what a body can have. If the printed totals
-    contained m_e L^2, with 10 kg the load's own moments about x and y would be -0.005 kg m^2.
+    I_xx + I^e_xx, without the terms m_e L^2 of eq. 16. Only this interpretation is physically possible with the
+    table's "actual values": it gives I^e = (0.115, 0.115, 0.230) with Ixy = 0.115 and principal moments
+    (0, 0.230, 0.230), a slender rod at 45 degrees, the limiting case of a rigid body. If the printed totals included
+    m_e L^2, a load of 10 kg would have moments of -0.005 kg m^2 about x and y.
     """
 
     mass: float
@@ -88,7 +88,7 @@ class Halcyonics(Rig):
     """The table; SI units, symbols of the source.
 
     k_s : the four vertical spring stiffnesses, spring i at the corner of actuator A_i. The source has
-        one value for all; separate ones let each mount be uncertain by itself.
+        one value for all; separate values allow an independent uncertainty of each mount.
     e : force constants e_1..e_8 [N/V]; load : None when the plate is bare.
     Coordinates are those of the bare plate's centre of mass (eq. 16), loaded or not.
     """
@@ -135,7 +135,7 @@ class Halcyonics(Rig):
 
     @property
     def edge_m(self) -> float:
-        """Arm L2/2 along y of the springs and the vertical actuators."""
+        """Lever arm L2/2 along y of the springs and the vertical actuators."""
         return self.L2 / 2
 
     @property
@@ -216,7 +216,7 @@ class Halcyonics(Rig):
         return dict(zip(self.actuator_names, zip(places, directions, strict=True), strict=True))
 
     def mounted_body(self) -> MountedBody:
-        """The rig by positions: springs at (+-L1/2, +-L2/2), actuators as springs along their axes."""
+        """The rig described by positions: springs at (+-L1/2, +-L2/2), actuators as springs along their axes."""
         z = np.diag([0.0, 0.0, 1.0])
         corners = [np.array([cx * self.L1 / 2, cy * self.L2 / 2, 0.0]) for cx, cy in CORNERS]
         mounts = [Mount(f"spring{k}", place, place, stiffness * z, np.zeros((3, 3)))
@@ -231,7 +231,7 @@ class Halcyonics(Rig):
         return MountedBody(mass, inertia, centre, tuple(mounts), actuators, suspension, self.damping_matrix())
 
     def _rigid_body(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Mass, inertia about the common centre of mass, and that centre, of plate and load."""
+        """Mass, inertia about the common centre of mass, and this centre, of plate and load."""
         plate = np.diag([self.Ixx, self.Iyy, self.Izz])
         if self.load is None:
             return self.mass, plate, np.zeros(3)
@@ -253,7 +253,7 @@ class Halcyonics(Rig):
         return found | ({"load": Place(self.load.position(), "load")} if self.load else {})
 
     def sensors(self) -> tuple[Sensor, ...]:
-        """The built-in accelerometers (section 3.1), "acc_A1" at actuator A1 and along its axis, and so on."""
+        """The built-in accelerometers (section 3.1): "acc_A1" at actuator A1 along its axis, and so on."""
         axes, acc = self.actuator_axes(), self.accelerometers
         noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
         pole = complex(-2 * np.pi * acc.low_corner_Hz)
@@ -276,7 +276,7 @@ class Halcyonics(Rig):
         return found
 
     def _with_values(self, values: dict[str, float]) -> Halcyonics:
-        """`k_s` sets all four springs; k_s1..k_s4, when also given, go over it."""
+        """`k_s` sets all four springs; k_s1..k_s4, if given, take precedence."""
         springs = tuple(values.get(f"k_s{k}", values.get("k_s", old)) for k, old in enumerate(self.k_s, 1))
         constants = tuple(values.get(f"e{k}", old) for k, old in enumerate(self.e, 1))
         load = self.load and replace(self.load, **{name.removeprefix("load."): value for name, value in values.items()

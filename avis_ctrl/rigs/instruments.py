@@ -2,7 +2,7 @@
 
     motion along the sensor's axis -> zeros and poles of the sensor -> volts at the converter
 
-A geophone measures velocity and an accelerometer acceleration, both in space; a position sensor measures the
+A geophone measures absolute velocity, an accelerometer absolute acceleration; a position sensor measures the
 displacement of the payload relative to the chassis.
 """
 
@@ -21,12 +21,12 @@ from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
 
 Quantity = Literal["velocity", "acceleration", "displacement"]
 Triple = tuple[float, float, float]
-# Derivatives that each quantity is of a displacement.
+# Order of the time derivative of displacement.
 ORDER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 
 def unit_vector(direction: Triple, field: str) -> Triple:
-    """The direction scaled to length one, unchanged if it has that already. Raises InputError for a zero vector."""
+    """The direction scaled to unit length, unchanged if it has that length. Raises InputError for a zero vector."""
     length = float(np.linalg.norm(direction))
     if not (np.isfinite(length) and length > 0):
         raise InputError("expected a vector that is not zero", field=field, value=list(direction))
@@ -38,9 +38,9 @@ def unit_vector(direction: Triple, field: str) -> Triple:
 
 @dataclass(frozen=True)
 class Drive:
-    """A force anywhere: constant_N_per_V * volts at position [m] along direction (unit vector; its sign counts).
+    """A force at any position [m]: constant_N_per_V * volts along direction (unit vector with sign).
 
-    limit_V : largest voltage, None for the rig's common one.
+    limit_V : voltage limit; None for the rig's common limit.
     """
 
     name: str
@@ -52,20 +52,21 @@ class Drive:
 
 @dataclass(frozen=True)
 class Sensor:
-    """One channel of any kind.
+    """A sensor channel of any kind.
 
     Attributes
     ----------
-    quantity : what it measures along its axis: "velocity" [m/s] and "acceleration" [m/s^2] of the payload in space,
+    quantity : what it measures along its axis: absolute "velocity" [m/s] or "acceleration" [m/s^2] of the payload, or
         "displacement" [m] of the payload relative to the chassis.
-    zeros, poles : rad/s, of its chain from there to volts.
-    gain : volts per unit of motion in the passband: far above all corners; for a position sensor, at low frequency.
-    noise_rms_V : white noise of one sample, before the converter.
-    suspension : corner [Hz] and damping ratio of a geophone's own suspension, None for other kinds.
-    noise_density : the same noise as motion in the passband [unit/sqrt(Hz)], where the rig's file states it so.
-    low_pass : those of `poles` that are the anti-alias filter's.
-    offset_V : largest offset of the channel, of either sign.
-    flicker_rms_V : of one sample of white noise with the density that the 1/f noise has at 1 Hz.
+    zeros, poles : [rad/s] of the sensor chain from this motion to volts.
+    gain : volts per unit of motion in the passband: far above the high-pass corners; for a position sensor, at low
+        frequency.
+    noise_rms_V : r.m.s. of the white noise per sample, before the converter.
+    suspension : corner [Hz] and damping ratio of a geophone's suspension; None for other kinds.
+    noise_density : the same noise as motion in the passband [unit/sqrt(Hz)], if the rig file states it in this form.
+    low_pass : the poles of the anti-alias filter, which are also in `poles`.
+    offset_V : maximum offset of the channel, of either sign.
+    flicker_rms_V : r.m.s. per sample of a white noise whose density is that of the 1/f noise at 1 Hz.
     """
 
     name: str
@@ -84,7 +85,7 @@ class Sensor:
 
     @property
     def inertial(self) -> bool:
-        """Whether it measures motion in space, not relative to the chassis."""
+        """Whether it measures absolute motion, not motion relative to the chassis."""
         return self.quantity != "displacement"
 
     @property
@@ -94,25 +95,25 @@ class Sensor:
         return float(np.prod(np.abs(lags)))
 
     def chain(self, gain: float | None = None) -> StateSpace:
-        """Motion -> volts; `gain` in the place of its own where given."""
+        """Motion -> volts, with `gain` in place of the sensor's gain if it is given."""
         size = self.gain if gain is None else gain
         zeros, poles = (np.real_if_close(np.array(roots, complex)) for roots in (self.zeros, self.poles))
         return cascade(zeros, poles, self.leading * size, "motion", "voltage")
 
     def motion_density(self, converter: Converter | None, sample_rate_Hz: float) -> float:
-        """One-sided density of noise and rounding as motion in the passband [unit/sqrt(Hz)]."""
+        """One-sided density of sensor noise and rounding noise, as motion in the passband [unit/sqrt(Hz)]."""
         rounding = converter.noise_density_V_rtHz if converter else 0.0
         if self.noise_density is not None:
             return float(np.hypot(self.noise_density, rounding / self.gain))
         return float(np.hypot(rounding, white_density(self.noise_rms_V, sample_rate_Hz)) / self.gain)
 
     def flicker_density(self, sample_rate_Hz: float) -> float:
-        """One-sided density of the 1/f noise at 1 Hz as motion in the passband [unit/sqrt(Hz)]."""
+        """One-sided density of the 1/f noise at 1 Hz, as motion in the passband [unit/sqrt(Hz)]."""
         return white_density(self.flicker_rms_V, sample_rate_Hz) / self.gain
 
     def with_electronics(self, electronics: Electronics, preamplifier_gain: float, converter: Converter | None,
                          sample_rate_Hz: float) -> Sensor:
-        """The sensor with offset, 1/f noise and anti-alias filter of its channel."""
+        """The sensor with the offset, 1/f noise and anti-alias filter of its channel."""
         lags = electronics.low_pass()
         code, rounding = (converter.lsb_V, converter.noise_rms_V) if converter else (0.0, 0.0)
         return replace(self, poles=(*self.poles, *lags), low_pass=lags,
@@ -121,7 +122,7 @@ class Sensor:
                                                                sample_rate_Hz))
 
     def as_velocity(self, omega: np.ndarray) -> np.ndarray:
-        """(n,) complex, the chain of unit gain from velocity; omega > 0."""
+        """Response (n,) of the chain from velocity with unit passband gain, at omega > 0 [rad/s]."""
         s = 1j * np.asarray(omega, float)
         chain = self.leading * s ** (ORDER[self.quantity] - 1)
         for zero in self.zeros:
@@ -133,7 +134,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class GeophoneAt:
-    """A geophone of a rig file; without compensated_Hz no filter follows it. Noise: None for the ambient one."""
+    """A geophone of a rig file. compensated_Hz : None for no filter. noise_rms_V : None for the ambient noise."""
 
     name: str
     position: Triple
@@ -160,7 +161,7 @@ class GeophoneAt:
 
 @dataclass(frozen=True)
 class AccelerometerAt:
-    """A charge-amplified accelerometer of a rig file: S s/(s + w) on acceleration, its noise white at the output."""
+    """A charge-amplified accelerometer of a rig file: S s/(s + w) from acceleration, with white output noise."""
 
     name: str
     position: Triple
@@ -180,13 +181,13 @@ class AccelerometerAt:
 
 
 def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
-    """R.m.s. of one sample [V] of a motion's noise density, limited to half the sample rate."""
+    """R.m.s. per sample [V] of a noise density of motion, band-limited to half the sample rate."""
     return float(density * gain * np.sqrt(sample_rate_Hz / 2))
 
 
 def _noise_rms(rms_V: float | None, density: float | None, gain: float, acquisition: Acquisition,
                ambient: Ambient | None) -> float:
-    """The noise that the file states for a sensor, or else the ambient noise of the channels."""
+    """Noise stated in the file for a sensor, otherwise the ambient noise of the channels."""
     if rms_V is not None:
         return rms_V
     if density is not None:
@@ -196,7 +197,7 @@ def _noise_rms(rms_V: float | None, density: float | None, gain: float, acquisit
 
 @dataclass(frozen=True)
 class PositionSensorAt:
-    """A position sensor of a rig file, payload against chassis; bandwidth_Hz : first-order lag, None for none."""
+    """A position sensor of a rig file, payload relative to chassis. bandwidth_Hz : first-order lag, None for none."""
 
     name: str
     position: Triple
@@ -219,7 +220,7 @@ Instrument = GeophoneAt | AccelerometerAt | PositionSensorAt
 
 
 def with_gain(instrument: Instrument, gain: float) -> Instrument:
-    """The instrument with another gain, in volts per unit of motion after its preamplifier."""
+    """The instrument with another gain, in volts per unit of motion, preamplifier included."""
     sensitivity = gain / instrument.preamplifier_gain
     if isinstance(instrument, GeophoneAt):
         return replace(instrument, sensitivity_Vs_per_m=sensitivity)
@@ -230,9 +231,9 @@ def with_gain(instrument: Instrument, gain: float) -> Instrument:
 
 @dataclass(frozen=True)
 class FloorSensor:
-    """The sensor behind a column of floor velocity of a campaign: along x, y or z of the floor.
+    """The sensor of a floor-velocity channel of a campaign, along x, y or z of the floor.
 
-    noise_rms_m_per_s : white noise of one sample, as velocity of the floor.
+    noise_rms_m_per_s : r.m.s. of the white noise per sample, as floor velocity.
     """
 
     name: str
@@ -242,10 +243,10 @@ class FloorSensor:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """One standard deviation of each value of a rig file.
+    """Standard deviations of the values of a rig file.
 
-    Places: every coordinate of isolators, drives and sensors. Directions: of every drive and sensor, about both
-    normals.
+    place_m : of every coordinate of isolators, drives and sensors. direction_rad : of the direction of every drive and
+    sensor, about both normals.
     """
 
     place_m: float = 0.001

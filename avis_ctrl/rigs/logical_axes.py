@@ -1,13 +1,13 @@
-"""Actuator and sensor matrices: between physical channels and the logical axes x .. phi_z (Rademakers, A.4).
+"""Matrices between physical channels and the logical axes x .. phi_z (Rademakers, appendix A.4).
 
-Built from geometry alone. Appendix A.4 itself is not in the text at hand; these are the kinematic relations that
-section 2.1.1 says it was built from.
+They follow from the geometry alone. Appendix A.4 was not available; these are the kinematic relations on which it is
+based according to section 2.1.1.
 
-If the channels do not span all six coordinates, the requested axes are driven (or measured) exactly and the others as
-little as these channels allow; rotations count as displacement, or force, at the edge. Sensors of motion in space take
-precedence. Position sensors measure the payload relative to the chassis: they help to separate other coordinates from
-the requested one, and measure an axis themselves only if the other sensors cannot. That axis is then "relative": its
-reading includes the motion of the floor.
+If the channels do not span all six coordinates, the requested axes are driven (or measured) exactly, and the other
+coordinates as little as the channels allow; rotations count as displacement, or force, at the edge. Sensors of absolute
+motion take precedence. Position sensors measure the payload relative to the chassis: they help to separate other
+coordinates from the requested ones, and measure an axis only if the other sensors cannot. Such an axis is called
+"relative": its signal includes the motion of the floor.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 class Reach:
     """What a set of channels can drive or measure.
 
-    weakest : smallest share of the strongest combination that counts. Drawings give directions to about 0.005 rad; what
-        channels drive or measure only by such a tilt is not intended.
-    noise_band_Hz : where the sensors' noise, as velocity, is compared: the band of a table's modes and of its loops.
+    weakest : minimum singular value that counts, relative to the largest. Drawings give directions to about 0.005 rad;
+        a coordinate that is driven or measured only through such a tilt is not intended.
+    noise_band_Hz : band in which the sensors' noise is compared as velocity: that of a table's modes and loops.
     """
 
     weakest: float = 0.02
@@ -43,12 +43,12 @@ class ActuatorAxes:
     """Voltages to generalised forces and back.
 
     matrix : (6, n_u) T, N/V and N m/V, all six coordinates.
-    allocation : (n_u, n_axes) V per N or N m: the voltages of least Euclidean norm that make the
-        force asked on `axes` and as little as possible on the others.
-    condition : condition number of the rows inverted, each scaled to unit length, so that it does
+    allocation : (n_u, n_axes) V per N or N m: the voltages of minimum Euclidean norm for a force on `axes`, with the
+        minimum force on the other coordinates.
+    condition : condition number of the inverted rows, each scaled to unit length, so that it does
         not depend on units.
     leftover : (n_others, n_axes) force on the other coordinates per force on `axes`, moments as forces at the edge;
-        zero where the actuators span all six coordinates.
+        zero if the actuators span all six coordinates.
     """
 
     actuators: tuple[str, ...]
@@ -65,11 +65,11 @@ class SensorAxes:
 
     matrix : (n_s, 6) from q to the sensors.
     decoding : (n_axes, n_s) least-squares inverse, weighted with the sensors' noise: logical coordinates `axes` from
-        the sensors, with the least possible sensitivity to the others.
-    condition : condition number of the columns inverted, each scaled to unit length.
-    leftover : (n_axes, n_others) what is read of the other coordinates, rotations at the edge.
-    relative : those of `axes` that are measured relative to the chassis.
-    inertial : (n_s,) which sensors measure motion in space.
+        the sensors, with minimum sensitivity to the other coordinates.
+    condition : condition number of the inverted columns, each scaled to unit length.
+    leftover : (n_axes, n_others) sensitivity to the other coordinates, rotations at the edge.
+    relative : the axes that are measured relative to the chassis.
+    inertial : (n_s,) True for sensors of absolute motion.
     """
 
     sensors: tuple[str, ...]
@@ -88,8 +88,8 @@ def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES,
 
     Raises
     ------
-    InputError : unknown names, or axes that these actuators cannot push independently; it names the
-        combination that is out of reach.
+    InputError : unknown names, or axes that these actuators cannot drive independently, which the
+        message names.
     """
     eom = rig.equations_of_motion()
     names = eom.actuators if actuators is None else tuple(actuators)
@@ -108,7 +108,7 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
 
     Raises
     ------
-    InputError : unknown names, or coordinates that these sensors cannot tell apart.
+    InputError : unknown names, or coordinates that these sensors cannot distinguish.
     """
     all_names, matrix = rig.sensor_rows()
     names = all_names if sensors is None else tuple(sensors)
@@ -125,7 +125,7 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     if absolute and alone:
         decoding, condition = _blind_inverse(H, wanted, others, rig.edge_m, complaint, noise)
     elif absolute:
-        # Position sensors see the absolute axes minus the floor's motion: unknowns of their own.
+        # Position sensors measure the absolute axes minus the floor motion, which adds unknowns.
         own = [H[:, k] * inertial for k in absolute]
         both = [H[:, k] for k in range(6) if k not in absolute]
         against = [H[:, k] * ~inertial for k in absolute]
@@ -152,12 +152,12 @@ def drivable(rig: Rig) -> tuple[str, ...]:
 
 
 def sensed(rig: Rig) -> tuple[str, ...]:
-    """Coordinates that the sensors can separate from all others, in space or relative to the chassis."""
+    """Coordinates that the sensors can separate from all others, absolutely or relative to the chassis."""
     return _spanned(rig.sensor_rows()[1], rig.edge_m)
 
 
 def _spanned(H: np.ndarray, edge_m: float) -> tuple[str, ...]:
-    """Coordinates within the rows of H (n, 6)."""
+    """Coordinates that lie in the row space of H (n, 6)."""
     _, sizes, V = np.linalg.svd(H * _edge_scale(edge_m), full_matrices=False)
     kept = V[sizes > REACH.weakest * sizes[0]]
     return tuple(name for k, name in enumerate(COORDINATES)
@@ -165,7 +165,7 @@ def _spanned(H: np.ndarray, edge_m: float) -> tuple[str, ...]:
 
 
 def _absolute(H: np.ndarray, wanted: list[int], edge_m: float, noise: np.ndarray) -> list[int]:
-    """Of the wanted axes those that inertial sensors H (n, 6) read with less of the other coordinates than of them."""
+    """The wanted axes that inertial sensors H (n, 6) measure with less than unit sensitivity to other coordinates."""
     found: list[int] = []
     scale = _edge_scale(edge_m)
     for k in wanted:
@@ -182,7 +182,7 @@ def _absolute(H: np.ndarray, wanted: list[int], edge_m: float, noise: np.ndarray
 
 
 def _noise(rig: Rig, chosen: list[int]) -> np.ndarray:
-    """(n,) noise of each sensor as velocity, over the largest; ones where all are alike."""
+    """(n,) noise of each sensor as velocity, relative to the largest; ones if all are equal."""
     omega = 2 * np.pi * np.geomspace(*REACH.noise_band_Hz, 20)
     all_of, found = rig.sensors(), []
     for k in chosen:
@@ -193,7 +193,7 @@ def _noise(rig: Rig, chosen: list[int]) -> np.ndarray:
 
 
 def _edge_scale(edge_m: float) -> np.ndarray:
-    """(6,) that turn columns by q into columns by displacements, rotations at the edge."""
+    """(6,) factors that convert columns for q into columns for displacements, rotations at the edge."""
     return np.array([1 / edge_m if name.startswith("phi") else 1.0 for name in COORDINATES])
 
 
@@ -203,10 +203,10 @@ def _arms(rig: Rig) -> np.ndarray:
 
 def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: float, complaint: str,
                    noise: np.ndarray | None = None, order: list[int] | None = None) -> tuple[np.ndarray, float]:
-    """D (n_wanted, n) with D H = I on `wanted` and as little as possible on `others`, then of least noise.
+    """D (n_wanted, n) with D H = I on `wanted`, minimum response to `others` and, of these, minimum noise.
 
-    H : (n, m) by coordinates `order` (m,), by default the six.
-    Also returns the condition number of the columns inverted, each scaled to unit length.
+    H : (n, m), its columns the coordinates `order` (m,), by default all six.
+    Also returns the condition number of the inverted columns, each scaled to unit length.
     """
     order = list(range(6)) if order is None else order
     scale = _edge_scale(edge_m)[order]
@@ -217,7 +217,7 @@ def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: 
         if np.all(lengths > 0) and sizes[-1] > REACH.weakest * sizes[0]:
             return _weighted(H[:, columns], len(wanted), noise)
     _require_reach(H * scale, wanted, [order[k] for k in wanted], complaint)
-    # Of the others, what these channels tell from the wanted ones; it is made zero, the rest is left over.
+    # The part of the other columns that these channels distinguish from the wanted ones is zeroed; the rest remains.
     own, rest = H[:, wanted] * scale[wanted], H[:, others] * scale[others]
     basis = np.linalg.qr(own)[0]
     _, sizes, V = np.linalg.svd(rest - basis @ (basis.T @ rest), full_matrices=False)
@@ -227,7 +227,7 @@ def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: 
 
 
 def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], complaint: str) -> None:
-    """Raises InputError where a combination of the wanted columns of H, rotations at the edge, is hardly there."""
+    """Raises InputError if a combination of the wanted columns of H, rotations at the edge, is too weak."""
     _, sizes, V = np.linalg.svd(H[:, wanted], full_matrices=True)
     there = int(np.sum(sizes > REACH.weakest * np.linalg.svd(H, compute_uv=False)[0]))
     if there < len(wanted):
@@ -237,7 +237,7 @@ def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], com
 
 
 def _weighted(columns: np.ndarray, n_wanted: int, noise: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """First rows of the left inverse of `columns` (n, m) that is least in the noise (n,), and the condition number."""
+    """First rows of the minimum-noise left inverse of `columns` (n, m), and the condition number. noise : (n,)."""
     sizes = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)
     if noise is None or np.all(noise == 1):
         inverse = np.linalg.pinv(columns.T).T

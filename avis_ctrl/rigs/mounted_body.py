@@ -1,8 +1,8 @@
-"""A rigid body on springs and dampers with actuators, described by positions: what both rigs are.
+"""A rigid body on springs and dampers with actuators, described by positions: the model of both rigs.
 
-The reference point (origin of all positions, and the point that q describes) is the geometric
-centre; the centre of mass may lie beside it. Weight and the preload that carries it are not in the
-sources: the levelled body rests at q = 0 without force in its springs.
+The reference point (origin of all positions, and the point described by q) is the geometric centre;
+the centre of mass may be offset from it. The sources do not include the weight and the preload that
+supports it: the levelled body rests at q = 0 without force in its springs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _freeze(thing: object, **shapes: tuple[int, ...]) -> None:
 class Mount:
     """Spring and damper along earth axes between a body point and a chassis point.
 
-    position, chassis_point : (3,) m, each from its own body's reference point.
+    position, chassis_point : (3,) m, relative to the reference points of payload and chassis.
     stiffness, damping : (3, 3) N/m and N s/m in earth axes.
     """
 
@@ -49,7 +49,7 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class PointActuator:
-    """Force constant * u [N] at a body point (3,) [m] along a unit earth direction (3,)."""
+    """Force constant_N_per_V * u [N] at a body point (3,) [m] along a unit direction (3,) in earth axes."""
 
     name: str
     position: np.ndarray
@@ -70,9 +70,8 @@ class MountedBody:
     Parameters
     ----------
     mass : kg, positive.
-    inertia : (3, 3) kg m^2 about the centre of mass in body axes, positive definite together with
-        the mass and offset.
-    centre_of_mass : (3,) m from the reference point.
+    inertia : (3, 3) kg m^2 about the centre of mass in body axes, symmetric positive definite.
+    centre_of_mass : (3,) m relative to the reference point.
     mounts, actuators : point elements.
     stiffness, damping : (6, 6) additional generalised stiffness and damping between body and
         chassis, about the reference point (k_t, k_r and d1..d6 of the Halcyonics table).
@@ -105,7 +104,7 @@ class MountedBody:
                          [self.mass * S, self.inertia - self.mass * S @ S]])
 
     def equations_of_motion(self) -> EquationsOfMotion:
-        """Linearised about rest (Rademakers, eq. 2.36, with the chassis motion kept)."""
+        """Equations linearised about rest (Rademakers, eq. 2.36, with the chassis motion included)."""
         K, C = np.array(self.stiffness), np.array(self.damping)
         K_floor, C_floor = K.copy(), C.copy()
         for mount in self.mounts:

@@ -1,8 +1,8 @@
 """The nonlinear Newton-Euler model of a mounted body (Rademakers, eqs. 2.1-2.21), compiled.
 
 Large 3-2-1 rotations of payload and chassis; springs, dampers and actuators act along earth axes at
-body-fixed points; full inertia and an offset centre of mass. Gravity is not in the source: the
-levelled payload rests at q = 0 without force in its mounts, and its weight makes no moment.
+body-fixed points; full inertia and an offset centre of mass. The source does not include gravity: the
+levelled payload rests at q = 0 without force in its mounts, and its weight exerts no moment.
 
 `payload_acceleration` works on plain arrays so that a compiled closed loop can call it at each step.
 """
@@ -18,10 +18,10 @@ from avis_ctrl.rigs.mounted_body import MountedBody
 
 
 class RigArrays(NamedTuple):
-    """A `MountedBody` as C-contiguous float arrays, for compiled code (numba takes it as it is).
+    """A `MountedBody` as C-contiguous float arrays, for compiled code (accepted by numba).
 
     mass : float, kg
-    centre_of_mass : (3,) m, body axes, from the reference point
+    centre_of_mass : (3,) m, body axes, relative to the reference point
     inertia_ref : (3, 3) kg m^2 about the reference point, body axes
     inverse_mass : (6, 6) inverse of [[m I, -m S(c)], [m S(c), inertia_ref]], constant in body axes
     mount_position, mount_chassis : (n_mounts, 3) m
@@ -66,8 +66,8 @@ def rig_arrays(body: MountedBody) -> RigArrays:
 def rotation(angles):
     """Body to earth axes for the 3-2-1 angles (phi_x, phi_y, phi_z) [rad], (3, 3): R3(phi_z) R2(phi_y) R1(phi_x).
 
-    The matrix of Rademakers' eq. 2.4. His eq. 2.3 reads as if it took earth to body axes; it takes the components of a
-    vector from body to earth axes.
+    The matrix of Rademakers' eq. 2.4. Eq. 2.3 there reads like a transformation from earth to body axes, but the
+    matrix transforms the components of a vector from body to earth axes.
     """
     c1, c2, c3 = np.cos(angles[0]), np.cos(angles[1]), np.cos(angles[2])
     s1, s2, s3 = np.sin(angles[0]), np.sin(angles[1]), np.sin(angles[2])
@@ -87,9 +87,9 @@ def _cross(out, a, b):
 
 @njit(cache=True)
 def body_rates(omega, angles, rates):
-    """Angular velocity in body axes, from angles' (Rademakers, eq. 2.5).
+    """Angular velocity in body axes from the rates of the angles (Rademakers, eq. 2.5), written to omega.
 
-    The source says that eq. 2.5 is "with respect to" the earth frame; its components are in body axes.
+    The source states eq. 2.5 "with respect to" the earth frame; its components are in body axes.
     """
     c1, s1, c2, s2 = np.cos(angles[0]), np.sin(angles[0]), np.cos(angles[1]), np.sin(angles[1])
     omega[0] = rates[0] - s2 * rates[2]
@@ -99,7 +99,7 @@ def body_rates(omega, angles, rates):
 
 @njit(cache=True)
 def _point_motion(place, speed, R, omega, p, q, q_dot):
-    """Displacement from p and velocity of the body-fixed point p, earth axes."""
+    """Displacement and velocity of the body-fixed point p in earth axes."""
     # Scalars, not small arrays: this runs for every mount at every step.
     t0, t1, t2 = omega[1] * p[2] - omega[2] * p[1], omega[2] * p[0] - omega[0] * p[2], omega[0] * p[1] - omega[1] * p[0]
     for i in range(3):
@@ -109,7 +109,7 @@ def _point_motion(place, speed, R, omega, p, q, q_dot):
 
 @njit(cache=True)
 def _add_force(wrench, arm, R, force):
-    """Adds an earth-axes force at the body point `arm` to the body-axes force and moment."""
+    """Add a force in earth axes at the body point `arm` to force and moment in body axes."""
     f0 = R[0, 0] * force[0] + R[1, 0] * force[1] + R[2, 0] * force[2]
     f1 = R[0, 1] * force[0] + R[1, 1] * force[1] + R[2, 1] * force[2]
     f2 = R[0, 2] * force[0] + R[1, 2] * force[1] + R[2, 2] * force[2]
@@ -123,7 +123,7 @@ def _add_force(wrench, arm, R, force):
 
 @njit(cache=True)
 def _mount_wrench(wrench, R, omega, q, q_dot, q_ch, q_ch_dot, arrays):
-    """Springs and dampers of eqs. 2.15-2.16, in body axes about the reference point."""
+    """Force and moment of the springs and dampers of eqs. 2.15-2.16, in body axes about the reference point."""
     R_ch, omega_ch = rotation(q_ch[3:]), np.empty_like(omega)
     body_rates(omega_ch, q_ch[3:], q_ch_dot[3:])
     place, speed, place_ch, speed_ch = (np.empty_like(omega), np.empty_like(omega), np.empty_like(omega),
@@ -143,7 +143,7 @@ def _mount_wrench(wrench, R, omega, q, q_dot, q_ch, q_ch_dot, arrays):
 
 @njit(cache=True)
 def _generalised_wrench(wrench, R, q, q_dot, q_ch, q_ch_dot, arrays):
-    """The 6 x 6 stiffness and damping: forces on the coordinates, turned into body axes by inv(W)^T."""
+    """Generalised forces of the 6 x 6 stiffness and damping, converted to body axes by inv(W)^T."""
     Q = np.empty_like(wrench)
     for i in range(6):
         Q[i] = 0.0
@@ -161,7 +161,7 @@ def _generalised_wrench(wrench, R, q, q_dot, q_ch, q_ch_dot, arrays):
 
 @njit(cache=True)
 def _accelerations(wrench, R, omega, q, q_dot, arrays):
-    """Newton and Euler about the reference point in body axes, eqs. 2.8-2.14; returns q''."""
+    """Newton-Euler equations about the reference point in body axes, eqs. 2.8-2.14; returns q''."""
     c = arrays.centre_of_mass
     turning, momentum = np.empty_like(omega), np.empty_like(omega)
     centrifugal, gyroscopic = np.empty_like(omega), np.empty_like(omega)
@@ -204,9 +204,9 @@ def payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, arrays):
     q_ch, q_ch_dot : (6,) motion of the chassis, same coordinates.
     arrays : `RigArrays`.
 
-    All arrays contiguous, writable float64 (complex128 in all but `arrays` is compiled when first asked for, for
-    complex-step Jacobians).
-    Singular at phi_y = +-90 degrees, as every set of 3-2-1 angles is.
+    All arrays are contiguous, writable float64 (complex128 in all but `arrays`, for complex-step Jacobians, is compiled
+    at the first call).
+    Singular at phi_y = +-90 degrees, as all 3-2-1 angles are.
     """
     R = rotation(q[3:])
     omega = np.empty_like(q[3:])

@@ -1,9 +1,9 @@
-"""Whether a rig file can describe a table at all, and if not, which unit error would explain it.
+"""Plausibility check of a rig file: can it describe a real table, and if not, which unit error would explain it?
 
 Natural frequencies, sag, damping ratios, mass per area, radii of gyration, travel of the drives, full scale and noise
-of the sensors, delay and sample rate are computed from the file (`judged`). If one is out of range, every single unit
-error (`unit_slips`) is undone in turn, and the one that brings everything into range, with the fewest unusual values
-left, is named.
+of the sensors, delay and sample rate are computed from the file (`judged`). If one of them is out of range, each
+possible unit error (`unit_slips`) is corrected in turn. The error whose correction brings all properties into range,
+with the fewest unusual values, is reported.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ ALIKE = ("constant_N_per_V", "sensitivity_Vs_per_m", "sensitivity_Vs2_per_m", "s
 class SlipCost:
     """Weights that decide which unit error ("slip") is the likeliest, in squared decades beyond the usual range.
 
-    scope : times the square of the steps from one number to a list, a key, a unit in a section, in the file. rank : a
-    step down the list of what people write instead. off_centre : all properties at the ends of what is usual. apart :
-    the slip's numbers a decade from the others of their unit in their section. near : a second field is named beside
-    the first where it is that near. better : part of the cost before, below which an unusual rig is taken for a slip.
+    scope : times the squared scope of the slip (`Slip.scope`). rank : per position in the list of likely wrong units.
+    off_centre : if all properties of the table are at the ends of their usual ranges. apart : if the corrected numbers
+    are a decade from the others of the same unit and section. near : a second field is named if its cost is within this
+    of the best. better : an unusual rig is taken for a slip if the correction reduces the cost below this fraction.
     """
 
     scope: float = 0.02
@@ -46,15 +46,15 @@ COST = SlipCost()
 
 
 class UnusualRig(UserWarning):
-    """A rig file has a value that is possible but unusual: one line."""
+    """Warning, in one line, of a value in a rig file that is possible but unusual."""
 
 
 @dataclass(frozen=True)
 class Property:
-    """A property of the table, judged.
+    """A property of the table compared with its range.
 
-    kind : of the range. refused, unusual : decades beyond what is possible and what is usual, 0 inside. off_centre : of
-    `Range`. words : with number and unit. field, value : of the file, where it is a single key's.
+    kind : name of the range. refused, unusual : decades beyond the possible and the usual range, 0 inside. off_centre :
+    see `Range`. words : with number and unit. field, value : in the file, if it is the property of a single key.
     """
 
     kind: str
@@ -71,11 +71,11 @@ def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = R
 
     Parameters
     ----------
-    content : of the TOML file. build : makes the rig, and raises InputError if it cannot.
+    content : of the TOML file. build : makes the rig from it, or raises InputError.
 
     Raises
     ------
-    InputError : that of `build`, with the likely unit error if there is one; values that no table has.
+    InputError : the error of `build`, with the likely unit error if there is one; values that no real table has.
     """
     try:
         rig = build(content)
@@ -123,9 +123,9 @@ def _shown(value: Any) -> str:
 
 
 def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now: float = np.inf) -> list[Slip]:
-    """Slips that, undone, leave nothing impossible and less that is unusual than `now`: the best, and one as near.
+    """Slips whose correction leaves nothing impossible and a cost well below `now`: the best, and one nearly as good.
 
-    Single numbers of lists are tried where something is impossible and nothing wider explains it.
+    Single numbers of lists are tried only if something is impossible and no wider slip explains it.
     """
     found: list[tuple[float, Slip]] = []
     before, _, _ = _outcome(content, build, ranges)
@@ -138,7 +138,7 @@ def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now:
         mended = slip.mended(content)
         odd, refused, cost = _outcome(mended, build, ranges)
         if odd == before:
-            # What is wrong does not depend on these numbers.
+            # The problem does not depend on these numbers.
             idle.update(entry.place for entry in slip.entries)
         elif not refused and cost <= COST.better * now:
             cost += COST.scope * slip.scope ** 2 + COST.rank * slip.rank + COST.apart * apart(slip, mended)
@@ -154,7 +154,7 @@ def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now:
 
 
 def _outcome(content: dict[str, Any], build: Build, ranges: PlausibleRanges) -> tuple[tuple[str, ...], bool, float]:
-    """What is odd about a content, in words; whether it is refused; its cost."""
+    """Unusual or impossible properties of a content in words; whether it is rejected; its cost."""
     try:
         properties = judged(content, build(content), ranges)
     except (InputError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -170,7 +170,7 @@ def _cost(properties: Sequence[Property]) -> float:
 
 
 def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) -> list[Property]:
-    """Every property of a rig that is held against a range."""
+    """All properties of a rig, each compared with its range."""
     found: list[Property] = []
 
     def judge(kind: str, value: float, words: str, field: str = "", of: Range | None = None) -> None:
@@ -272,7 +272,7 @@ def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
 
 
 def _unequal(values: np.ndarray, names: list[str], judge: Judge) -> None:
-    """Entries against the median of the nonzero ones, if there are at least three of them."""
+    """Compare the nonzero entries with their median, if there are at least three of them."""
     there = np.abs(values) > 1e-9 * np.max(np.abs(values), initial=0.0)
     if np.count_nonzero(there) < 3:
         return
@@ -291,7 +291,7 @@ def _clock(rig: Rig, f: float, judge: Judge) -> None:
 
 
 def _hearing(content: dict[str, Any], judge: Judge) -> None:
-    """Full scale and noise of velocity sensors against converter and floor motion."""
+    """Full scale of the velocity sensors, and their signal and noise relative to converter range and floor motion."""
     def of(section: str, key: str) -> float | None:
         part = content.get(section)
         value = part.get(key) if isinstance(part, dict) else None
@@ -312,7 +312,7 @@ def _hearing(content: dict[str, Any], judge: Judge) -> None:
 
 
 def _velocity_sensors(content: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """Name and volts per m/s of every geophone: one section of lists, or one table each."""
+    """Name and gain [V s/m] of every geophone, from the section of lists and from the tables of single geophones."""
     together = content.get("geophones")
     parts: list[Any] = content.get("geophone") or []
     if isinstance(together, dict):

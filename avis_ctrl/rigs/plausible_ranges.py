@@ -1,8 +1,8 @@
-"""Ranges of the properties of real tables: outside the wide ones a rig file is refused, outside the narrow ones it
-gets a warning.
+"""Ranges of the properties of real tables. A rig file outside a wide range is rejected, outside a narrow one it gets
+a warning.
 
-They cover tables from 0.3 kg to 100 t, on springs, air, rubber, magnets or piezo stacks, in laboratory and factory. A
-wrong unit is a factor of 25 to 1e9; the ranges are as wide as real tables need, and no wider.
+They cover tables from 0.3 kg to 100 t, on springs, air, rubber, magnets or piezo stacks, in laboratories and factories.
+A wrong unit is an error by a factor of 6 (rad/s) to 1e9; the ranges are only as wide as real tables need.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Range:
-    """lowest, low, high, highest in `unit`: outside low .. high is unusual, outside lowest .. highest is refused.
+    """Values outside low .. high are unusual, values outside lowest .. highest are rejected; all in `unit`.
 
     why : the reason for the range.
     """
@@ -28,12 +28,12 @@ class Range:
     why: str
 
     def beyond(self, value: float) -> tuple[float, float]:
-        """Decades of a positive value beyond (what is possible, what is usual), 0 inside."""
+        """Decades by which a positive value exceeds the (possible, usual) range, 0 inside."""
         return tuple(max(log10(low / value) if low else 0.0, log10(value / high), 0.0)  # type: ignore[return-value]
                      for low, high in ((self.lowest, self.highest), (self.low, self.high)))
 
     def off_centre(self, value: float) -> float:
-        """How far a positive value is from the middle of what is usual, 1 at its ends; 0 where only the upper is."""
+        """Distance of a positive value from the middle of the usual range, 1 at its ends; 0 without a lower end."""
         if not 0 < self.low < self.high:
             return 0.0
         return abs(log10(value / self.low) + log10(value / self.high)) / log10(self.high / self.low)
@@ -41,26 +41,26 @@ class Range:
 
 @dataclass(frozen=True)
 class PlausibleRanges:
-    """Of the table as a whole, and of single keys of its file.
+    """Ranges of the properties of the table as a whole, and of single keys of its file.
 
     Attributes
     ----------
-    mode_Hz : every natural frequency. slowest_Hz : the lowest one. sag_m : g over the square of the lowest natural
-        frequency of vertical motion, the sag of a plain spring (mounts that are levelled or of negative stiffness sag
+    mode_Hz : every natural frequency. slowest_Hz : the lowest one. sag_m : g over the square of the lowest angular
+        frequency of vertical motion, the sag of a plain spring (levelled mounts and mounts of negative stiffness sag
         less, but are as hard to build). spread : highest natural frequency over lowest.
-    damping : damping ratio of every mode that has any.
-    slab_kg_per_m2 : mass over the circle through the outermost mount. gyration : each sqrt(J / m), and mounts_height
-        the distance of the centre of mass from the mounts' centre, over the radius of that circle.
-    outlier : distance of one point from the mounts' centre over that radius.
-    unequal : one of several like entries (stiffness of a mount along an axis, force constant, sensitivity) over their
-        median.
-    acceleration : of all drives at their limit, per direction, over the mass. travel_m : the same force over the
-        stiffness. travel_share : over the radius of the mounts' circle.
+    damping : smallest and largest modal damping ratio; zero is not judged.
+    slab_kg_per_m2 : mass over the area of the circle through the outermost mount. gyration : each sqrt(J / m), and
+        mounts_height the distance of the centre of mass from the mounts' centre, over the radius of that circle.
+    outlier : distance of a point from the mounts' centre over the median of the mounts' distances.
+    unequal : one of several similar entries (stiffness of a mount along an axis, force constant, sensitivity) over
+        their median.
+    acceleration : force of all drives at their limit over the mass, in the direction where it is largest. travel_m :
+        the same force over the stiffness. travel_share : travel_m over the radius of the mounts' circle.
     samples_per_cycle : of the fastest mode. delay_cycles : loop delay in cycles of the fastest mode.
     full_scale_m_per_s : converter range over sensitivity and gain of a velocity sensor.
-    deaf : noise (of sensor or converter step) in velocity over the floor's. floor_share : the floor's volts over the
-        converter's range.
-    keys : single keys of a rig file, by name; zero is allowed for all.
+    deaf : noise of a velocity sensor (its own or the converter's) over the floor velocity. floor_share : voltage due to
+        floor motion over the converter range.
+    keys : single keys of a rig file, by name; zero is always allowed.
     """
 
     mode_Hz: Range = Range(0.03, 0.15, 400.0, 1500.0, "Hz", "pendulums reach 0.1 Hz, stiff piezo mounts 100 Hz")

@@ -1,4 +1,4 @@
-"""What every rig offers, whatever its geometry: named parameters and equations of motion."""
+"""Common interface of all rigs: named parameters, equations of motion, drives and sensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Parameter:
 
 
 class Place(NamedTuple):
-    """A point of a drawing: position (3,) [m] from the geometric centre and what is there."""
+    """A point of a drawing: position (3,) [m] relative to the geometric centre, and what is there."""
 
     position: np.ndarray
     kind: str
@@ -37,8 +37,8 @@ class Place(NamedTuple):
 class Rig(ABC):
     """A table on its isolators.
 
-    Coordinates q of the payload's geometric centre; `edge_m` is the lever arm that turns phi_x into
-    displacement of the edge along z.
+    The coordinates q are those of the payload's geometric centre; `edge_m` is the lever arm that converts phi_x into
+    a displacement of the edge along z.
     """
 
     name: str
@@ -53,38 +53,38 @@ class Rig(ABC):
     @property
     @abstractmethod
     def edge_m(self) -> float:
-        """Distance [m] from the phi_x axis to the edge whose displacement judges phi_x."""
+        """Distance [m] from the phi_x axis to the edge whose displacement represents phi_x."""
 
     @property
     @abstractmethod
     def drive_limit_V(self) -> float:
-        """Largest voltage of the actuators; the largest of all limits if they differ."""
+        """Voltage limit of the actuators; the largest limit if they differ."""
 
     def drive_limits_V(self) -> np.ndarray:
-        """(n_u,) largest voltage of each actuator."""
+        """(n_u,) voltage limit of each actuator."""
         return np.full(len(self.equations_of_motion().actuators), self.drive_limit_V)
 
     def limits_of(self, names: Sequence[str]) -> np.ndarray:
-        """(n,) largest voltage [V] of some actuators by name."""
+        """(n,) voltage limits [V] of the named actuators."""
         known = dict(zip(self.equations_of_motion().actuators, self.drive_limits_V().tolist(), strict=True))
         return np.array([known[name] for name in names])
 
     @abstractmethod
     def with_drives_limited(self, limit_V: float) -> Self:
-        """The rig with no drive beyond this voltage; lower limits stay."""
+        """The rig with all drives limited to at most this voltage; lower limits are kept."""
 
     @abstractmethod
     def with_loop_delay(self, delay_s: float) -> Self:
         """The rig with another delay from sample to drive voltage."""
 
     def with_electronics(self, electronics: Electronics) -> Self:
-        """The rig with another offset, 1/f noise or anti-alias filter of its channels."""
+        """The rig with other electronics of its channels: offset, 1/f noise, anti-alias filter."""
         return replace(self, electronics=electronics)  # type: ignore[type-var]
 
     @property
     @abstractmethod
     def sample_rate_Hz(self) -> float:
-        """Clock of the controller."""
+        """Sample rate of the controller."""
 
     @property
     @abstractmethod
@@ -97,15 +97,15 @@ class Rig(ABC):
 
     @abstractmethod
     def _with_values(self, values: dict[str, float]) -> Self:
-        """A new rig; the names are known and the values finite."""
+        """A new rig with these values; the names are known and the values finite."""
 
     @abstractmethod
     def mounted_body(self) -> MountedBody:
-        """The rig by positions."""
+        """The rig as a body on mounts, described by positions."""
 
     @abstractmethod
     def equations_of_motion(self) -> EquationsOfMotion:
-        """Linear model about rest, floor motion kept."""
+        """Linear model about rest, with floor motion."""
 
     @abstractmethod
     def points(self) -> dict[str, Place]:
@@ -117,7 +117,7 @@ class Rig(ABC):
 
     @property
     def converter(self) -> Converter | None:
-        """What every sensor's volts are read with; None for unlimited resolution."""
+        """Converter of all sensor channels; None for unlimited resolution."""
         a = self.acquisition
         return Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz) if a else None
 
@@ -134,9 +134,9 @@ class Rig(ABC):
                          value=[f"sensor.{name}" for name in gains])
 
     def slopes(self, name: str) -> list[tuple[str, str, np.ndarray]] | None:
-        """Derivatives of the matrices by a parameter, those that are not zero: (matrix, "", (6, 6)) of "M", "C", "K",
-        "C_floor" and "K_floor"; ("T" or "R", channel, (6,)) of a drive's column of T or a sensor's row of R. None where
-        the rig states none."""
+        """Nonzero derivatives of the matrices with respect to a parameter: (matrix, "", (6, 6)) for "M", "C", "K",
+        "C_floor" and "K_floor"; ("T" or "R", channel, (6,)) for a drive's column of T or a sensor's row of R. None if
+        the rig does not provide derivatives."""
         return None
 
     def sensor_rows(self) -> tuple[tuple[str, ...], np.ndarray]:
@@ -145,7 +145,7 @@ class Rig(ABC):
         return tuple(axes), np.array([direction @ point_map(place) for place, direction in axes.values()])
 
     def tilt_rows(self) -> np.ndarray:
-        """(n, 6) from q to the apparent acceleration by gravity of each sensor; zero for those against the chassis."""
+        """(n, 6) from q to the apparent acceleration due to gravity of each sensor; zero for position sensors."""
         return np.array([one.inertial * tilt_row(one.direction) for one in self.sensors()])
 
     def with_parameters(self, changes: Mapping[str, float]) -> Self:
@@ -153,8 +153,8 @@ class Rig(ABC):
 
         Raises
         ------
-        InputError : an unknown name, a value that is not finite, a mass or an inertia that
-            leaves no positive definite mass matrix.
+        InputError : an unknown name, a value that is not finite, a mass matrix that is
+            not positive definite.
         """
         known = self.parameters()
         for name, value in changes.items():

@@ -1,8 +1,8 @@
-"""Rig files: TOML with the numbers of a rig, checked entry by entry.
+"""Rig files: TOML with the data of a rig, checked entry by entry.
 
-Two kinds, told apart by their sections: [[isolator]] makes an `AvisTable`, [suspension] a `Halcyonics`. What each key
-means stands in docs/rig_file.md.
-Whatever is wrong is one `InputError` line that names file, field, value and what was expected.
+There are two kinds: files with [[isolator]] sections give an `AvisTable`, files with [suspension] a `Halcyonics`. The
+keys are documented in docs/rig_file.md.
+Each error is one `InputError` line that names file, field, value and what was expected.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ SHIPPED = {"avis": ("avis.toml", False), "halcyonics": ("halcyonics.toml", False
 
 
 def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> AvisTable | Halcyonics:
-    """The rig of a file, or a shipped one: "avis", "halcyonics", "halcyonics_loaded".
+    """The rig of a file, or a shipped rig: "avis", "halcyonics", "halcyonics_loaded".
 
     `loaded` puts the load of the file's [load] section on the table. `check` compares the values with those of real
-    tables (`plausibility`) and warns of unusual ones (`UnusualRig`); not for files that an identification wrote.
+    tables (`plausibility`) and warns of unusual ones (`UnusualRig`); disable it for files written by an identification.
 
     Raises
     ------
-    InputError : no such file, not TOML, a key that is unknown, missing, of a wrong unit or value,
-        an inertia that no body can have, a load asked for that the file does not have, values that no table has.
+    InputError : no such file, not TOML, a key that is unknown, missing, of a wrong unit or value, an inertia that no
+        body can have, a load that is requested but not in the file, values that no real table has.
     """
     if str(path_or_name) in SHIPPED:
         filename, with_load = SHIPPED[str(path_or_name)]
@@ -72,7 +72,7 @@ def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True)
 
 
 def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcyonics:
-    """The rig of a file's content; raises as `load_rig` does, without the file's name."""
+    """The rig of a file's content; errors as in `load_rig`, without the file's name."""
     rig: AvisTable | Halcyonics
     if "isolator" in content:
         if loaded:
@@ -89,7 +89,7 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
 
 
 def _check_mass(rig: AvisTable | Halcyonics) -> None:
-    """Every motion of the payload has inertia, also in the arithmetic at hand."""
+    """Check that the mass matrix is finite and numerically positive definite."""
     M = rig.equations_of_motion().M
     if not (np.all(np.isfinite(M)) and np.linalg.eigvalsh(M)[0] > 0):
         raise InputError("expected mass, inertia and centre of mass that make a positive definite mass matrix",
@@ -97,7 +97,7 @@ def _check_mass(rig: AvisTable | Halcyonics) -> None:
 
 
 def _check_support(rig: AvisTable | Halcyonics) -> None:
-    """Every motion of the payload stretches a spring: the stiffness, its diagonal scaled to one, is definite."""
+    """Check that every motion of the payload stretches a spring: stiffness scaled to unit diagonal is definite."""
     K = rig.equations_of_motion().K
     size = np.sqrt(np.maximum(np.diag(K), np.finfo(float).tiny))
     softest, motion = (part[..., 0] for part in np.linalg.eigh(K / np.outer(size, size)))
@@ -138,7 +138,7 @@ def _avis(file: AvisFile) -> AvisTable:
 
 
 def _common_limit(file: AvisFile) -> float:
-    """The limit of drives without one of their own: that of [actuators], or where all have their own the largest."""
+    """Limit of drives without an individual limit: that of [actuators], or the largest if all drives have one."""
     if file.actuators is not None:
         return file.actuators.limit_V
     for k, one in enumerate(file.drive, 1):
@@ -167,7 +167,7 @@ def _instruments(file: AvisFile) -> tuple[Instrument, ...]:
 
 
 def _at_place(section: BaseModel) -> dict[str, Any]:
-    """What a drive or sensor is made from: the section, its direction of length one."""
+    """Arguments of a drive or sensor: the section, with its direction scaled to unit length."""
     content = _tuples(section)
     place = content.pop("position_m")
     return content | {"position": place, "direction": unit_vector(content["direction"], "direction")}
@@ -220,7 +220,7 @@ def _tolerances(section: TolerancesSection | None) -> Tolerances | None:
 
 
 def _load(section: LoadSection, plate: PlateSection) -> Load:
-    """Table 2 prints plate plus load (I_xx + I^e_xx), without the terms m_e L^2: see `Load`."""
+    """Load from the totals of table 2, plate plus load (I_xx + I^e_xx) without the terms m_e L^2: see `Load`."""
     totals = np.array([section.Ixx_total_kgm2, section.Iyy_total_kgm2, section.Izz_total_kgm2])
     Ixx, Iyy, Izz = (float(value) for value in totals - plate.inertia_kgm2)
     load = Load(section.mass_kg, section.L7_m, section.L8_m, section.L9_m, Ixx, Iyy, Izz, section.Ixy_load_kgm2,
@@ -231,10 +231,10 @@ def _load(section: LoadSection, plate: PlateSection) -> Load:
 
 
 def _check_inertia(J: np.ndarray, field: str, value: Any, slender: bool = False) -> None:
-    """A body's principal moments are positive and none exceeds the sum of the others.
+    """Check that the principal moments are positive and that none exceeds the sum of the other two.
 
-    A slender rod (one moment zero) is on the edge of both and allowed for a load, up to what a measurement of it
-    scatters about the edge.
+    A slender rod (one moment zero) is the limiting case of both. It is allowed for a load, within the scatter of a
+    measurement.
     """
     moments = np.linalg.eigvalsh(J)
     slack = (1e-3 if slender else 1e-9) * moments[-1]

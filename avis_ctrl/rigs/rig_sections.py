@@ -13,7 +13,7 @@ from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.instruments import Tolerances
 
-# In SI units nothing on a table comes near the limit; it keeps the products of such numbers finite.
+# In SI units no value of a table comes near this limit; it keeps products of such numbers finite.
 LIMIT = 1e12
 Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
 Positive = Annotated[float, Field(gt=0, le=LIMIT)]
@@ -22,8 +22,8 @@ NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
 
 @dataclass(frozen=True)
 class RigLimits:
-    """farthest_m : of a point from the origin, along each axis [m]: no table is larger, and far points leave no digits
-    for the inertia beside m r^2.
+    """farthest_m : maximum distance of a point from the origin along each axis [m]. No table is larger, and for distant
+    points the inertia is lost in the round-off of m r^2.
     """
 
     farthest_m: float = 100.0
@@ -46,7 +46,7 @@ def _with_a_length(direction: list[float]) -> list[float]:
 
 
 Direction = Annotated[list[Number], Field(min_length=3, max_length=3), AfterValidator(_with_a_length)]
-# Signals of a model are named after channels: letters, digits, _ and -, a letter first.
+# Channel names become signal names of models: letters, digits, _ and -, a letter first.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
 Percent = Annotated[float, Field(ge=0, le=100)]
 
@@ -63,7 +63,7 @@ def _shipped(spectrum: str) -> str:
     return spectrum
 
 
-# What other files share: a frequency band [Hz], and the name of a shipped spectrum of floor motion.
+# Also for other files: a frequency band [Hz], and the name of a shipped spectrum of floor motion.
 Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Spectrum = Annotated[str, AfterValidator(_shipped)]
 
@@ -83,7 +83,7 @@ class IsolatorSection(Section):
 
 
 class MotorSection(Section):
-    """Motors in the isolators, along their axes; without any, only the limit of [[drive]] tables."""
+    """Motors in the isolators, along their axes; without motors, only the voltage limit of the [[drive]] tables."""
 
     names: list[str] = []
     isolator: list[int] = []
@@ -154,7 +154,7 @@ class FloorSensorSection(Section):
 
 
 class TolerancesSection(Section):
-    """One standard deviation each; what is left out takes the default."""
+    """Standard deviations; omitted keys take the default."""
 
     place_m: NotNegative = Tolerances.place_m
     direction_rad: NotNegative = Tolerances.direction_rad
@@ -167,7 +167,7 @@ class TolerancesSection(Section):
 
 
 class ElectronicsSection(Section):
-    """Offset, 1/f noise and anti-alias filter of the channels; what is left out takes the default."""
+    """Offset, 1/f noise and anti-alias filter of the channels; omitted keys take the default."""
 
     sensor_offset_V: NotNegative | None = None
     sensor_flicker_corner_Hz: NotNegative | None = None
@@ -226,7 +226,7 @@ class PlateSection(Section):
 
 
 class SuspensionSection(Section):
-    """k_s_each_N_per_m : the springs at the corners of A1..A4, where they differ; k_s_N_per_m is then their mean."""
+    """k_s_each_N_per_m : of the springs at the corners of A1..A4, if they differ; k_s_N_per_m is then their mean."""
 
     k_s_N_per_m: Positive
     k_s_each_N_per_m: Annotated[list[Positive], Field(min_length=4, max_length=4)] | None = None

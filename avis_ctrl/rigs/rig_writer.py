@@ -1,4 +1,4 @@
-"""A rig as a rig file: TOML that `load_rig` reads back, every value with all its digits."""
+"""Writing of rig files: TOML that `load_rig` reads back, with all digits of every value."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class _Line:
-    """One key of a file and the parameters of the rig (flat names) that its value holds."""
+    """One key of a file, and the rig parameters (flat names) that its value contains."""
 
     key: str
     value: Any
     parameters: tuple[str, ...] = ()
 
 
-# Title as it stands in the file, the name that comments and messages use, and the lines.
+# Title as written in the file, name used in comments and messages, and lines.
 _Section = tuple[str, str, list[_Line]]
 
 
 def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = "") -> str:
     """The text of a rig file.
 
-    A loaded Halcyonics table is read back with `load_rig(path, loaded=True)`. Two values are stored as sums, as the
-    file has them (total inertia of plate and load, chassis ends of isolators), and come back to the last digit of
-    the sum.
+    A loaded Halcyonics table is read back with `load_rig(path, loaded=True)`. Two quantities are stored as sums, as the
+    file format requires (total inertia of plate and load, chassis points of isolators); they are recovered to the last
+    digit of the sum.
 
     Parameters
     ----------
-    comments : written behind the line of their key, which is a parameter's flat name ("isolator1.k_x", several on one
-        line are joined) or the key in the file as messages name it ("payload.mass_kg", "isolator[1].damping_Ns_per_m").
-    header : comment lines at the top.
+    comments : by key, written at the end of the key's line. A key is a parameter's flat name ("isolator1.k_x"; several
+        comments on one line are joined) or the key in the file as named in messages ("payload.mass_kg",
+        "isolator[1].damping_Ns_per_m"). header : comment lines at the top.
 
     Raises
     ------
-    InputError : a rig of another kind, a comment for a line that is not there or that is no single line.
+    InputError : a rig of another kind, a comment for a line that does not exist, a comment of several lines.
     """
     if isinstance(rig, AvisTable):
         sections = _avis_sections(rig)
@@ -75,7 +75,7 @@ def _comment(text: str) -> str:
 
 def _toml(value: Any) -> str:
     if isinstance(value, str):
-        # JSON's strings are TOML's but for this character, which TOML wants escaped.
+        # JSON strings are TOML strings, except that TOML requires this character to be escaped.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (int, np.integer)):
         return str(int(value))
@@ -85,7 +85,7 @@ def _toml(value: Any) -> str:
 
 
 def _plain(thing: object, *names: str) -> list[_Line]:
-    """Attributes that the file calls as the rig does."""
+    """Lines of attributes that have the same name in the file and in the rig."""
     return [_Line(name, getattr(thing, name)) for name in names]
 
 
@@ -95,7 +95,7 @@ def _ambient(ambient: Ambient | None) -> list[_Section]:
 
 
 def _sum_for(parts: Iterable[float], bases: Iterable[float]) -> list[float]:
-    """base + part, moved by the last digit where that makes sum - base the part exactly."""
+    """base + part, changed in its last digit if sum - base is then closer to part."""
     sums = []
     for part, base in zip(parts, bases, strict=True):
         total = base + part
@@ -143,7 +143,7 @@ def _avis_sections(rig: AvisTable) -> list[_Section]:
 
 
 def _all(thing: Any) -> list[_Line]:
-    """Every field that has a value."""
+    """Lines of all fields that have a value."""
     return [_Line(one.name, value) for one in fields(thing) if (value := getattr(thing, one.name)) is not None]
 
 

@@ -34,9 +34,9 @@ def point_map(p: ArrayLike) -> np.ndarray:
 
 
 def tilt_row(direction: ArrayLike) -> np.ndarray:
-    """(6,) apparent acceleration by gravity, per unit of q, along a body-fixed unit direction d.
+    """(6,) apparent acceleration due to gravity, per unit of q, along a body-fixed unit direction d.
 
-    A turned body lays d over by phi x d: the mass feels d . (a + g e_z), in which g e_z . (phi x d) is new.
+    A rotation phi changes d by phi x d. The sensor measures d . (a + g e_z), to which this adds g e_z . (phi x d).
     """
     x, y, _ = np.asarray(direction)
     return GRAVITY * np.array([0.0, 0.0, 0.0, y, -x, 0.0])
@@ -46,7 +46,7 @@ def tilt_row(direction: ArrayLike) -> np.ndarray:
 class Modes:
     """Undamped natural frequencies [Hz], ascending, and mass-normalised shapes (columns).
 
-    A negative frequency stands for a statically unstable mode that diverges at 2 pi |f| [rad/s].
+    A negative frequency denotes a statically unstable mode that diverges at the rate 2 pi |f| [rad/s].
     """
 
     frequencies_Hz: np.ndarray
@@ -93,9 +93,9 @@ class EquationsOfMotion:
         return Modes(np.sign(squares) * np.sqrt(np.abs(squares)) / (2 * np.pi), shapes)
 
     def restricted(self, coordinates: Sequence[str], floor: Sequence[str] | None = None) -> EquationsOfMotion:
-        """The other coordinates locked to the earth: their rows and columns struck.
+        """Equations of some coordinates, the others locked to the earth (rows and columns deleted).
 
-        `floor` names the floor coordinates kept; by default the same as `coordinates`.
+        `floor` : names of the floor coordinates that are kept, by default the same as `coordinates`.
         """
         keep = _indices(self.coordinates, coordinates)
         names = tuple(coordinates)

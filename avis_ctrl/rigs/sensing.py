@@ -1,12 +1,12 @@
-"""How a digital controller turns a rig's sensor signals into one velocity per axis, whatever the sensors are.
+"""Computation of one velocity per axis from a rig's sensor signals, as in a digital controller, for any sensors.
 
-    volts / gain -> conditioning of each channel -> decoding -> seen velocity of each axis
+    volts / gain -> conditioning of each channel -> decoding -> measured ("seen") velocity of each axis
 
-Decoding adds channels, so all channels of an axis need the same dynamics. A digital filter gives every sensor of motion
-in space the same second-order high-pass on velocity, s^2 / p(s): an accelerometer is integrated with a leak, and a
-geophone's corner is moved to that of the others. The common corner is the highest of all their own corners, so that no
-channel is amplified below its own; for a lower corner, give a geophone a compensation filter in the rig file. Position
-sensors are differentiated: they give the velocity of the payload relative to the chassis.
+Decoding adds channels, so all channels of an axis need the same dynamics. A digital filter gives every sensor of
+absolute motion the same second-order high-pass from velocity, s^2 / p(s): an accelerometer gets a leaky integrator, and
+a geophone's corner is moved to the common corner. This is the highest corner of all sensors, so that no channel is
+amplified below its own corner; for a lower one, specify a compensation filter for the geophone in the rig file.
+Position sensors are differentiated: they give the velocity of the payload relative to the chassis.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class SensingSettings:
-    """differentiator_share : corner of the position sensors' differentiator, as a fraction of the sample rate: as far
+    """differentiator_share : corner of the position sensors' differentiator, as a fraction of the sample rate; as far
     above the loop's band as the bilinear map allows."""
 
     differentiator_share: float = 0.2
@@ -52,7 +52,7 @@ class Filter:
         return not self.zeros and not self.poles and self.leading == 1.0
 
     def over(self, other: Filter) -> Filter:
-        """The quotient, equal roots cancelled."""
+        """Quotient of two filters, with equal roots cancelled."""
         zeros, poles = _cancelled([*self.zeros, *other.poles], [*self.poles, *other.zeros])
         return Filter(zeros, poles, self.leading / other.leading)
 
@@ -70,12 +70,12 @@ def _cancelled(zeros: list[complex], poles: list[complex]) -> tuple[tuple[comple
 
 @dataclass(frozen=True, eq=False)
 class NoiseGroup:
-    """Sensors whose noise has one shape.
+    """Sensors whose noise has the same spectral shape.
 
-    shape : unit white density -> noise of the noisiest of them as seen velocity [m/s/sqrt(Hz)].
-    share : (n_s,) each sensor's noise over that; zero for sensors of other groups.
-    flicker, offset_rtHz : 1/f noise density at 1 Hz, and offset [sqrt(Hz)], the largest of each, over the white noise
-        density of the noisiest of them.
+    shape : unit white density -> noise of the noisiest sensor as seen velocity [m/s/sqrt(Hz)].
+    share : (n_s,) noise of each sensor relative to the noisiest; zero for sensors of other groups.
+    flicker, offset_rtHz : largest 1/f noise density at 1 Hz, and largest offset [sqrt(Hz)], over the white noise
+        density of the noisiest sensor.
     """
 
     shape: StateSpace
@@ -86,12 +86,12 @@ class NoiseGroup:
 
 @dataclass(frozen=True, eq=False)
 class Sensing:
-    """Axes as the controller sees them.
+    """Axes as measured by the controller.
 
     decoder : from conditioned channels to velocities of `axes`.
-    chain : velocity in space -> seen velocity, unit passband gain.
-    relative_chain : displacement against the chassis [m] -> seen velocity; None for a rig without position sensors.
-    conditioning : each channel's filter, from volts over gain to seen velocity; None for nothing.
+    chain : absolute velocity -> seen velocity, unit passband gain.
+    relative_chain : displacement relative to the chassis [m] -> seen velocity; None without position sensors.
+    conditioning : filter of each channel, from volts over gain to seen velocity; None for no filter.
     noise : of the sensors that the axes use.
     """
 
@@ -107,18 +107,18 @@ class Sensing:
 
     @property
     def relative(self) -> tuple[str, ...]:
-        """Axes whose velocity is measured relative to the chassis, not in space."""
+        """Axes whose velocity is measured relative to the chassis, not absolutely."""
         return self.decoder.relative
 
 
 def sensing(rig: Rig, axes: Sequence[str], integrator_corner_Hz: float) -> Sensing:
-    """How the controller measures these axes with the rig's sensors.
+    """Measurement of these axes with the rig's sensors.
 
-    integrator_corner_Hz : leak of the accelerometers' integrators.
+    integrator_corner_Hz : corner of the accelerometers' leaky integrators.
 
     Raises
     ------
-    InputError : axes that the sensors cannot tell apart.
+    InputError : axes that the sensors cannot distinguish.
     """
     decoder, filters = sensor_axes(rig, axes), conditioning(rig, integrator_corner_Hz)
     target, against = _targets(rig, integrator_corner_Hz)
@@ -128,22 +128,22 @@ def sensing(rig: Rig, axes: Sequence[str], integrator_corner_Hz: float) -> Sensi
 
 
 def conditioning(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter, ...]:
-    """Of each channel, from volts over gain to seen velocity."""
+    """Filter of each channel, from volts over gain to seen velocity."""
     target, against = _targets(rig, integrator_corner_Hz)
     found = []
     for one in rig.sensors():
         asked = target if one.inertial else against
         assert asked is not None
-        # What is seen is a velocity: of acceleration the chain has one zero at rest more.
+        # Referred to velocity, the chain of an accelerometer has one more zero at s = 0.
         own = Filter((*one.zeros, 0j) if one.quantity == "acceleration" else one.zeros, one.poles, one.leading)
         found.append(asked.over(own))
     return tuple(found)
 
 
 def _targets(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter | None, Filter | None]:
-    """From velocity in space, and from displacement against the chassis, to seen velocity; None without such sensors.
-    """
-    # The anti-alias filters are alike, and stay: their poles are in what is seen.
+    """Filters from absolute velocity, and from displacement relative to the chassis, to seen velocity; None without
+    such sensors."""
+    # The anti-alias filters are all equal and not compensated: their poles remain in the seen velocity.
     lags = next((one.low_pass for one in rig.sensors()), ())
     size = float(np.prod(np.abs(lags)))
     own = [_high_pass(one, integrator_corner_Hz) for one in rig.sensors() if one.inertial]
@@ -160,7 +160,7 @@ def _targets(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter | None, Filt
 
 
 def _high_pass(sensor: Sensor, integrator_corner_Hz: float) -> tuple[complex, ...]:
-    """Poles of the high-pass of second order that a sensor is on velocity, its integrator included."""
+    """Poles of the second-order high-pass from velocity of a sensor, including its integrator."""
     own = sensor.poles[:len(sensor.poles) - len(sensor.low_pass)]
     return own if sensor.quantity == "velocity" else (*own, complex(-2 * np.pi * integrator_corner_Hz))
 
@@ -170,7 +170,7 @@ def _noise(rig: Rig, filters: Sequence[Filter], used: np.ndarray) -> tuple[Noise
     density = np.array([one.motion_density(rig.converter, rig.sample_rate_Hz) for one in sensors])
     flicker = np.array([one.flicker_density(rig.sample_rate_Hz) for one in sensors])
     offset = np.array([one.offset_V / one.gain for one in sensors])
-    # What is integrated falls as 1/s up to half the clock, and is white above, where sampling folds it back.
+    # Integrated noise falls as 1/s up to half the sample rate and is white above, where sampling folds it back.
     nyquist = np.pi * rig.sample_rate_Hz
     for one in dict.fromkeys(f for f, in_use in zip(filters, used, strict=True) if in_use):
         own = np.array([f == one for f in filters]) & used

@@ -1,8 +1,8 @@
-"""The few coordinates that a controller is designed for, cut out of the six, and what the cut leaves out.
+"""Models of a rig in the few coordinates that a controller is designed for, and the error of this reduction.
 
-What happens to the other coordinates is said, not implied:
-"locked" : they do not move (rows and columns struck; motion relative to the earth);
-"free"   : they move as the mechanics has it: all six degrees of freedom, seen from the kept ones.
+The treatment of the other coordinates is stated explicitly:
+"locked" : they do not move relative to the earth (rows and columns deleted);
+"free"   : they move: the model has all six degrees of freedom, with only the kept ones as outputs.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Z_PHIX = ("z", "phi_x")
 
 @dataclass(frozen=True, eq=False)
 class ReducedRig:
-    """A rig seen from the coordinates kept.
+    """Model of a rig in the coordinates that are kept.
 
-    system : inputs: all actuators [V], then "floor_<c>" [m, rad] (kept coordinates when locked, else
+    system : inputs: all actuators [V], then "floor_<c>" [m, rad] (kept coordinates if locked, else
         all six); outputs "<c>" and "<c>_dot" of the kept coordinates.
-    allocation : voltages that push one kept coordinate and no other.
+    allocation : voltages that drive each kept coordinate, see `ActuatorAxes`.
     """
 
     system: StateSpace
@@ -49,11 +49,11 @@ class ReducedRig:
 
 
 def reduce_rig(rig: Rig, keep: Sequence[str] = Z_PHIX, others: Others = "locked") -> ReducedRig:
-    """The rig seen from the coordinates `keep`.
+    """Model of a rig in the coordinates `keep`.
 
     Raises
     ------
-    InputError : unknown coordinates or choices, actuators that cannot push a kept coordinate alone.
+    InputError : unknown coordinates or choices, actuators that cannot drive the kept coordinates independently.
     """
     keep = tuple(keep)
     allocation = actuator_axes(rig, keep)
@@ -67,7 +67,7 @@ def reduce_rig(rig: Rig, keep: Sequence[str] = Z_PHIX, others: Others = "locked"
 
 
 def critical_gains(rig: Rig, keep: Sequence[str] = ()) -> dict[str, float]:
-    """Velocity gains [N s/m, N m s/rad] that damp each coordinate not kept critically, the others locked.
+    """Velocity gains [N s/m, N m s/rad] for critical damping of each coordinate that is not kept, the others locked.
 
     The classical rule: C_kk + g = 2 sqrt(M_kk K_kk).
     """
@@ -79,12 +79,12 @@ def critical_gains(rig: Rig, keep: Sequence[str] = ()) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class ReductionError:
-    """What the model with the others locked misses against all six degrees of freedom.
+    """Error of the model with locked coordinates relative to the model with six degrees of freedom.
 
     omega : (n_omega,) rad/s.
     reduced, full : (n_omega, n_keep, 2 n_keep) responses of the kept coordinates to their floor
-        motion (transmissibility) and to the force on each; rotation counted as edge displacement, force on
-        it as force at the edge, so that all entries of a kind share a unit.
+        motion (transmissibility) and to the force on each; rotations as edge displacement, moments as
+        force at the edge, so that all entries of a kind have the same unit.
     relative : (n_omega, n_keep, 2 n_keep) |reduced - full| over the largest singular value of the full
         response of that kind at that frequency.
     left_out : (n_omega, n_keep, n_dropped) full response to the floor coordinates that the reduced
@@ -105,9 +105,9 @@ class ReductionError:
 
 
 def reduction_error(rig: Rig, keep: Sequence[str] = Z_PHIX, omega: ArrayLike | None = None) -> ReductionError:
-    """Compare the locked reduction with the six degrees of freedom.
+    """Error of the locked model relative to the model with six degrees of freedom.
 
-    omega : rad/s; by default 400 points evenly in logarithm from 0.1 to 100 Hz.
+    omega : rad/s; by default 400 logarithmically spaced points from 0.1 to 100 Hz.
     """
     omega = 2 * np.pi * np.geomspace(0.1, 100.0, 400) if omega is None else np.asarray(omega, float)
     full_rig = reduce_rig(rig, keep, "free")

@@ -1,4 +1,4 @@
-"""The numbers of a rig file with the units of their keys, and their values if given in a wrong unit (a "slip")."""
+"""Numbers of a rig file with the units of their keys, and the possible unit errors ("slips")."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from avis_ctrl.rigs.rigid_body import GRAVITY
 G = GRAVITY
 INCH = 0.0254
 KILO = 1e3
-# Unit at the end of a key, with units used by mistake: (factor to the key's unit, the unit that was meant), the most
-# likely first. A key without a unit is a ratio.
+# Unit suffix of a key, with the units used by mistake: (factor to the key's unit, mistaken unit), the most likely
+# first. A key without a unit is a ratio.
 UNITS: dict[str, tuple[tuple[float, str], ...]] = {
     "_kgm2": ((1e-4, "kg cm^2"), (1e-6, "kg mm^2"), (1e-9, "g mm^2"), (1e-7, "g cm^2"), (KILO, "t m^2"),
               (1e-3, "g m^2")),
@@ -39,7 +39,7 @@ UNITS: dict[str, tuple[tuple[float, str], ...]] = {
 }
 RATIOS = {"suspension_damping": ((1e-2, "per cent"),), "compensated_damping": ((1e-2, "per cent"),),
           "preamplifier_gain": ((1e-3, "a thousand times too large"), (KILO, "a thousand times too small"))}
-# Sections that hold no property of the table.
+# Sections without properties of the table.
 APART = ("tolerances",)
 
 Place = tuple[str | int, ...]
@@ -47,7 +47,7 @@ Place = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class Entry:
-    """One number of a file: where it stands, its key, its value."""
+    """One number of a file: its place, key and value."""
 
     place: Place
     key: str
@@ -56,10 +56,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Slip:
-    """Numbers that were all given in another unit than their key's.
+    """Numbers that were all given in a unit other than that of their key.
 
-    field, value : as a message names them. factor : to the key's unit. unit : that was likely meant. rank : position
-    among the slips of that key, the likeliest first. scope : 0 one number, 1 a list, 2 a key, 3 a unit in a section,
+    field, value : as in messages. factor : to the key's unit. unit : in which they were probably given. rank : position
+    among the slips of the key, the likeliest first. scope : 0 one number, 1 a list, 2 a key, 3 a unit in a section,
     4 a unit in the whole file.
     """
 
@@ -72,7 +72,7 @@ class Slip:
     scope: int
 
     def mended(self, content: dict[str, Any]) -> dict[str, Any]:
-        """A copy of the content without the slip."""
+        """A copy of the content with the slip corrected."""
         made = copy.deepcopy(content)
         for entry in self.entries:
             *parents, last = entry.place
@@ -88,7 +88,7 @@ class Slip:
 
     @property
     def words(self) -> str:
-        """given in g; a thousand times too large."""
+        """Such as "given in g" or "a thousand times too large"."""
         return self.unit if self.unit.startswith("a ") else f"given in {self.unit}"
 
     @property
@@ -100,7 +100,7 @@ class Slip:
 
 
 def entries(content: Any, place: Place = (), key: str = "") -> Iterator[Entry]:
-    """Every number with a unit, in the order of the file."""
+    """Every number with a unit and every known ratio, in the order of the file."""
     if isinstance(content, dict):
         for name, part in content.items():
             if name not in APART:
@@ -114,14 +114,14 @@ def entries(content: Any, place: Place = (), key: str = "") -> Iterator[Entry]:
 
 @cache
 def unit_of(key: str) -> str:
-    """End of the key that states the unit, or the key of a ratio; empty for none."""
+    """Unit suffix of a key, or the key itself for a known ratio; empty for neither."""
     if key in RATIOS:
         return key
     return next((ending for ending in UNITS if key.endswith(ending)), "")
 
 
 def slips(content: dict[str, Any]) -> Iterator[Slip]:
-    """Every single unit error that may have been made: in one number, a list, a key, a unit in a section or the file.
+    """All possible single unit errors: in one number, a list, a key, or a unit in a section or in the whole file.
 
     Single numbers of lists come last.
     """
@@ -168,7 +168,7 @@ def dotted(place: Place) -> str:
 
 
 def apart(slip: Slip, mended: dict[str, Any]) -> float:
-    """Mean squared decades of the slip's numbers, mended, from the median of the others of their unit and section."""
+    """Mean squared distance, in decades, of the corrected numbers from the median of the others of their unit."""
     there = {entry.place for entry in slip.entries}
     first = slip.entries[0]
     others = [abs(entry.value) for entry in entries(mended) if entry.place not in there and entry.value

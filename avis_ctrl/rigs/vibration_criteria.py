@@ -2,7 +2,7 @@
 
 C. G. Gordon, Generic criteria for vibration-sensitive equipment, Proc. SPIE 1619 (1991); H. Amick, M. Gendreau,
 T. Busch and C. Gordon, Evolving criteria for research facilities: I - Vibration, Proc. SPIE 5933 (2005). VC-A and
-VC-B hold from 4 Hz, as constant acceleration below 8 Hz; VC-C to VC-G are constant velocity from 1 Hz. All end at
+VC-B start at 4 Hz, with constant acceleration below 8 Hz; VC-C to VC-G have constant velocity from 1 Hz. All end at
 80 Hz.
 """
 
@@ -26,11 +26,11 @@ class Criterion:
     constant_acceleration_below_Hz: float | None = None
 
     def midbands(self) -> np.ndarray:
-        """Exact midbands [Hz] of the bands that the criterion judges."""
+        """Exact midbands [Hz] of the bands of the criterion."""
         return third_octave_midbands(self.low_Hz, 80.0)
 
     def limit(self, frequency_Hz: np.ndarray) -> np.ndarray:
-        """Limit [m/s r.m.s.] at midbands [Hz]; inf where the criterion says nothing."""
+        """Limit [m/s r.m.s.] at midbands [Hz]; inf outside the bands of the criterion."""
         f = np.asarray(frequency_Hz, float)
         bands = self.midbands()
         inside = (f > bands[0] * 10 ** -0.05) & (f < bands[-1] * 10 ** 0.05)
@@ -47,16 +47,16 @@ CRITERIA: tuple[Criterion, ...] = (
 
 @dataclass(frozen=True)
 class Rating:
-    """The best criterion met, and the band that decides.
+    """The strictest criterion met, and the band that decides.
 
     Parameters
     ----------
-    criterion : name, or None where not even VC-A is met.
-    deciding_band_Hz : midband where the motion is highest against the next better criterion (against the
-        best one, VC-G, where all are met).
+    criterion : name, or None if not even VC-A is met.
+    deciding_band_Hz : midband where the motion is largest relative to the next stricter criterion (to VC-G if all
+        are met).
     deciding_rms, deciding_limit : r.m.s. velocity there and that criterion's limit [m/s].
     against : the criterion of `deciding_limit`.
-    bands_missing_Hz : midbands of the criterion for which no data were given.
+    bands_missing_Hz : midbands of the criterion without data.
     """
 
     criterion: str | None
@@ -68,7 +68,7 @@ class Rating:
 
 
 def criterion(name: str) -> Criterion:
-    """A curve by name ("VC-A" to "VC-G"); InputError names those there are."""
+    """A curve by name ("VC-A" to "VC-G"); the InputError for an unknown name lists the known ones."""
     for one in CRITERIA:
         if one.name == name:
             return one
@@ -76,11 +76,11 @@ def criterion(name: str) -> Criterion:
 
 
 def rating(midband_Hz: np.ndarray, rms: np.ndarray) -> Rating:
-    """The best criterion that r.m.s. velocities [m/s] in third octaves meet.
+    """The strictest criterion that r.m.s. velocities [m/s] in third octaves meet.
 
     Raises
     ------
-    InputError : vectors that do not fit, values that are not finite or negative, no band between 4 and 80 Hz.
+    InputError : vectors of different lengths, values that are negative or not finite, no band from 4 to 80 Hz.
     """
     f, v = np.atleast_1d(np.asarray(midband_Hz, float)), np.atleast_1d(np.asarray(rms, float))
     if f.shape != v.shape or f.ndim != 1:
@@ -92,7 +92,7 @@ def rating(midband_Hz: np.ndarray, rms: np.ndarray) -> Rating:
     if not np.any(np.isfinite(CRITERIA[0].limit(f))):
         raise InputError("at least one third octave from 4 to 80 Hz", field="midband_Hz", value=f.tolist())
     met = [c for c in CRITERIA if np.all(v <= c.limit(f))]
-    # VC-C asks from 1 Hz, VC-B only from 4 Hz: the curves are not nested, so the best met is the last in a row.
+    # VC-C starts at 1 Hz, VC-B only at 4 Hz: the curves are not nested, so take the last before the first not met.
     best = next((k for k, c in enumerate(CRITERIA) if c not in met), len(CRITERIA)) - 1
     against = CRITERIA[min(best + 1, len(CRITERIA) - 1)]
     worst = int(np.argmax(v / against.limit(f)))

@@ -1,4 +1,4 @@
-"""A controller as a vector of its free entries, each in units of its own size: what descent moves."""
+"""A controller as a vector of its normalised free entries: the variables of the descent."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from avis_ctrl.robust.mu_lmi import Array
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """K with tridiagonal A (blocks of its modes), its free entries in units of their own size.
+    """K with tridiagonal A (modal blocks), and its free entries, each normalised by its typical size.
 
-    rows, cols : places of the free entries of [A B; C D]; size : their units; start : their values in these units.
+    rows, cols : indices of the free entries of [A B; C D]; size : typical sizes; start : normalised values.
     """
 
     K: StateSpace
@@ -59,9 +59,9 @@ class Entries:
 
 
 def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
-    """A of 2 x 2 blocks, real poles in pairs of neighbours, with rows of B as long as columns of C; and |poles|.
+    """Modal A (1 x 1 and 2 x 2 blocks), B and C with rows of B and columns of C of equal norm, |poles|, and outputs.
 
-    Last the output (n,) that each state moves most; the states are in the order of these.
+    The outputs (n,) are those that each state affects most; the states are ordered by them.
     """
     n, vectors, sizes, channels = K.nstates, [], [], []
     values, V = la.eig(K.A)
@@ -78,7 +78,7 @@ def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
     S = np.array(vectors).T.reshape(n, n)
     A, B, C = np.linalg.solve(S, K.A @ S), np.linalg.solve(S, K.B), K.C @ S
     rows, cols = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
-    # One scale for both states of a pair keeps its block normal.
+    # A common scale for both states of a pair keeps its block normal.
     scale = np.sqrt(np.where((rows > 0) & (cols > 0), rows, 1.0) / np.where((rows > 0) & (cols > 0), cols, 1.0))
     for k in range(n - 1):
         if A[k, k + 1] * A[k + 1, k] < 0 and sizes[k] == sizes[k + 1]:

@@ -1,4 +1,4 @@
-"""Disk margins: how much gain and phase a feedback loop bears, in one channel or in all at once.
+"""Disk margins: gain and phase variations that a feedback loop tolerates, in one channel or in all at once.
 
 Each channel is multiplied by f = (1 + (1 - s)/2 delta)/(1 - (1 + s)/2 delta), |delta| < alpha, a disk of gains and
 phases about 1 with skew s. The largest alpha is 1/mu of S + (s - 1)/2 I, which is (S - T)/2 at s = 0 (Seiler, Packard
@@ -26,8 +26,8 @@ At = Literal["outputs", "inputs", "both"]
 
 @dataclass(frozen=True)
 class DiskMarginSettings:
-    """steps : mu computations of a worst-case margin, doubling and then halving its interval: eleven give one part in
-    a thousand of a margin of 2, which no loop needs finer."""
+    """steps : number of mu computations of a worst-case margin, which double alpha and then bisect: eleven resolve a
+    margin of 2 to one part in a thousand, which is always sufficient."""
 
     steps: int = 11
 
@@ -37,12 +37,12 @@ SETTINGS = DiskMarginSettings()
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DiskMargin(Shown):
-    """alpha, with what it means for gain and phase.
+    """Bounds of alpha, and the corresponding gain and phase margins.
 
     lower : every loop with |delta| < lower in all channels is stable; proved at all frequencies if `guaranteed`.
-    upper : `delta` (n, n), diagonal, of this size makes the loop unstable at `omega` [rad/s]; infinite if none.
-    gain : (low, high) factors of all channels that `lower` allows. phase_deg : phase lag or lead [degrees].
-    mu : the bounds of mu behind it.
+    upper : `delta` (n, n), diagonal, of this size makes the loop unstable at `omega` [rad/s]; inf if none was found.
+    gain : (low, high) gain factors of all channels for `lower`. phase_deg : phase lag or lead for `lower` [degrees].
+    mu : the underlying bounds of mu.
     """
 
     lower: float
@@ -57,26 +57,26 @@ class DiskMargin(Shown):
 
     @property
     def gain_dB(self) -> float:
-        """The smaller of gain reduction and increase that is allowed [dB]."""
+        """The smaller of the allowed gain reduction and gain increase [dB]."""
         low, high = self.gain
         return float(20 * np.log10(min(high, 1 / low if low > 0 else np.inf)))
 
 
 def disk_margin(L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0, slack: float = SLACK) -> DiskMargin:
-    """Disk margin of the loop with negative feedback, of all its channels at once.
+    """Disk margin of a loop with negative feedback, for all its channels at once.
 
     Parameters
     ----------
-    L : the open loop, as many inputs as outputs, continuous or sampled; or the plant, with the controller K beside it.
+    L : the open loop, as many inputs as outputs, continuous or sampled; or the plant, if a controller K is given.
         An `UncertainSystem` gives the worst case over its uncertainty.
-    K : controller of negative feedback, u = -K y (for a K with u = K y of `musyn`, give -K).
-    at : where the factors act: at the plant's outputs, its inputs, or at both at the same time.
-    skew : s above; 0 for equal gain increase and reduction. slack : as for `mu_peak`.
+    K : controller with negative feedback, u = -K y (for a K of `musyn`, with u = K y, give -K).
+    at : location of the factors: plant outputs, plant inputs, or both simultaneously.
+    skew : s of the module docstring; 0 for equal gain increase and reduction. slack : as for `mu_peak`.
 
     Raises
     ------
-    InputError : shapes that do not fit. ComputationError : an unstable loop, or one that is unstable for some of the
-        uncertainty.
+    InputError : shapes that do not fit. ComputationError : an unstable loop, or a loop that is not proved stable for
+        all of its uncertainty.
 
     Examples
     --------
@@ -131,7 +131,7 @@ def _margin(peak: MuPeak, skew: float) -> DiskMargin:
 
 
 def _gains(alpha: float, skew: float) -> tuple[float, float]:
-    """Real factors inside the disk; an end is infinite where the disk is a half plane or more."""
+    """Interval of real factors in the disk; an end is infinite if the disk is a half plane or larger."""
     below = 2 + alpha * (1 + skew) if np.isfinite(alpha) else 1.0
     low = -np.inf if below <= 0 else 0.0 if np.isinf(alpha) else (2 - alpha * (1 - skew)) / below
     room = 2 - alpha * (1 + skew)
@@ -140,7 +140,7 @@ def _gains(alpha: float, skew: float) -> tuple[float, float]:
 
 
 def _phase(low: float, high: float) -> float:
-    """Phase of a factor of gain 1 at the edge of the disk [degrees]: cos = (1 + low high)/(low + high)."""
+    """Phase of a factor of gain 1 on the edge of the disk [degrees]: cos = (1 + low high)/(low + high)."""
     if np.isinf(low) or np.isinf(high):
         cosine = high if np.isinf(low) else low
     else:
@@ -149,7 +149,7 @@ def _phase(low: float, high: float) -> float:
 
 
 def _worst_case(N: Any, blocks: BlockStructure, place: np.ndarray, skew: float, slack: float) -> DiskMargin:
-    """The largest alpha for which mu, with the factors' channels scaled by alpha, is proved below 1."""
+    """The largest alpha for which mu, with the channels of the factors scaled by alpha, is proved below 1."""
     rows = [k for block, w, z in blocks.slices() if w.start in place for k in range(z.start, z.stop)]
 
     def scaled(alpha: float) -> MuPeak:

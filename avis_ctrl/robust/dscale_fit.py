@@ -10,9 +10,9 @@ Convex Optimization, sections 3.4.2 and 4.2.5; the certificate is that of Markov
 a semidefinite feasibility problem inside a bisection on log t. Spectral factorisation then takes the left
 half plane roots of p(-s^2) and q(-s^2).
 
-Eight decades of frequency are sixteen of y, so monomials are hopeless. The powers are scaled by the
-coefficients of prod(y + |y_i|), y_i the roots of the best fit so far: every basis function is then a bump of
-height at most one in log y, and the basis follows the solution.
+Eight decades of frequency are sixteen decades of y, for which monomials are hopelessly ill conditioned. The powers are
+scaled by the coefficients of prod(y + |y_i|), with y_i the roots of the best fit so far. Every basis function is then a
+bump of height at most one in log y, and the basis follows the solution.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ import scipy.sparse as sp
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.robust.scalings import ScalarScaling
 
-# p and q stay this far above zero, relative to prod(y + |y_i|): zeros and poles keep clear of the axis.
+# Minimum of p and q relative to prod(y + |y_i|), which keeps zeros and poles away from the axis.
 POSITIVITY_MARGIN = 1e-7
-# log t / weight beyond which a point constrains nothing that doubles can express.
+# log t / weight above which a point imposes no constraint in double precision.
 SLACK_LIMIT = 25.0
 
 
@@ -38,7 +38,7 @@ class MagnitudeFit:
     """A fitted d(s) with its error recomputed from the realised roots.
 
     error : max over the points of weight |log(|d| / target)|.
-    error_bound : no d(s) of this order has a smaller one (the bisection proved it infeasible).
+    error_bound : no d(s) of this order has a smaller error (the bisection proved it infeasible).
     solves : conic problems solved.
     """
 
@@ -56,12 +56,12 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     ----------
     omega, magnitude : (n_omega,) rad/s and |d| > 0.
     order : number of poles, and of zeros.
-    weight : (n_omega,) in 0..1, what a logarithmic misfit costs at each point; all one when absent.
-    tolerance : gap between the error and its proven bound at which the bisection ends.
+    weight : (n_omega,) in 0..1, weight of the logarithmic misfit at each point; default one.
+    tolerance : gap between the error and its proved bound at which the bisection ends.
 
     Raises
     ------
-    InputError : shapes that differ, magnitudes or frequencies that are not positive and finite, a negative order.
+    InputError : different shapes, magnitudes or frequencies that are not positive and finite, a negative order.
     """
     omega, target, weight = _checked(omega, magnitude, order, weight)
     best, error = _constant_fit(target, weight)
@@ -76,7 +76,7 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
         try:
             candidate = problem.solve(2 * level)
         except ComputationError:
-            # Neither fitted nor proved impossible: what was found so far stands, with its bound.
+            # Neither solved nor proved infeasible: keep the best fit so far, with its bound.
             break
         if candidate is None:
             lower = level
@@ -85,11 +85,11 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
         try:
             fitted = _spectral_factor(p, q, unit)
         except ComputationError:
-            # Round-off put a root on the axis: as above.
+            # Round-off moved a root onto the axis: as above.
             break
         achieved = float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
         if achieved >= error:
-            # Feasible on paper but not after factorisation: doubles end here.
+            # Feasible, but no better after factorisation: the limit of double precision.
             break
         best, error = fitted, achieved
         problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
@@ -115,7 +115,7 @@ def _checked(omega: np.ndarray, magnitude: np.ndarray, order: int,
 
 
 def _constant_fit(target: np.ndarray, weight: np.ndarray) -> tuple[ScalarScaling, float]:
-    """Constant d of least weighted log-Chebyshev error: two points pull it from either side."""
+    """Constant d of minimum weighted log-Chebyshev error, which is attained at two points with opposite signs."""
     # error e with target_i - e/w_i <= c <= target_j + e/w_j for all i, j
     difference = target[:, None] - target[None, :]
     pull = np.divide(1.0, weight, out=np.full(weight.size, np.inf), where=weight > 0)
@@ -127,7 +127,7 @@ def _constant_fit(target: np.ndarray, weight: np.ndarray) -> tuple[ScalarScaling
 
 
 def initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarray:
-    """Roots -y_i of the first basis, spread over the band in proportion to how much the target varies."""
+    """Roots -y_i of the initial basis, distributed over the band in proportion to the variation of the target."""
     position = np.log(omega)
     arrange = np.argsort(position)
     position, target = position[arrange], target[arrange]
@@ -153,9 +153,9 @@ class _Feasibility:
         self.centre = np.ones(y.size) if ratio is None else ratio
 
     def recentred(self, zeros: np.ndarray, poles: np.ndarray) -> _Feasibility:
-        """The same problem in a basis around the latest solution, its roots held within a decade of the band.
+        """The same problem in a basis around the latest solution, with its roots kept within a decade of the band.
 
-        A basis that followed a root to infinity would lose sight of every solution with that root in the band.
+        A basis that followed a root to infinity could no longer represent solutions with that root in the band.
         """
         low, high = np.min(self.y) / 100, np.max(self.y) * 100
         near_zeros, near_poles = (np.clip(np.abs(roots), low, high) for roots in (zeros, poles))
@@ -164,7 +164,7 @@ class _Feasibility:
                             np.exp(np.maximum(log_ratio - np.max(log_ratio), -14.0)))
 
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Coefficients of p and q, ascending in y, or None where the level is infeasible."""
+        """Coefficients of p and q, ascending in y, or None if the level is infeasible."""
         log_t_k = np.divide(log_t, self.weight, out=np.full(self.y.size, np.inf), where=self.weight > 0)
         kept = log_t_k < SLACK_LIMIT
         inverse_t = np.exp(-log_t_k[kept])[:, None]
@@ -233,7 +233,7 @@ def gram_cone(size: int) -> Any:
 
 
 def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarray:
-    """Solution of max x[-1] subject to b - A x in the cones; ComputationError where the solver stops without one."""
+    """Solution of max x[-1] subject to b - A x in the cones; ComputationError if the solver fails."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1

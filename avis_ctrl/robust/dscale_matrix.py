@@ -1,7 +1,7 @@
 """Fit of a Hermitian positive definite X(j omega) by D(s)^H D(s): matrix scalings of repeated blocks.
 
 X is approximated by P(j omega) / q(omega^2) with a positive matrix polynomial P and a positive scalar q, both
-carried by Gram matrices, in the sense
+represented by Gram matrices, in the sense
 
     1/t X q <= P <= t X q   (in the order of Hermitian matrices) at the points:
 
@@ -40,8 +40,8 @@ from avis_ctrl.robust.scalings import MatrixScaling
 class HermitianFit:
     """A fitted D(s), with its error recomputed from the state space.
 
-    error : max over the points of weight |log eig(X^-1 D^H D)| / 2, the misfit of log |d| in one dimension.
-    error_bound : no D(s) of this degree over a scalar denominator has a smaller one.
+    error : max over the points of weight |log eig(X^-1 D^H D)| / 2; for n = 1 the misfit of log |d|.
+    error_bound : no D(s) of this degree over a scalar denominator has a smaller error.
     """
 
     scaling: MatrixScaling
@@ -52,10 +52,10 @@ class HermitianFit:
 
 def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndarray | None = None,
                   tolerance: float = 1e-2) -> HermitianFit:
-    """Log-Chebyshev fit of X (n_omega, n, n) at omega [rad/s] by D^H D, D of n * degree states.
+    """Log-Chebyshev fit of X (n_omega, n, n) at omega [rad/s] by D^H D, where D has n * degree states.
 
-    weight (n_omega,) in 0..1; the bisection ends where error and bound are within the tolerance.
-    Raises InputError for shapes that differ or an X that is not Hermitian positive definite.
+    weight (n_omega,) in 0..1; the bisection ends when error and bound differ by at most the tolerance.
+    Raises InputError for inconsistent shapes or an X that is not Hermitian positive definite.
     """
     omega, X, weight = _checked(omega, X, degree, weight)
     C = la.cholesky(np.mean(X.real, axis=0))
@@ -77,7 +77,7 @@ def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndar
         try:
             candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
         except (ComputationError, InputError):
-            # Round-off left the factorisation without a stable factor: what was found so far stands.
+            # No stable factor because of round-off: keep the best fit so far.
             break
         achieved = _error(candidate, omega, X, weight)
         if achieved >= error:
@@ -137,7 +137,7 @@ class _Feasibility:
         rows_q, gram_q = half_line_rows(omega ** 2, log_scale, e)
         power = np.arange(degree + 1)
         v = 1j ** power * np.exp(0.5 * np.log(e) + np.log(omega)[:, None] * power - 0.5 * log_scale[:, None])
-        # X = L L^H; the constraints are taken in the frame where X is the identity.
+        # X = L L^H; the constraints are expressed in coordinates where X is the identity.
         inverse = np.linalg.inv(np.linalg.cholesky(X))
         V = np.kron(v[:, None, :], np.eye(n))  # (n_omega, n, n (m + 1))
         W = inverse @ np.conj(V)
@@ -152,7 +152,7 @@ class _Feasibility:
                             POSITIVITY_MARGIN * _real_vectors((W @ np.conj(np.swapaxes(W, 1, 2)))[:, None])[:, 0])
 
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Gram matrix of P and coefficients of q in the scaled basis, or None where the level is infeasible."""
+        """Gram matrix of P and coefficients of q in the scaled basis, or None if the level is infeasible."""
         log_t_k = np.divide(log_t, self.weight, out=np.full(self.weight.size, np.inf), where=self.weight > 0)
         kept = np.flatnonzero(log_t_k < SLACK_LIMIT)
         inverse_t = np.exp(-log_t_k[kept])[:, None, None]
@@ -196,7 +196,7 @@ def _spectral_factor(gram: np.ndarray, q: np.ndarray, e: np.ndarray, unit: float
     root_gain = np.sqrt(q[-1])
     if degree == 0:
         return gain(la.cholesky(gram) / root_gain)
-    # the Gram matrix belongs to s^k sqrt(e_k), so f is scaled alike
+    # the Gram matrix belongs to s^k sqrt(e_k), so f is scaled likewise
     f = np.poly(stable_roots(q)).real[::-1]
     scale = np.sqrt(e)
     A = np.diag(scale[:-2] / scale[1:-1], 1) if degree > 1 else np.zeros((1, 1))

@@ -1,11 +1,11 @@
-"""The D-step: scalings of least order that keep the scaled loop within a per cent of its peak mu.
+"""The D-step: scalings of minimum order that keep the scaled loop within one per cent of its peak mu.
 
-Only magnitudes matter for scalar scalings, and log sigma_max(D N D^-1) is convex in log |d| with the gradient
-|u_i|^2 - |v_i|^2 of its singular vectors (Sezginer and Overton, IEEE TAC 35, 1990). So after the semidefinite
-fit of single blocks, all parameters are moved together by linear programs in a trust region, on what counts:
-the peak over frequency of the loop scaled by the realised D(s). Repeated blocks take part with the scalar factors
-of their matrices, which grow before these do: the best scalings at one frequency are not unique, and a fit to them,
-block by block, may cost far more than a common one of the same order.
+For scalar scalings only the magnitude matters, and log sigma_max(D N D^-1) is convex in log |d| with the gradient
+|u_i|^2 - |v_i|^2 of its singular vectors (Sezginer and Overton, IEEE TAC 35, 1990). After the semidefinite fit of
+single blocks, all parameters are therefore adjusted jointly by linear programs in a trust region, with the actual
+objective: the peak over frequency of the loop scaled by the realised D(s). Repeated blocks take part with the scalar
+factors of their matrices, whose orders are raised before those of the matrices. The best scalings at one frequency are
+not unique, and fitting them block by block may cost far more than a joint fit of the same order.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, Part, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# A fit is refined together with the others afterwards: closer than this its own optimum is not worth looking for.
+# Single fits are not optimised beyond these tolerances, because all fits are refined jointly afterwards.
 FIT_TOLERANCE = 2e-2
 MATRIX_FIT_TOLERANCE = 2e-2
-# Gain of a linear program below which refining a fit is not worth another: a tenth of what a fit may cost.
+# Refinement ends when a linear program predicts a smaller gain than this: a tenth of the allowed cost of a fit.
 REFINEMENT = 1e-3
-# Below this share of the peak a loop has room for any misfit; from here up its own mu is the yardstick. Steps that
-# gain much need little of the profile, the last ones live off it.
+# Below this fraction of the peak any misfit is harmless; above it, mu itself is the yardstick. Steps with a large gain
+# need little of the mu profile; the last steps depend on it.
 BROAD_FLOOR, DETAILED_FLOOR = 0.5, 0.3
-# Points of the check between the grid's, and the excess there that sends its peaks back into the grid.
+# Number of points of the check between grid points, and the ratio to the peak above which they are added to the grid.
 CHECKED_POINTS = 400
 BETWEEN = 1.02
 
 
 @dataclass(frozen=True)
 class GroupSettings:
-    """groups : of many blocks, those whose best scalings have the most similar course over frequency share their roots:
-    one root of each would add more states than the plant has. Their gains remain their own."""
+    """groups : with many blocks, number of groups of blocks with shared roots, grouped by the similarity of their best
+    scalings over frequency: one root per block would add more states than the plant has. The gains are not shared."""
 
     groups: int = 4
 
@@ -52,7 +52,7 @@ GROUPS = GroupSettings()
 
 @dataclass(frozen=True)
 class EqualOrderSettings:
-    """orders : of the scalings that have one order in all blocks. Fits of a higher order follow details of the best
+    """orders : orders of the scalings with equal order in all blocks. Fits of higher order follow details of the best
     scalings at single frequencies, which are not unique."""
 
     orders: tuple[int, ...] = (1, 2, 3, 4, 5)
@@ -63,7 +63,7 @@ EQUAL_ORDER = EqualOrderSettings()
 
 @dataclass(frozen=True, eq=False)
 class PointwiseScalings:
-    """Best scalings at each frequency on its own: what D(s) is fitted to.
+    """Best scalings at each single frequency: the target of the fit of D(s).
 
     mu : (n_omega,) upper bounds; log_d : (n_omega, n_blocks), zero for performance; X : block index ->
     (n_omega, n, n) Hermitian positive definite D^H D of a repeated scalar, relative to performance.
@@ -82,17 +82,17 @@ class PointwiseScalings:
         return float(np.max(self.mu))
 
     def shape(self, k: int) -> np.ndarray:
-        """X of a repeated block without its common size |d|^2 (n_omega, n, n)."""
+        """X of a repeated block divided by its common size |d|^2 (n_omega, n, n)."""
         return self.X[k] / np.exp(2 * self.log_d[:, k])[:, None, None]
 
     @property
     def yardstick(self) -> np.ndarray:
-        """What the loop scaled by realised D(s) is compared with (n_omega,): mu, or a share of its peak."""
+        """Reference for the loop scaled by the realised D(s) (n_omega,): mu, but at least a fraction of its peak."""
         return np.maximum(self.mu, self.floor * self.peak)
 
     @staticmethod
     def of(omega: np.ndarray, M: np.ndarray, structure: BlockStructure, tolerance: float = 2e-3) -> PointwiseScalings:
-        """From the response M (n_omega, n_z, n_w) of the loop; the last block is performance, none is real."""
+        """From the response M (n_omega, n_z, n_w) of the loop; the last block is performance, no block is real."""
         mu, scalings = upper_bound(M[:, None], structure, tolerance)
         last = next(reversed(list(structure.slices())))[2].start
         log_d, X = np.zeros((omega.size, len(structure.blocks))), {}
@@ -104,7 +104,7 @@ class PointwiseScalings:
         return PointwiseScalings(omega, M, structure, mu, log_d, X)
 
     def extended(self, omega: np.ndarray, M: np.ndarray) -> PointwiseScalings:
-        """With more frequencies of the same loop."""
+        """The same with additional frequencies of the loop."""
         more = PointwiseScalings.of(omega, M, self.structure)
         order = np.argsort(np.concatenate([self.omega, omega]))
 
@@ -116,7 +116,7 @@ class PointwiseScalings:
 
 @dataclass(frozen=True)
 class DStep:
-    """Realised scalings, the peak of the loop they scale, and their cost: largest excess over the yardstick."""
+    """Realised scalings, the peak of the scaled loop, and their cost: largest relative excess over the yardstick."""
 
     scalings: Scalings
     peak: float
@@ -124,10 +124,10 @@ class DStep:
 
 
 def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[DStep]:
-    """Scalings fitted block by block, all of one order: the lowest orders first, each with three weights of a misfit.
+    """Scalings fitted block by block, all of equal order: lowest orders first, each with three weights of the misfit.
 
-    They are much quicker than `d_steps`, and evaluated on the grid only. Their cost in the last loop says little about
-    the next one, so the caller compares the gamma that they allow.
+    They are much faster than `d_steps`, and evaluated on the grid only. Their cost in the last loop says little about
+    the next loop, so that the caller compares the gamma that is achievable with them.
     """
     start = _constants(points)
     everywhere = np.ones((points.omega.size, len(start.parts)))
@@ -145,11 +145,11 @@ def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[DSt
 
 def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors: Sequence[float] = (BROAD_FLOOR,),
             allowed_cost: float = 0.01, max_states: int = 60) -> Iterator[DStep]:
-    """Scalings of the loop N(s) chosen on the grid and measured between its points: peaks there are added to it.
+    """Scalings of the loop N(s) chosen on the grid and checked between its points: peaks there are added to the grid.
 
-    For each floor, fitted anew, and fitted on from `start`, the scalings that the loop was made with; the first that
-    costs no more than allowed is the last. Measured so, none costs more than `start`. Where none follows the best
-    scalings of all frequencies, their costs do not tell which one allows the better controller.
+    For each floor two fits are generated: a new fit, and one continued from `start`, the scalings of the last K-step.
+    The first fit within the allowed cost is the last. By this measure no fit costs more than `start`. If no fit follows
+    the best scalings at all frequencies, the costs do not show which fit allows the better controller.
     """
     for floor in floors:
         at = replace(points, floor=floor)
@@ -162,7 +162,7 @@ def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors
 
 def tightened(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float,
               max_states: int) -> DStep:
-    """Scalings from `start` that lower the peak of the scaled loop N(s) itself, whatever they do below it."""
+    """Scalings continued from `start` that lower only the peak of the scaled loop N(s), not its values below."""
     points = replace(points, floor=1.0)
     step = _continued(points, start, allowed_cost, max_states)
     return _settled(points, loop, step, start, allowed_cost, max_states)
@@ -170,7 +170,7 @@ def tightened(points: PointwiseScalings, loop: StateSpace, start: Scalings, allo
 
 def _settled(points: PointwiseScalings, loop: StateSpace, step: DStep, start: Scalings, allowed_cost: float,
              max_states: int) -> DStep:
-    """The step corrected until nothing peaks between the grid's points, or `start` where that costs less."""
+    """The step corrected until there are no peaks between grid points, or `start` if that costs less."""
     dense = np.geomspace(points.omega[0], points.omega[-1], CHECKED_POINTS)
     response = loop.frequency_response(dense)
     first = _measured(points, loop, dense, response, start)[0]
@@ -187,9 +187,9 @@ def _settled(points: PointwiseScalings, loop: StateSpace, step: DStep, start: Sc
 
 def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, response: np.ndarray,
               scalings: Scalings) -> tuple[DStep, np.ndarray, np.ndarray]:
-    """The step with peak and cost between the grid's points too, and where (and with which M) it exceeds theirs."""
+    """The step with peak and cost also between grid points, and the frequencies and M where these exceed the grid."""
     step = _evaluated(points, scalings)
-    # Lightly damped roots make the narrowest peaks that scalings can add.
+    # Lightly damped roots cause the narrowest peaks that scalings can add.
     roots = np.abs(np.concatenate([np.r_[part.scalar.zeros, part.scalar.poles] for part in scalings.parts]))
     omega = np.concatenate([dense, roots])
     order = np.argsort(omega)
@@ -207,28 +207,28 @@ def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, re
 def _anew(points: PointwiseScalings, allowed_cost: float, max_states: int) -> DStep:
     """Greedy search for the smallest orders whose realised scalings cost less than `allowed_cost` of peak mu.
 
-    All orders start at zero; the blocks whose misfit accounts for most of the excess get one more, as long as the
-    scaled plant gains at most `max_states` states.
+    All orders start at zero. Blocks whose misfit explains most of the excess get a higher order, as long as the
+    scalings add at most `max_states` states to the plant.
     """
     return _grown(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
 
 
 def _continued(points: PointwiseScalings, start: Scalings, allowed_cost: float, max_states: int) -> DStep:
-    """Given scalings refined where that helps, and grown from there."""
+    """The given scalings, refined if that helps, with orders raised as needed."""
     kept = min(_evaluated(points, start), _evaluated(points, _refined(points, start)), key=lambda step: step.cost)
     return _grown(points, kept, allowed_cost, max_states)
 
 
 def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_states: int) -> DStep:
-    """Orders raised where the misfit costs most, until the cost is allowed or nothing helps."""
+    """Raise orders where the misfit costs most, until the cost is allowed or no increase helps."""
     while best.cost > allowed_cost:
         share = _blame(points, best.scalings)
         if not np.any(share > 0):
             break
         candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by, matrices)
-                      # Matrices last: most often their factors are enough, and a factor is refined with all the rest.
+                      # Matrices last: their scalar factors usually suffice, and are refined jointly with the rest.
                       for matrices in (False, True)
-                      # One more order may not pay where two do: a resonance needs a pair of roots.
+                      # One more order may not help where two do: a resonance needs a pair of roots.
                       for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2)))
         better = next((new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)),
                       None)
@@ -239,7 +239,7 @@ def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_stat
 
 
 def band_of(omega: np.ndarray) -> tuple[float, float]:
-    """Where roots of scalings may lie [rad/s]: a decade inside the frequencies looked at, so that D is flat beyond."""
+    """Band for the roots of scalings [rad/s]: a decade inside the range of frequencies, so that D is flat beyond it."""
     low, high = float(np.min(omega)), float(np.max(omega))
     return (10 * low, high / 10) if high > 1e3 * low else (low, high)
 
@@ -272,7 +272,7 @@ def _constants(points: PointwiseScalings) -> Scalings:
 
 
 def _groups(points: PointwiseScalings) -> tuple[int, ...]:
-    """Number of the group of each block; empty where there are few blocks, or repeated ones."""
+    """Group number of each block; empty if there are few blocks, or repeated blocks."""
     n = len(points.structure.blocks) - 1
     if not points.structure.many or points.X:
         return ()
@@ -284,9 +284,9 @@ def _groups(points: PointwiseScalings) -> tuple[int, ...]:
 
 def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_states: int, by: int,
             matrices: bool) -> DStep | None:
-    """The step with some groups refitted at a higher order and everything refined; None where they may not grow.
+    """The step with some groups refitted at a higher order and everything refined; None if the order is not allowed.
 
-    matrices : raise the orders of repeated blocks by matrices of that order, instead of by their scalar factors.
+    matrices : raise the orders of the matrices of repeated blocks, instead of those of their scalar factors.
     """
     scalings = step.scalings
     members = [scalings.members[number] for number in groups]
@@ -305,7 +305,7 @@ def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_stat
             order = part.scalar.order + by
             if order > MAX_ORDER:
                 return None
-            # Of the scalings with the groups that are refitted already.
+            # Sensitivities with the groups that are already refitted.
             weights = _sensitivities(points, scalings)
             for k, part in zip(blocks, _fitted(points, step.scalings, blocks, order, weights), strict=True):
                 scalings = scalings.replace(k, part)
@@ -318,14 +318,14 @@ def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_stat
 
 def _fitted(points: PointwiseScalings, scalings: Scalings, blocks: tuple[int, ...], order: int,
             weights: np.ndarray) -> list[Part]:
-    """A group's blocks with d(s) fitted to their best scalings at each frequency, weighted (n_omega, n_blocks) by what
-    a misfit costs."""
+    """The blocks of a group with d(s) fitted to their best scalings at each frequency; `weights` (n_omega, n_blocks)
+    are the cost of a misfit."""
     weights = weights[:, blocks]
     part, target = scalings.parts[blocks[0]], points.log_d[:, blocks]
     if isinstance(part, MatrixScaling):
         size = np.linalg.norm(part.system.frequency_response(points.omega), axis=(1, 2))
         target = target - np.log(size / np.sqrt(part.system.ninputs))[:, None]
-    # What is left of each where the course of all is taken away is its gain.
+    # Each block has its own gain; the remaining dependence on frequency is common to the group.
     own = np.average(target, axis=0, weights=weights) if len(blocks) > 1 else np.zeros(1)
     common = np.average(target - own, axis=1, weights=weights)
     fit = fit_magnitude(points.omega, np.exp(common), order, np.max(weights, axis=1), FIT_TOLERANCE)
@@ -335,25 +335,25 @@ def _fitted(points: PointwiseScalings, scalings: Scalings, blocks: tuple[int, ..
 
 
 def _closeness(points: PointwiseScalings) -> np.ndarray:
-    """Weight of a misfit by the distance of mu from its peak: one at the peak, little where there is room."""
+    """Weight of a misfit by the distance of mu from its peak: one at the peak, small far below it."""
     room = np.log(points.peak / np.maximum(points.mu, 1e-3 * points.peak))
     return 0.03 / (0.03 + room)
 
 
 def _sensitivities(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """(n_omega, n_blocks) what a misfit costs: closeness to the peak times the share in the singular vectors."""
+    """(n_omega, n_blocks) cost of a misfit: closeness to the peak times the contribution to the singular vectors."""
     left, right = scalings.response(points.omega)
     U, _, Vh = np.linalg.svd(left @ points.M @ right)
     share = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
                       for _, w, z in points.structure.slices()], axis=1)
-    # A block that no loop goes through has no share.
+    # A block that is not part of a loop does not contribute.
     relative = share / np.maximum(np.max(share, axis=0), np.finfo(float).tiny)
     weight = _closeness(points)[:, None] * np.maximum(relative, 1e-2)
     return np.maximum(weight / np.max(weight, axis=0), 1e-3)
 
 
 def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """How much of the excess over the peak each group's misfit explains (n_groups,), to first order."""
+    """Part of the excess over the yardstick explained by the misfit of each group (n_groups,), to first order."""
     left, right = scalings.response(points.omega)
     U, s, Vh = np.linalg.svd(left @ points.M @ right)
     excess = np.maximum(np.log(s[:, 0] / points.yardstick), 0.0)
@@ -374,7 +374,7 @@ def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
 
 
 def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> Scalings:
-    """Sequential linear programs in a trust region on max over frequency of log sigma_max(D N D^-1)."""
+    """Minimise max over frequency of log(sigma_max(D N D^-1) / yardstick) by linear programs in a trust region."""
     if len(scalings.parts) < 2:
         return scalings
     box = np.array(parameter_box(scalings, band_of(points.omega)))
@@ -398,7 +398,7 @@ def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> S
 
 
 def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of the largest singular values near the peak (n,), and their slopes in theta (n, n_theta)."""
+    """Logarithms of the largest singular values relative to the yardstick near the peak (n,), slopes (n, n_theta)."""
     left, right = scalings.response(points.omega)
     U, s, Vh = np.linalg.svd(left @ points.M @ right, full_matrices=False)
     kept = min(kept, s.shape[1])

@@ -1,12 +1,12 @@
-"""mu synthesis at a fixed order: modes are removed and added, with descent on the upper bound of mu between.
+"""mu synthesis at a fixed order: modes are removed and added, with descent on the upper bound of mu in between.
 
-It starts from the full controller and goes down order by order: descent (`mu_descent`), then removal of the mode that
-is missed least. Few states do not roll off by themselves: the descent makes a direct term of what the full controller
-does with fast modes, hence the limit of the gain in `Task`.
+The method starts from the full controller and reduces the order stepwise: descent (`mu_descent`), then removal of the
+mode whose removal raises the peak least. A controller with few states does not roll off by itself: the descent replaces
+the fast modes of the full controller by a direct term. Hence the gain limit in `Task`.
 
-The descent ends in a local minimum. A controller with fewer states than asked is therefore lengthened by the mode that
-lowers the smoothed peak most to first order, and at the end modes are exchanged, as long as the peak falls: one or two
-are added, descent follows, and those that are missed least are removed.
+The descent ends in a local minimum. A controller with fewer states than requested is therefore extended by the mode
+that lowers the smoothed peak most to first order. At the end modes are exchanged as long as the peak decreases: one or
+two modes are added, descent follows, and the modes with the smallest effect are removed.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from avis_ctrl.robust.reduction import reduce_controller, split, split_stable
 
 @dataclass(frozen=True)
 class FixedOrderSettings:
-    """unneeded : Hankel singular values, relative to the largest, of the states that an entry of a decentralised
-        controller does not need.
-    free : growth of mu for which balanced truncation may shorten the controller at once.
-    costly : growth of mu by the removal of a mode from which the controller is improved before it is shortened.
-    passing : number of stages of descent, the first ones, for a controller on the way to another order.
-    exchanged : states by which a controller is lengthened to look for one of its own order with a smaller peak.
-    worth : relative fall of the peak from which the exchange of modes goes on.
-    per_decade, damping : natural frequencies per decade, and damping ratios beside a real pole, of the modes that are
-        tried as additions.
+    """unneeded : relative Hankel singular value up to which states of an entry of a decentralised controller are
+        removed.
+    free : growth of mu up to which balanced truncation may reduce the order at once.
+    costly : growth of mu by the removal of a mode above which descent precedes the removal.
+    passing : number of stages of descent (the first ones) for a controller of intermediate order.
+    exchanged : number of states added temporarily to find a controller of the same order with a smaller peak.
+    worth : minimum relative decrease of the peak for the exchange of modes to continue.
+    per_decade, damping : natural frequencies per decade, and damping ratios in addition to a real pole, of the modes
+        that are tried as additions.
     small : gain of an added mode before descent, relative to that of the controller at the mode's natural frequency;
         small, because its effect is known to first order only.
-    same_pole : relative distance up to which two computations of a pole are one.
+    same_pole : relative distance up to which two computed poles count as equal.
     """
 
     unneeded: float = 1e-6
@@ -56,11 +56,11 @@ SETTINGS = FixedOrderSettings()
 
 
 def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpace] = ()) -> Iterator[Step]:
-    """Controllers of falling order with small peaks, as they are found; the last one has at most `order` states.
+    """Generate controllers of decreasing order with small peaks; the last one has at most `order` states.
 
-    K stabilises the plant; it is shortened while that is free, then mode by mode with descent where a mode is missed.
-    `others` are further controllers to start from, used where they have at most `order` states. ComputationError where
-    no shortened controller, or not the diagonal part of K, stabilises the plant.
+    K stabilises the plant. Its order is reduced by truncation while this is free, then mode by mode, with descent
+    before costly removals. `others` are further initial controllers, used if they have at most `order` states.
+    ComputationError if no reduced controller stabilises the plant, or if the diagonal part of K does not.
     """
     if task.decentralised:
         K = _diagonal_part(K)
@@ -75,10 +75,10 @@ def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpa
         if step.K.nstates > order:
             yield step
         K = step.K
-    # The start that the first stage brings lowest goes on.
+    # Continue from the start with the lowest peak after the first stage.
     starts = [K, *(one for one in others if one.nstates <= order and lft_lower(task.P, one).is_stable())]
     best = min((task.descended(one, task.settings.sharpness[:1]) for one in starts), key=lambda one: one.peak)
-    # An added mode may not help, or even make the loop unstable; then the shorter controller stays.
+    # An added mode may not help, or even make the loop unstable; then the controller without it is kept.
     best = min(task.descended(_lengthened(task, best.K, order), task.settings.sharpness[1:]), best,
                key=lambda one: one.peak)
     yield best
@@ -87,7 +87,7 @@ def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpa
 
 
 def _shortened(task: Task, K: StateSpace, order: int) -> Iterator[Step]:
-    """K mode by mode down to an order: each controller that descent improved on the way, and the last one without."""
+    """Remove modes of K one by one down to an order; yields each descent step, and the last controller as it is."""
     peak = np.inf
     while K.nstates > order:
         shorter, peak = _shorter(task, K, order)
@@ -104,7 +104,7 @@ def _shortened(task: Task, K: StateSpace, order: int) -> Iterator[Step]:
 
 
 def _lengthened(task: Task, K: StateSpace, order: int) -> StateSpace:
-    """K with modes added up to an order, each where it lowers the smoothed peak most, and descent after each."""
+    """Add modes to K up to an order, each where it lowers the smoothed peak most, with descent after each."""
     while K.nstates < order:
         K = with_mode(task, K, order - K.nstates)
         K = task.descended(K, task.settings.sharpness[:SETTINGS.passing]).K
@@ -112,7 +112,7 @@ def _lengthened(task: Task, K: StateSpace, order: int) -> StateSpace:
 
 
 def _exchanged(task: Task, K: StateSpace, order: int) -> Step:
-    """K with modes added, then without those that are missed least: a way out of a local minimum."""
+    """Add modes to K, then remove those with the smallest effect, to leave a local minimum."""
     try:
         *_, step = _shortened(task, _lengthened(task, K, order + SETTINGS.exchanged), order)
     except ComputationError:
@@ -121,7 +121,7 @@ def _exchanged(task: Task, K: StateSpace, order: int) -> Step:
 
 
 def _diagonal_part(K: StateSpace) -> StateSpace:
-    """K with its entries off the diagonal zero, each one on it without the states that it does not need."""
+    """The diagonal entries of K, each without the states that it does not need; off-diagonal entries are zero."""
     parts = []
     for k in range(K.noutputs):
         stable, unstable = split_stable(K.select([k], [k]))
@@ -130,7 +130,7 @@ def _diagonal_part(K: StateSpace) -> StateSpace:
 
 
 def _shorter(task: Task, K: StateSpace, order: int) -> tuple[StateSpace, float]:
-    """K without the mode missed least, and its peak then; one state less than asked where only a pair can go."""
+    """K without the mode of smallest effect, and its peak; below `order` by one if only a pair can be removed."""
     omega = frequency_grid(lft_lower(task.P, K))
     fewer = [*_without_one_mode(K), *_truncated(K)]
     fewer = [one for one in fewer if one.nstates >= order] or fewer
@@ -140,13 +140,13 @@ def _shorter(task: Task, K: StateSpace, order: int) -> tuple[StateSpace, float]:
 
 
 def _truncated(K: StateSpace) -> list[StateSpace]:
-    """K with one and with two states less, by balanced truncation of its stable part."""
+    """K with one and with two states fewer, by balanced truncation of its stable part."""
     stable, unstable = split_stable(K)
     return [balanced_truncation(stable, stable.nstates - less) + unstable for less in (1, 2) if stable.nstates >= less]
 
 
 def _without_one_mode(K: StateSpace) -> list[StateSpace]:
-    """K without each of its modes (a pole or a pair), dropped, or replaced by what it contributes at rest."""
+    """K without each of its modes (a pole or a pair), once dropped and once replaced by its static gain."""
     fewer = []
     for pole in K.poles():
         if pole.imag < 0:
@@ -163,11 +163,11 @@ def _without_one_mode(K: StateSpace) -> list[StateSpace]:
 
 
 def with_mode(task: Task, K: StateSpace, most: int) -> StateSpace:
-    """K with one mode more, of one state, or two where `most` allows it: the one that lowers the smoothed peak most.
+    """K with one more mode (one state, or two if `most` allows it): the mode that lowers the smoothed peak most.
 
     A mode f(s) u v^T, with f one of wn/(s + wn), and wn^2/d(s) or s wn/d(s) with d(s) = s^2 + 2 zeta wn s + wn^2, adds
-    u^T D v to the slope, D = Re sum_k f(j omega_k) G_k^T: the largest singular value of D, for f of unit r.m.s. value
-    over the frequencies, says how much the mode can do, and its singular vectors are u and v.
+    u^T D v to the slope, D = Re sum_k f(j omega_k) G_k^T. With f of unit r.m.s. value over the frequencies, the largest
+    singular value of D measures the possible decrease by the mode, and its singular vectors are u and v.
     """
     _, grid = task.measured(K)
     _, omega, G = smoothed_peak(task, K, grid, task.P.frequency_response(grid), task.settings.sharpness[0])
@@ -182,8 +182,8 @@ def with_mode(task: Task, K: StateSpace, most: int) -> StateSpace:
 
 def _best_mode(K: StateSpace, wn: float, zeta: float | None, omega: Array, G: Array, decentralised: bool
                ) -> tuple[float, float, StateSpace]:
-    """The fall of the smoothed peak by a mode of unit r.m.s. value, its natural frequency, and the mode itself."""
-    # The first state is the output; a mode of two states has an input for each of its two numerators.
+    """Decrease of the smoothed peak by a mode of unit r.m.s. value, its natural frequency, and the mode itself."""
+    # The first state is the output; a mode with two states has one input per numerator.
     A = np.array([[-wn]] if zeta is None else [[-2 * zeta * wn, wn], [-wn, 0.0]])
     B = wn * np.eye(len(A))[::-1]
     f = StateSpace(A, B, np.eye(1, len(A)), np.zeros((1, len(A)))).frequency_response(omega)[:, 0]

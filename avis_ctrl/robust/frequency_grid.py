@@ -1,4 +1,4 @@
-"""Frequencies at which a loop is looked at: spread over the band where it changes, dense at its resonances."""
+"""Frequency grids for a loop: they cover the band where the response changes, and are dense at resonances."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_POINTS = 140
 
 
 def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
-    """Grid [rad/s] from the poles, without the ends over which the response stays within `change` of its limit."""
+    """Grid [rad/s] from the poles, without the ends where the response stays within `change` of its limits."""
     poles = system.poles()
     sizes = np.abs(poles[np.abs(poles) > 1e-9])
     low, high = (np.min(sizes) / 10, np.max(sizes) * 10) if sizes.size else (1e-2, 1e2)
@@ -25,13 +25,13 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     last = min(wide.size - int(np.argmax(from_end[::-1])), wide.size - 1)
     low, high = wide[min(first, last - 1)], wide[max(last, first + 1)]
     even = np.geomspace(low, high, max(30, round(POINTS_PER_DECADE * np.log10(high / low))))
-    # A decade more on either side shows scalings settle where the loop has settled already.
+    # Another decade on either side makes the scalings constant where the loop is already constant.
     ends = np.concatenate([low / np.array([10.0, 3.0]), high * np.array([3.0, 10.0])])
     return merged(np.concatenate([even, ends]), resonances(poles, low, high))
 
 
 def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf, damping: float = 0.4) -> np.ndarray:
-    """Peaks of modes [rad/s] with a damping ratio below `damping`, with points at half a bandwidth to either side."""
+    """Resonance frequencies [rad/s] of modes with a damping ratio below `damping`, and points half a bandwidth away."""
     light = poles[(poles.imag > 0) & (np.abs(poles.real) < damping * np.abs(poles))]
     centre = np.sqrt(np.maximum(np.abs(light) ** 2 - 2 * light.real ** 2, 0.0))
     points = np.concatenate([centre, centre + light.real, centre - light.real])
@@ -39,14 +39,14 @@ def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf, dampin
 
 
 def merged(omega: np.ndarray, extra: np.ndarray) -> np.ndarray:
-    """Sorted union without points closer than a thousandth, at most MAX_POINTS of them."""
+    """Sorted union without points closer than 0.1 %, thinned to at most MAX_POINTS."""
     every = np.sort(np.concatenate([omega, extra]))
     kept = every[np.concatenate([[True], every[1:] > every[:-1] * np.exp(1e-3)])]
     return kept if kept.size <= MAX_POINTS else kept[np.unique(np.linspace(0, kept.size - 1, MAX_POINTS).astype(int))]
 
 
 def refined_grid(omega: np.ndarray, mu: np.ndarray, peaks: int = 4) -> np.ndarray:
-    """The grid with points halfway around its highest local maxima, while there is room."""
+    """The grid with additional points halfway to both neighbours of its highest local maxima, up to MAX_POINTS."""
     inner = np.flatnonzero((mu[1:-1] >= mu[:-2]) & (mu[1:-1] >= mu[2:])) + 1
     highest = inner[np.argsort(mu[inner])[::-1][:peaks]]
     if omega.size + 2 * highest.size > MAX_POINTS:

@@ -1,16 +1,16 @@
-"""Descent on the H-infinity optimum itself over the parameters of the scalings.
+"""Descent on the H-infinity optimum over the parameters of the scalings.
 
-D-K iteration minimises over D and K in turn and stalls: after a K-step the scaled loop is flat, so that no
-change of D alone helps. Here gamma(theta) = min over K of ||D P_K D^-1|| is one function of the scalings'
-parameters, and its gradient is cheap. Where the optimum is set by rho(X Y) = gamma^2, the implicit function
-theorem gives dgamma/dtheta = -(drho/dtheta) / (drho/dgamma - 2 gamma), and the derivatives of X and Y are
-solutions of Lyapunov equations, of which two adjoint ones serve all parameters:
+D-K iteration minimises over D and K in turn and stalls: after a K-step the scaled loop is flat over frequency, so that
+no change of D alone helps. Here gamma(theta) = min over K of ||D P_K D^-1|| is minimised as a function of the scaling
+parameters; its gradient is cheap. If the optimum is determined by rho(X Y) = gamma^2, the implicit function theorem
+gives dgamma/dtheta = -(drho/dtheta) / (drho/dgamma - 2 gamma). The derivatives of X and Y are solutions of Lyapunov
+equations, and two adjoint Lyapunov equations serve all parameters:
 
     A'X + XA + XRX + Q = 0,   A_c = A + R X:     dX solves   A_c' dX + dX A_c + M = 0,
     M = dA'X + X dA + X dR X + dQ,     a' dX a = tr(L M),   A_c L + L A_c' + a a' = 0 .
 
-The data (A, R, Q) of the Riccati equations do not change under the rotations of z and w and the scalings of
-u and y that bring a plant to normal form, so that differences of them are taken without meeting those.
+The data (A, R, Q) of the Riccati equations are invariant under the rotations of z and w and the scalings of u and y
+that transform a plant to normal form. Differences of the data are therefore not affected by these transformations.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ REGULARISATION = 1e-4
 
 @dataclass(frozen=True)
 class ScaledProblem:
-    """The plant whose scalings are sought, its states balanced once so that gamma is smooth in theta."""
+    """The plant to be scaled; its states are balanced only once, so that gamma is smooth in theta."""
 
     P: StateSpace
     nmeas: int
@@ -49,7 +49,7 @@ class ScaledProblem:
         return ScaledProblem(balance(P), nmeas, ncon, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
 
     def normal(self, scalings: Scalings) -> NormalForm:
-        """Normal form of the scaled plant, with extra channels where D12 or D21 lacks rank."""
+        """Normal form of the scaled plant, with extra channels if D12 or D21 is rank deficient."""
         S = scalings.scale(self.P)
         w, z = S.ninputs - self.ncon, S.noutputs - self.nmeas
         plant = Plant(S.A, S.B[:, :w], S.B[:, w:], S.C[:z], S.C[z:], S.D[:z, :w], S.D[:z, w:], S.D[z:, :w], S.D[z:, w:],
@@ -57,13 +57,13 @@ class ScaledProblem:
         return normal_form(regularised(plant, REGULARISATION, *self.singular, False) if any(self.singular) else plant)
 
     def reaches(self, scalings: Scalings, gamma: float) -> bool:
-        """Whether some controller makes the scaled norm less than gamma."""
+        """Whether some controller achieves a scaled norm below gamma."""
         return gamma_test(self.normal(scalings).plant, gamma).feasible
 
 
 @dataclass(frozen=True)
 class Descent:
-    """The best scalings found, with gamma before and after, and the points tried."""
+    """The best scalings found, gamma before and after, and the number of evaluated points."""
 
     scalings: Scalings
     gamma_before: float
@@ -72,7 +72,7 @@ class Descent:
 
 
 def parameters(scalings: Scalings) -> np.ndarray:
-    """theta of all free scalings in a row; what the scalings of a group have in common is there once."""
+    """theta of all free scalings in one vector; parameters shared by a group occur once."""
     places = scalings.places()
     theta = np.zeros(1 + max((int(at.max()) for at in places), default=-1))
     for part, at in zip(scalings.parts, places, strict=False):
@@ -81,7 +81,7 @@ def parameters(scalings: Scalings) -> np.ndarray:
 
 
 def with_parameters(scalings: Scalings, theta: np.ndarray) -> Scalings:
-    """The scalings moved to theta."""
+    """The scalings with the parameters theta."""
     for k, at in enumerate(scalings.places()):
         scalings = scalings.replace(k, scalings.parts[k].with_scalar(ScalarScaling(theta[at])))
     return scalings
@@ -89,7 +89,7 @@ def with_parameters(scalings: Scalings, theta: np.ndarray) -> Scalings:
 
 def gamma_and_gradient(problem: ScaledProblem, scalings: Scalings,
                        hint: float | None = None) -> tuple[float, np.ndarray]:
-    """gamma(theta) and d log gamma / d theta (n_theta,); ComputationError where rho(X Y) does not set the optimum."""
+    """gamma(theta), d log gamma / d theta (n_theta,); ComputationError if rho(X Y) does not determine the optimum."""
     slope, gamma, of_gamma = _coupling(problem, scalings, hint)
     theta = parameters(scalings)
     gradient = np.empty(theta.size)
@@ -102,7 +102,7 @@ def gamma_and_gradient(problem: ScaledProblem, scalings: Scalings,
 
 
 def _coupling(problem: ScaledProblem, scalings: Scalings, hint: float | None) -> tuple[_CouplingSlope, float, float]:
-    """Derivatives of rho(X Y) at the optimum, gamma there, and the slope of rho(X Y) - gamma^2 in gamma."""
+    """Derivatives of rho(X Y) at the optimum, gamma there, and the derivative of rho(X Y) - gamma^2 by gamma."""
     plant = problem.normal(scalings).plant
     bracket = find_gamma(plant, GAMMA_TOLERANCE, hint)
     if COUPLED not in bracket.limited_by:
@@ -115,7 +115,7 @@ def _coupling(problem: ScaledProblem, scalings: Scalings, hint: float | None) ->
 
 @dataclass(frozen=True)
 class _CouplingSlope:
-    """First-order change of rho(X Y) with the data of the two Riccati equations."""
+    """First-order change of rho(X Y) with the data of both Riccati equations."""
 
     rho: float
     X: np.ndarray
@@ -141,7 +141,7 @@ class _CouplingSlope:
         return _CouplingSlope(rho, X, Y, control, filter_, L_x, L_y)
 
     def along(self, plant: Plant, gamma: float) -> float:
-        """Change of rho(X Y) when the plant and gamma move to these, to first order."""
+        """First-order change of rho(X Y) from the present plant and gamma to the given ones."""
         total = 0.0
         for X, L, here, there in ((self.X, self.L_x, self.control, control_riccati(plant, gamma)),
                                   (self.Y, self.L_y, self.filter, filter_riccati(plant, gamma))):
@@ -153,10 +153,10 @@ class _CouplingSlope:
 def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float], *,
             evaluations: int = 40, tolerance: float = 1e-3,
             stop: Callable[[float], bool] = lambda gamma: False) -> Descent:
-    """Quasi-Newton descent (BFGS in a box) on log gamma over the parameters of the scalar scalings.
+    """Quasi-Newton descent (BFGS with bounds) on log gamma over the parameters of the scalar scalings.
 
-    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends where five steps together gain less than `tolerance`.
-    `stop(gamma)` is asked after every evaluation.
+    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`, or
+    when `stop(gamma)`, called before every step, returns true.
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     low, high = np.array(parameter_box(scalings, band)).T
@@ -188,7 +188,7 @@ def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tupl
 
 
 def _direction(H: np.ndarray, slope: np.ndarray, theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Quasi-Newton step of at most one (a factor e in a root), without parameters that push against the box."""
+    """Quasi-Newton step of at most one (a factor e in a root); parameters at an active bound stay fixed."""
     free = ~(((theta <= low) & (slope > 0)) | ((theta >= high) & (slope < 0)))
     step = np.zeros(theta.size)
     step[free] = -H[np.ix_(free, free)] @ slope[free]
@@ -198,9 +198,9 @@ def _direction(H: np.ndarray, slope: np.ndarray, theta: np.ndarray, low: np.ndar
 
 
 def _tried(problem: ScaledProblem, trial: Scalings, gamma: float, demanded: float) -> tuple[float, np.ndarray] | None:
-    """gamma and slope at a trial point that falls enough (log gamma by `demanded` < 0); None elsewhere."""
+    """gamma and slope at a trial point of sufficient decrease (log gamma changes by `demanded` < 0); otherwise None."""
     try:
-        # A point that does not improve is known by one test, without its optimum.
+        # One gamma test rejects a point without sufficient decrease; its optimum is not needed.
         if not problem.reaches(trial, gamma * np.exp(demanded)):
             return None
         return gamma_and_gradient(problem, trial, gamma)
@@ -209,7 +209,7 @@ def _tried(problem: ScaledProblem, trial: Scalings, gamma: float, demanded: floa
 
 
 def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """BFGS update of the inverse Hessian; the first one sets its size."""
+    """BFGS update of the inverse Hessian; the first update sets its scale."""
     curvature = float(s @ y)
     if curvature <= 1e-10 * float(np.linalg.norm(s) * np.linalg.norm(y)):
         return H
@@ -221,11 +221,11 @@ def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
           max_states: int, share: float = 0.5) -> Scalings | None:
-    """The scalings with one more root pair in the blocks where, and at the frequency where, gamma asks for it.
+    """The scalings with one more zero-pole pair in the blocks, and at the frequencies, where gamma is most sensitive.
 
-    A zero and a pole that cancel change nothing, but gamma has a slope in their distance. Pairs are tried at two
-    places a decade in all blocks at once; those blocks grow whose slope is at least `share` of the largest.
-    None where no slope is left, or no room for more states.
+    A zero and a pole that cancel change nothing, but gamma has a slope with respect to their distance. Pairs are tried
+    at two frequencies per decade in all blocks at once. Blocks whose slope is at least the fraction `share` of the
+    largest get a pair. None if all slopes vanish, or if no more states are allowed.
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
@@ -252,7 +252,7 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
 
 
 def _with_pair(scalings: Scalings, group: tuple[int, ...], place: float, split: float = 0.0) -> Scalings:
-    """The scalings with a neutral pair in each block of a group."""
+    """The scalings with a neutral (cancelling) pair in each block of a group."""
     for k in group:
         part = scalings.parts[k]
         scalings = scalings.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, split)))
@@ -280,7 +280,7 @@ def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[tuple
 
 
 def parameter_box(scalings: Scalings, band: tuple[float, float]) -> list[tuple[float, float]]:
-    """Bounds: gains within 1e-6..1e6 of where they are, roots in the band, damping from 0.05 to 50."""
+    """Bounds: gains within 1e-6..1e6 times their present value, roots in the band, damping from 0.05 to 50."""
     box: list[tuple[float, float]] = []
     slow, fast = np.log(band[0]), np.log(band[1])
     for k, at in enumerate(scalings.places()):

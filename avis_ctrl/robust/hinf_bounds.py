@@ -1,15 +1,15 @@
-"""What no controller can do: a lower bound on ||F_l(P, K)|| over every stabilising K.
+"""Lower bound on ||F_l(P, K)|| over all stabilising K.
 
-At any point s of the closed right half plane where P has no pole, F_l(P, K)(s) = P11 + P12 Q P21 with
-some finite matrix Q(s), and by Parrott's theorem no Q brings its norm below
+At any point s of the closed right half plane where P has no pole, F_l(P, K)(s) = P11 + P12 Q P21 with a finite matrix
+Q(s). By Parrott's theorem no Q gives a norm below
 
     max( sigma(U' P11), sigma(P11 V) ),      U' P12 = 0,   P21 V = 0.
 
-By the maximum principle each such value bounds the H-infinity norm. On the imaginary axis this is what
-the directions of actuators and sensors leave; at a zero of u -> z or w -> y in the right half plane it is
-the interpolation bound, such as |W(z)| for a weighted sensitivity (Zames and Francis 1983; Skogestad and
-Postlethwaite, Multivariable Feedback Control, 2nd ed. 2005, section 5.6.1). The Riccati test, where
-the plant needs no regularisation, gives the sharp bound.
+By the maximum principle each such value bounds the H-infinity norm. On the imaginary axis it is the gain in directions
+that actuators do not affect or sensors do not measure. At a zero of u -> z or w -> y in the right half plane it is the
+interpolation bound, such as |W(z)| for a weighted sensitivity (Zames and Francis 1983; Skogestad and Postlethwaite,
+Multivariable Feedback Control, 2nd ed. 2005, section 5.6.1). The Riccati test gives the sharp bound if the plant needs
+no regularisation.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from avis_ctrl.robust.hinf_settings import SETTINGS
 
 @dataclass(frozen=True)
 class LowerBound:
-    """No stabilising controller brings the norm below `gamma`.
+    """No stabilising controller achieves a norm below `gamma`.
 
-    point : s [rad/s] where the bound is reached (of the bilinear image when P is sampled); nan for the Riccati test.
-    source : the argument, in words.
+    point : s [rad/s] where the bound is attained (of the bilinear image if P is sampled); nan for the Riccati test.
+    source : description of the argument.
     """
 
     gamma: float
@@ -48,10 +48,10 @@ class LowerBound:
 
 
 def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = None) -> LowerBound:
-    """The best of the pointwise bounds and, where it applies, of the Riccati test (infeasible gamma, within 0.1 %).
+    """The largest of the pointwise bounds and, if applicable, the bound of the Riccati test (within 0.1 %).
 
-    omega : frequencies [rad/s] to look at; by default 400 over the range of the plant's poles.
-    Errors as in `hinfsyn`.
+    omega : frequencies [rad/s] to evaluate; default: 400 over the range of the plant poles, with two decades beyond.
+    Raises the errors of `hinfsyn`.
     """
     P = as_plant(P, nmeas, ncon)
     plant = posed_plant(P, nmeas, ncon)
@@ -64,7 +64,7 @@ def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = N
 
 
 def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound:
-    """Largest Parrott bound over the imaginary axis (sampled) and the zeros in the right half plane."""
+    """Largest Parrott bound over frequencies on the imaginary axis and the zeros in the right half plane."""
     plant = in_usual_units(plant)
     if omega is None:
         poles = np.abs(plant.sample_points())
@@ -79,7 +79,7 @@ def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound
 
 
 def right_zeros(plant: Plant) -> np.ndarray:
-    """Invariant zeros in the open right half plane of the square channels among u -> z and w -> y."""
+    """Invariant zeros in the open right half plane of the channels u -> z and w -> y, if they are square."""
     found = []
     for B, C, D in ((plant.B2, plant.C1, plant.D12), (plant.B1, plant.C2, plant.D21)):
         if D.shape[0] != D.shape[1] or not plant.n:

@@ -1,4 +1,4 @@
-"""The smallest H-infinity norm by linear matrix inequalities: a second opinion on the Riccati test.
+"""Minimum H-infinity norm by linear matrix inequalities: an independent check of the Riccati test.
 
 A controller of the plant's order with ||F_l(P, K)|| < gamma exists if and only if symmetric R, S exist
 with (Gahinet and Apkarian, Int. J. Robust Nonlinear Control 4 (1994) 421-448, theorem 4.3)
@@ -8,7 +8,7 @@ with (Gahinet and Apkarian, Int. J. Robust Nonlinear Control 4 (1994) 421-448, t
          [B1'         D11'    -gamma I]            [C1          D11     -gamma I]
 
 where N_R spans the kernel of [B2' D12'] and N_S that of [C2 D21] (and the identity on the last block).
-D12 and D21 may have any rank. The plant is balanced, and time and norm are scaled, before it is posed.
+D12 and D21 may have any rank. Before the problem is posed, the plant is balanced, and time and norm are scaled.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from avis_ctrl.robust.riccati import solve_riccati
 class LmiOptimum:
     """Optimum of the semidefinite program.
 
-    upper : gamma at which the returned R and S satisfy the inequalities, re-checked by their eigenvalues.
+    upper : gamma at which the returned R and S satisfy the inequalities, verified by their eigenvalues.
     lower : dual objective, a lower bound to the accuracy of the solver (about 1e-6 relative).
     R, S : (n, n) certificates in the balanced coordinates.
-    violation : largest eigenvalue of the inequalities at (R, S, upper), relative to gamma; negative when certified.
+    violation : largest eigenvalue of the inequalities at (R, S, upper), relative to gamma; negative if certified.
     """
 
     upper: float
@@ -47,14 +47,14 @@ class LmiOptimum:
 def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
     """Optimal gamma of the H-infinity problem by semidefinite programming (cvxpy, clarabel).
 
-    Arguments and input errors as in `hinfsyn`; ComputationError where the solver fails.
+    Arguments and input errors as in `hinfsyn`; ComputationError if the solver fails.
     """
     P = as_plant(P, nmeas, ncon)
     plant = Plant.of(continuous_image(P), nmeas, ncon)
     check_stabilisable(plant)
     first = size = float(plant.size(plant.B1, plant.C1, plant.D11))
     best: LmiOptimum | None = None
-    # The solver's tolerances are absolute: the norm is measured in units of the last answer until that is 1.
+    # The solver's tolerances are absolute: the norm is scaled by the last result until the result is 1.
     for _ in range(6):
         scaled = _balanced(_scaled(plant, size))
         R, S, bounds, status = _optimum(scaled)
@@ -71,9 +71,9 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
 
 
 def _balanced(plant: Plant) -> Plant:
-    """States in which the Riccati solutions of the plant's LQG problem are equal and diagonal.
+    """LQG-balanced coordinates, in which both Riccati solutions of the plant's LQG problem are equal and diagonal.
 
-    A change of coordinates only: R and S then have like sizes, where diagonal balancing leaves them apart
+    With this change of coordinates R and S have similar sizes, which diagonal balancing does not achieve
     (Jonckheere and Silverman, IEEE Trans. Automatic Control 28 (1983) 953-964).
     """
     B, C = np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2])
@@ -92,7 +92,7 @@ def _balanced(plant: Plant) -> Plant:
 
 
 def _scaled(plant: Plant, size: float) -> Plant:
-    """Time in units of the poles' geometric mean, and the norm in units of `size`, shared between w and z."""
+    """Time scaled by the geometric mean of the poles, and the norm by `size`, split equally between w and z."""
     poles = np.abs(la.eigvals(plant.A)) if plant.n else np.ones(1)
     rate = float(np.exp(np.mean(np.log(np.maximum(poles, 1e-3 * max(np.max(poles), 1e-12))))))
     root, half = np.sqrt(rate), np.sqrt(size)
@@ -120,7 +120,7 @@ def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float],
     problem = cp.Problem(cp.Minimize(gamma), constraints)
     try:
         with warnings.catch_warnings():
-            # An inaccurate solution shows in `status`, and `upper` is checked by eigenvalues all the same.
+            # An inaccurate solution is reported in `status`, and `upper` is verified by eigenvalues in any case.
             warnings.simplefilter("ignore", UserWarning)
             problem.solve(solver=cp.CLARABEL)
     except cp.SolverError as error:
@@ -135,7 +135,7 @@ def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float],
 
 
 def _dual_value(plant: Plant, multipliers: list[np.ndarray]) -> float:
-    """Lagrangian's constant term over its coefficient of gamma: the bound that the multipliers give."""
+    """Lower bound from the multipliers: constant term of the Lagrangian divided by its coefficient of gamma."""
     constant, weight = 0.0, 0.0
     for (_, B1, _, D11, N), Z in zip(_sides(plant), multipliers[:2], strict=True):
         p, m, n = *D11.shape, plant.n
@@ -150,7 +150,7 @@ def _dual_value(plant: Plant, multipliers: list[np.ndarray]) -> float:
 
 
 def _sides(plant: Plant) -> list[tuple[np.ndarray, ...]]:
-    """(A, B1, C1, D11, N) of the inequality of R, and of that of S: the same form on the transposed plant."""
+    """(A, B1, C1, D11, N) of the inequality of R, and of that of S, which is the same for the transposed plant."""
     sides: list[tuple[np.ndarray, ...]] = []
     for A, B1, C1, D11, B2, D12 in ((plant.A, plant.B1, plant.C1, plant.D11, plant.B2, plant.D12),
                                     (plant.A.T, plant.C1.T, plant.B1.T, plant.D11.T, plant.C2.T, plant.D21.T)):
@@ -160,9 +160,9 @@ def _sides(plant: Plant) -> list[tuple[np.ndarray, ...]]:
 
 
 def _certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float) -> tuple[float, float]:
-    """Smallest gamma, from the solver's upwards, at which eigenvalues confirm the inequalities, and their largest."""
+    """Smallest gamma, from that of the solver upwards, at which the inequalities are verified; largest eigenvalue."""
     coupling = la.eigvalsh(np.block([[R, np.eye(plant.n)], [np.eye(plant.n), S]])) if plant.n else np.ones(1)
-    # R and S are lifted together by what [R I; I S] >= 0 lacks, then gamma pays for it.
+    # R and S are shifted equally until [R I; I S] >= 0; gamma is then increased to compensate.
     lift = max(0.0, -float(coupling[0]) * (1 + 1e-6))
     R, S = R + lift * np.eye(plant.n), S + lift * np.eye(plant.n)
     worst = np.inf

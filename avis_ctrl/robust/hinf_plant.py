@@ -1,12 +1,12 @@
-"""The generalized plant of an H-infinity problem: partition, assumptions in plain words, normal form.
+"""The generalized plant of an H-infinity problem: partition, assumptions, normal form.
 
     x' = A  x + B1  w + B2  u
     z  = C1 x + D11 w + D12 u          u = K y  (positive feedback)
     y  = C2 x + D21 w + D22 u
 
-Solvability asks for (A, B2) stabilisable and (A, C2) detectable. The Riccati solution further asks
-for D12 of full column rank, D21 of full row rank, and no zero of the channels u -> z and w -> y on
-the imaginary axis (Zhou, Doyle and Glover, Robust and Optimal Control, 1996, section 16.2.1).
+Solvability requires (A, B2) stabilisable and (A, C2) detectable. The Riccati solution also requires D12 of full column
+rank, D21 of full row rank, and no zero of the channels u -> z and w -> y on the imaginary axis (Zhou, Doyle and Glover,
+Robust and Optimal Control, 1996, section 16.2.1).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from avis_ctrl.robust.hinf_settings import SETTINGS
 
 @dataclass(frozen=True)
 class Plant:
-    """A partitioned plant in continuous time, its states balanced; names of u and y for messages."""
+    """Partitioned continuous-time plant with balanced states; names of u and y for messages."""
 
     A: np.ndarray
     B1: np.ndarray
@@ -41,7 +41,7 @@ class Plant:
 
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> Plant:
-        """Split P (w, u -> z, y) by its last nmeas outputs and last ncon inputs, its states balanced."""
+        """Balance P (w, u -> z, y) and split it by its last nmeas outputs and last ncon inputs."""
         P = balance(P)
         w, z = P.ninputs - ncon, P.noutputs - nmeas
         return Plant(P.A, P.B[:, :w], P.B[:, w:], P.C[:z], P.C[z:], P.D[:z, :w], P.D[:z, w:], P.D[z:, :w],
@@ -52,7 +52,7 @@ class Plant:
         return self.A.shape[0]
 
     def sample_points(self) -> np.ndarray:
-        """Points of the right half plane, off the imaginary axis, at the magnitudes of the poles."""
+        """Points in the right half plane, off the imaginary axis, at the magnitudes of the poles."""
         sizes = np.abs(la.eigvals(self.A)) if self.n else np.zeros(0)
         sizes = np.unique(np.concatenate([sizes[sizes > 0], [1.0]]))
         return sizes * np.exp(0.25j * np.pi)
@@ -62,9 +62,10 @@ class Plant:
         return C @ np.linalg.solve(s * np.eye(self.n) - self.A, B.astype(complex)) + D if self.n else D.astype(complex)
 
     def size(self, B: np.ndarray, C: np.ndarray, D: np.ndarray, axis: int | None = None) -> np.ndarray:
-        """Typical size of one channel, whole or by column (axis 0) or row (axis 1); 1 where it is zero.
+        """Typical size of one channel, overall or by column (axis 0) or row (axis 1); 1 where it is zero.
 
-        A geometric mean over the sample points: neither a weight's huge gain at rest nor its roll-off decides.
+        It is a geometric mean over the sample points, so that neither the static gain nor the roll-off of a weight
+        dominates.
         """
         sizes = [la.norm(self.at(s, B, C, D), axis=axis) for s in self.sample_points()]
         logs = np.mean([np.log(np.maximum(size, 1e-300)) for size in sizes if np.any(size)] or [0.0], axis=0)
@@ -73,7 +74,7 @@ class Plant:
 
 
 def as_plant(P: Any, nmeas: int, ncon: int) -> StateSpace:
-    """Our StateSpace from ours or a python-control one, with the partition checked (InputError)."""
+    """Convert an avis_ctrl or python-control system to StateSpace and check the partition (InputError)."""
     if not isinstance(P, StateSpace):
         if not hasattr(P, "A") and not hasattr(P, "num"):
             raise InputError("expected an avis_ctrl or python-control StateSpace", field="P", value=type(P).__name__)
@@ -89,7 +90,7 @@ def as_plant(P: Any, nmeas: int, ncon: int) -> StateSpace:
 
 
 def check_stabilisable(plant: Plant) -> None:
-    """ComputationError naming the unstable mode that no input moves or no measurement sees (PBH test)."""
+    """Raise ComputationError if an unstable mode, which is named, is uncontrollable or unobservable (PBH test)."""
     for A, B, names, verb, who in (
             (plant.A, plant.B2, plant.u, "not moved by any of the inputs", "an actuator or input"),
             (plant.A.T, plant.C2.T, plant.y, "not seen by any of the measurements", "a sensor")):
@@ -108,7 +109,7 @@ def check_stabilisable(plant: Plant) -> None:
 
 
 def posed_plant(P: StateSpace, nmeas: int, ncon: int) -> Plant:
-    """The problem's continuous plant, known to be stabilisable (ComputationError), without hidden states."""
+    """Continuous plant of the problem without hidden states; ComputationError if it cannot be stabilised."""
     continuous = continuous_image(P)
     plant = Plant.of(continuous, nmeas, ncon)
     check_stabilisable(plant)
@@ -117,11 +118,11 @@ def posed_plant(P: StateSpace, nmeas: int, ncon: int) -> Plant:
 
 
 def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
-    """P without the states that no input reaches or no output sees, where its response stays the same; else P itself.
+    """P without its hidden (uncontrollable or unobservable) states, if this leaves its response unchanged; else P.
 
-    Such states (a weight realised twice, say) do not change the problem once they are known to be stable, but X and Y
-    are singular on them, or ill conditioned. Compared block by block off the imaginary axis: on it the
-    response near a lightly damped pole is not known to `response_tolerance`.
+    Stable hidden states, for example of a weight realised twice, do not change the problem, but X and Y are singular or
+    ill conditioned on them. The responses are compared block by block off the imaginary axis, because on the axis the
+    response near a lightly damped pole is not accurate to `response_tolerance`.
     """
     small = minimal(P)
     if small.nstates == P.nstates:
@@ -142,7 +143,7 @@ def without_hidden_states(P: StateSpace, nmeas: int, ncon: int) -> StateSpace:
 
 @dataclass(frozen=True)
 class NormalForm:
-    """Plant with D12 = [0; I], D21 = [0 I], D22 = 0, and the maps back: K = S K_n T, then D22 is restored."""
+    """Plant with D12 = [0; I], D21 = [0 I], D22 = 0, and the inverse maps: K = S K_n T, then D22 is restored."""
 
     plant: Plant
     S: np.ndarray
@@ -151,7 +152,7 @@ class NormalForm:
 
 
 def normal_form(plant: Plant) -> NormalForm:
-    """Scale u and y, rotate z and w, shift D22 away; D12 and D21 must have full rank (see `rank_margins`)."""
+    """Scale u and y, rotate z and w, remove D22; D12 and D21 must have full rank (see `rank_margins`)."""
     m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
     U, s, Vt = la.svd(plant.D12)
     Q, S = np.hstack([U[:, m2:], U[:, :m2]]), Vt.T / s
@@ -164,14 +165,14 @@ def normal_form(plant: Plant) -> NormalForm:
 
 
 def channel_scales(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """Typical size of each input's effect on z, and of w's on each measurement: the yardsticks of extra channels."""
+    """Typical size of the effect of each input on z, and of w on each measurement: the scale of extra channels."""
     return plant.size(plant.B2, plant.C1, plant.D12, 0), plant.size(plant.B1, plant.C2, plant.D21, 1)
 
 
 def in_usual_units(plant: Plant) -> Plant:
-    """The same problem with every u of typical size one on z, and so w on every y.
+    """The same problem with inputs and measurements scaled so that all `channel_scales` are one.
 
-    No bound depends on the units of u and y; rank that is judged against the largest channel would.
+    No bound depends on the units of u and y, but a rank test relative to the largest channel would.
     """
     of_u, of_y = channel_scales(plant)
     return replace(plant, B2=plant.B2 / of_u, D12=plant.D12 / of_u, C2=plant.C2 / of_y[:, None],
@@ -181,7 +182,7 @@ def in_usual_units(plant: Plant) -> Plant:
 def rank_margins(plant: Plant) -> tuple[float, float]:
     """Smallest singular values of D12 (columns of unit length) and D21 (rows of unit length).
 
-    A column below `no_column` of its input's typical effect on z counts as zero; 0 where there are too few rows.
+    A column below `no_column` times the typical effect of its input on z counts as zero; 0 if there are too few rows.
     """
     of_u, of_y = channel_scales(plant)
 
@@ -220,16 +221,16 @@ def _typical(matrix: np.ndarray) -> float:
 
 
 def parrott(P11: np.ndarray, of_u: np.ndarray, of_y: np.ndarray) -> float:
-    """min over Q of sigma(P11 + P12 Q P21), exactly (Parrott 1978).
+    """min over Q of sigma_max(P11 + P12 Q P21), exact (Parrott 1978).
 
-    of_u, of_y : orthonormal bases of the directions of z that u does not move, and of those of w that y does not see.
+    of_u, of_y : orthonormal bases of the directions of z not affected by u, and of those of w not measured in y.
     """
     left, right = of_u.conj().T @ P11, P11 @ of_y
     return float(max(la.norm(left, 2) if left.size else 0.0, la.norm(right, 2) if right.size else 0.0))
 
 
 def parrott_at_infinity(plant: Plant) -> float:
-    """Parrott's bound of the direct terms; for a plant `in_usual_units`."""
+    """Parrott's bound of the direct terms, for a plant `in_usual_units`."""
     bases = []
     for rows in (plant.D12.T, plant.D21):
         there = rows[la.norm(rows, axis=1) > SETTINGS.no_column]
@@ -240,7 +241,7 @@ def parrott_at_infinity(plant: Plant) -> float:
 def pointwise(plant: Plant, s: complex, at_zero: bool = False) -> float:
     """Parrott's bound at one point of the closed right half plane (see `hinf_bounds`).
 
-    0 where P has a pole, or where round-off leaves in doubt which directions u moves or y sees.
+    0 if P has a pole at s, or if round-off makes the directions affected by u or measured in y uncertain.
 
     at_zero : s is a computed zero of u -> z or w -> y, where that channel loses rank.
     """
@@ -262,13 +263,13 @@ def pointwise(plant: Plant, s: complex, at_zero: bool = False) -> float:
 
 def _rounding(C: np.ndarray, R: np.ndarray, resolvent: np.ndarray, B: np.ndarray, x: np.ndarray, D: np.ndarray
               ) -> np.ndarray:
-    """By how much round-off may have changed the entries of C x + D, x = R B (Higham 2002, section 7.2)."""
+    """Bound of the round-off in the entries of C x + D, x = R B (Higham 2002, section 7.2)."""
     of_x = np.abs(R) @ (np.abs(resolvent) @ np.abs(x) + np.abs(B))
     return (len(R) + 1) * np.finfo(float).eps * (np.abs(C) @ (np.abs(x) + of_x) + np.abs(D))
 
 
 def _known_kernel(rows: np.ndarray, noise: np.ndarray) -> np.ndarray | None:
-    """Null space of rows that are known to an error of `noise`; None where it is not known to `known_direction`."""
+    """Null space of rows with error bound `noise`; None if it is not accurate to `known_direction`."""
     length, error = la.norm(rows, axis=1), la.norm(noise, axis=1)
     there = (length > 0) | (error > 0)
     rows, length, error = rows[there], length[there], error[there]
@@ -282,7 +283,7 @@ def _known_kernel(rows: np.ndarray, noise: np.ndarray) -> np.ndarray | None:
 
 
 def _kernel_at_zero(rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Null space of rows at a zero of theirs: what is round-off there has vanished."""
+    """Null space of rows at one of their zeros: rows at the level of round-off count as zero."""
     length = la.norm(rows, axis=1)
     there = length > SETTINGS.rank_at_zero / np.finfo(float).eps * la.norm(noise, axis=1)
     return _kernel(rows[there] / length[there, None], SETTINGS.rank_at_zero)

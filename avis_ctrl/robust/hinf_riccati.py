@@ -1,14 +1,14 @@
-"""Two-Riccati test and central controller for any D11, and the search for the smallest gamma.
+"""Two-Riccati test and central controller for any D11, and search for the minimum gamma.
 
 Formulas of Glover and Doyle, Systems & Control Letters 11 (1988) 167-172, for a plant in normal form
 (D12 = [0; I], D21 = [0 I], D22 = 0). A controller with ||F_l(P, K)|| < gamma exists if and only if
 
     gamma > max(sigma [D1111 D1112], sigma [D1111; D1121]),   X >= 0,   Y >= 0,   rho(X Y) < gamma^2 .
 
-In double precision the test can also be undecided. A bound is claimed only if the test is decisive: a gamma is too
-small if the failing condition fails by more than its numerical error, or if the response at one frequency rules it out
-(Parrott's bound at the Hamiltonian's eigenvalue on the axis); a gamma that passes undecided counts only if the norm of
-the central controller's closed loop is computed and is below it.
+In double precision the test can also be undecided. A gamma is proved infeasible only if the failing condition fails by
+more than its numerical error, or if the response at one frequency excludes it (Parrott's bound at the frequency of the
+Hamiltonian eigenvalue on the axis). A gamma that passes in doubt counts as feasible only if the computed norm of the
+closed loop with the central controller is below it.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ IN_DOUBT = "the Riccati test is undecided and its controller does not reach this
 
 @dataclass(frozen=True)
 class GammaTest:
-    """Outcome of the test at one gamma: feasible with X, Y, or the condition that fails.
+    """Result of the test at one gamma: feasible with X, Y, or the condition that fails.
 
-    coupling : rho(X Y) / gamma^2, nan where X or Y does not exist or is indefinite.
-    forbidden : no controller reaches this; gamma itself where the failure is beyond round-off, 0 where in doubt.
-    doubtful : feasible, if the negative eigenvalues of X or Y are round-off.
+    coupling : rho(X Y) / gamma^2, nan if X or Y does not exist or is indefinite.
+    forbidden : proved lower bound of the optimum, up to gamma if the failure exceeds round-off; 0 if in doubt.
+    doubtful : feasible only if the negative eigenvalues of X or Y are round-off.
     """
 
     gamma: float
@@ -49,10 +49,10 @@ class GammaTest:
 
 @dataclass(frozen=True)
 class GammaBracket:
-    """lower: largest gamma at which the test failed for certain; upper: the smallest at which it passed.
+    """lower: largest gamma proved infeasible; upper: the test at the smallest gamma that passed.
 
-    undecided : the largest gamma at which the test did not pass, above `lower` where that was not for certain.
-    limited_by : why it did not.
+    undecided : the largest gamma at which the test did not pass; above `lower` if this failure is not proved.
+    limited_by : the reason for this failure.
     """
 
     lower: float
@@ -63,7 +63,7 @@ class GammaBracket:
 
 
 def direct_term_bound(plant: Plant) -> float:
-    """What no controller can go below at infinite frequency (Parrott's theorem on D11)."""
+    """Lower bound of gamma from infinite frequency (Parrott's theorem on D11)."""
     m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
     p, m = plant.D11.shape
     top, left = plant.D11[:p - m2, :], plant.D11[:, :m - p2]
@@ -71,7 +71,7 @@ def direct_term_bound(plant: Plant) -> float:
 
 
 def gamma_test(plant: Plant, gamma: float) -> GammaTest:
-    """The existence test at one gamma, for a plant in normal form."""
+    """Existence test at one gamma, for a plant in normal form."""
     if gamma <= direct_term_bound(plant):
         return GammaTest(gamma, False, "gamma is not above the bound of D11 at infinite frequency", forbidden=gamma)
     solutions = []
@@ -99,13 +99,13 @@ def gamma_test(plant: Plant, gamma: float) -> GammaTest:
 
 
 def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
-    """What the response at these frequencies forbids, at most gamma; 0 where that is clearly less."""
+    """Lower bound of gamma from the response at these frequencies, at most gamma; 0 if it is clearly below gamma."""
     best = max((pointwise(plant, 1j * w) for w in omega), default=0.0)
     return min(best, gamma) if best > (1 - SETTINGS.norm_accuracy) * gamma else 0.0
 
 
 def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> bool:
-    """Whether rho(X Y) is above gamma^2 by more than X and Y, refined, leave it uncertain to first order."""
+    """Whether rho(X Y) of the refined X and Y exceeds gamma^2 by more than its first-order error."""
     of_x, of_y = (refined_balanced(*control_riccati(one, gamma), solution, rounding(one, gamma))
                   for one, solution in ((plant, X), (_dual(plant), Y)))
     if of_x is None or of_y is None:
@@ -119,7 +119,7 @@ def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarra
 
 
 def keeps(plant: Plant, test: GammaTest) -> bool:
-    """Whether the central controller of a passed test is measured to keep its gamma."""
+    """Whether the measured norm of the loop with the central controller of a passed test is below its gamma."""
     m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
     form = NormalForm(plant, np.eye(m2), np.eye(p2), np.zeros((p2, m2)))
     try:
@@ -133,10 +133,10 @@ def keeps(plant: Plant, test: GammaTest) -> bool:
 
 def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit: float = 1e10,
                proved: bool = True) -> GammaBracket:
-    """Bracket the optimum to a relative tolerance: decades first, then regula falsi on rho(X Y), else bisection.
+    """Bracket the optimum to a relative tolerance: geometric steps, then regula falsi on rho(X Y), or bisection.
 
-    proved : look for a provable lower bound where the test is in doubt just below the optimum.
-    ComputationError where even gamma = limit times the start fails.
+    proved : search for a proved lower bound if the test is in doubt just below the optimum.
+    ComputationError if even gamma = limit times the initial value fails.
     """
     floor, natural = direct_term_bound(plant), natural_gamma(plant)
     nothing = SETTINGS.zero_gamma * natural
@@ -168,10 +168,10 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
 
 
 class _Search:
-    """State of the search for gamma: the bracket and the couplings seen so far."""
+    """State of the search for gamma: the bracket and the last couplings rho(X Y) / gamma^2."""
 
     def __init__(self, plant: Plant, floor: float):
-        # `failed` steers the search, `lower` is what was proved on the way.
+        # `failed` controls the search, `lower` is the proved bound.
         self.plant, self.lower, self.failed = plant, floor, floor
         self.upper: GammaTest | None = None
         self.below: GammaTest | None = None
@@ -191,7 +191,7 @@ class _Search:
         return passed
 
     def prove(self, tolerance: float) -> None:
-        """Look for a provable failure where the last one was in doubt, by halving; few steps, each costs a test."""
+        """Bisection for a proved failure if the last failure was in doubt; few steps, because each costs a test."""
         unproved = self.failed
         for _ in range(6):
             if unproved - self.lower <= tolerance * unproved:
@@ -205,7 +205,7 @@ class _Search:
                 unproved = middle
 
     def refine(self, tolerance: float, absolute: float) -> None:
-        """Shrink the bracket to the tolerance, or to an absolute size where the optimum is zero."""
+        """Shrink the bracket to the tolerance, or to an absolute width if the optimum is zero."""
         for count in range(200):
             assert self.upper is not None
             low, high = self.failed, self.upper.gamma
@@ -224,7 +224,7 @@ class _Search:
                 self.try_gamma(above)
 
     def _predicted(self) -> float:
-        """Root of 1 / coupling = 1 by the secant through the two nearest couplings; nan without them."""
+        """Root of 1 / coupling = 1 by the secant through the two nearest couplings; nan if they do not exist."""
         other = self.below if self.below is not None and np.isfinite(self.below.coupling) else self.second
         if self.upper is None or other is None or not min(self.upper.coupling, other.coupling) > 0:
             return np.nan
@@ -237,8 +237,8 @@ class _Search:
 def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
     """The central (maximum entropy) controller of the original plant at a feasible gamma, state dimension n.
 
-    Where its loop around D22 is nearly singular, another of the family F_l(M, Q), |Q| < gamma, with a constant Q is
-    taken. That happens in discrete time: entropy is measured at z = -1, where a K with a pole may cancel y altogether.
+    If its loop around D22 is nearly singular, another controller of the family F_l(M, Q), |Q| < gamma, with a constant
+    Q is used. This happens in discrete time: entropy is evaluated at z = -1, where a K with a pole may cancel y.
     """
     assert test.X is not None and test.Y is not None
     P, gamma, X, Y = form.plant, test.gamma, test.X, test.Y
@@ -258,7 +258,7 @@ def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
     right = np.eye(p2) - D1112.T @ np.linalg.solve(gamma ** 2 * np.eye(p1) - D1111 @ D1111.T, D1112)
     D = D + _off_centre(form, D, left, right, gamma)
     inner = P.C2 + F12
-    # Z = inv(I - Y X / gamma^2); the controller's states are chosen so that Z meets only its input matrix.
+    # Z = inv(I - Y X / gamma^2); the controller's states are chosen so that Z appears only in its input matrix.
     B_hat = np.linalg.solve(np.eye(P.n) - Y @ X / gamma ** 2, (P.B2 + L12) @ D - L2)
     C_hat = F2 - D @ inner
     A_hat = P.A + B @ F - B_hat @ inner
@@ -266,10 +266,10 @@ def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
 
 
 def _off_centre(form: NormalForm, D: np.ndarray, left: np.ndarray, right: np.ndarray, gamma: float) -> np.ndarray:
-    """D12 Q D21 of the family (Glover and Doyle 1988), left = D12 D12', right = D21' D21, which lifts I + D_K D22.
+    """D12 Q D21 of the family (Glover and Doyle 1988), left = D12 D12', right = D21' D21, to regularise I + D_K D22.
 
-    Zero where the central controller's loop is well conditioned; else Q of norm `off_centre` gamma that raises all its
-    singular values most, to first order.
+    Zero if the central controller's loop is well conditioned; otherwise Q of norm `off_centre` gamma that raises all
+    singular values of I + D_K D22 most, to first order.
     """
     direct = form.T @ form.D22 @ form.S
     U, sigma, Vt = la.svd(np.eye(D.shape[0]) + D @ direct)
@@ -281,7 +281,7 @@ def _off_centre(form: NormalForm, D: np.ndarray, left: np.ndarray, right: np.nda
 
 
 def _restored(form: NormalForm, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> StateSpace:
-    """Undo the shift of D22, u = K (y - D22 u), in normal coordinates, where units do not count; then the scalings."""
+    """Undo the removal of D22, u = K (y - D22 u), in normal coordinates, which have no units; then the scalings."""
     direct = form.T @ form.D22 @ form.S
     loop = np.eye(D.shape[0]) + D @ direct
     if np.linalg.cond(loop) > 1e12:
@@ -315,7 +315,7 @@ def _dual(P: Plant) -> Plant:
 
 
 def control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(A, R, Q) of the equation of X."""
+    """(A, R, Q) of the Riccati equation of X."""
     D1, R = _row_terms(P, gamma)
     B = np.hstack([P.B1, P.B2])
     solved = np.linalg.solve(R, np.hstack([D1.T @ P.C1, B.T]))
@@ -325,11 +325,11 @@ def control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def rounding(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """By how much round-off may have changed the entries of (A, R, Q) of `control_riccati`."""
+    """Bounds of the round-off in the entries of (A, R, Q) of `control_riccati`."""
     D1, R = _row_terms(P, gamma)
     B, d, c = np.abs(np.hstack([P.B1, P.B2])), np.abs(D1), np.abs(P.C1)
     w = P.D11.shape[1]
-    # |R| with its own terms, for it is a difference, too.
+    # |R| is bounded by the sum of its terms, because R is a difference, too.
     terms = d.T @ d
     terms[:w, :w] += gamma ** 2 * np.eye(w)
     right = np.hstack([d.T @ c, B.T])
@@ -341,17 +341,17 @@ def rounding(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _difference(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """a - b c with entries that are pure round-off set to zero: a balancing would take them for couplings."""
+    """a - b c with entries that are pure round-off set to zero, because balancing would treat them as couplings."""
     result = a - b @ c
     noise = 8 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
     return np.where(np.abs(result) <= noise, 0.0, result)
 
 
 def filter_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(A', R, Q) of the equation of Y: the control equation of the transposed plant."""
+    """(A', R, Q) of the Riccati equation of Y: the control equation of the transposed plant."""
     return control_riccati(_dual(P), gamma)
 
 
 def natural_gamma(plant: Plant) -> float:
-    """A first gamma of the right order: the open channel w -> z, off the imaginary axis."""
+    """Initial gamma of the right order of magnitude: the open-loop channel w -> z, off the imaginary axis."""
     return float(plant.size(plant.B1, plant.C1, plant.D11))

@@ -1,4 +1,4 @@
-"""Tolerances of the H-infinity synthesis: plant, Riccati equations, search for gamma, measured loop."""
+"""Tolerances of the H-infinity synthesis: plant, Riccati equations, search for gamma, measured closed loop."""
 
 from __future__ import annotations
 
@@ -9,39 +9,38 @@ from dataclasses import dataclass
 class HinfSettings:
     """All values are ratios.
 
-    rank_tolerance : singular value of D12 (columns of unit length) or D21 (rows of unit length) below which the matrix
-        counts as rank deficient: the formulas divide by it, which costs half the digits.
+    rank_tolerance : smallest singular value of D12 (columns of unit length) or D21 (rows of unit length) below which
+        the matrix counts as rank deficient: the formulas divide by it, which costs half of the digits.
     pbh_tolerance : smallest singular value of the PBH matrix relative to the norm of [A B], or of [A; C], below which a
         mode counts as uncontrollable, or unobservable: well above the round-off of its pole.
-    no_column : length of a column of D12, or row of D21, relative to its channel's typical size, below which it counts
-        as zero: round-off of the plant's data.
-    rank_at_zero : singular value of a channel at its own zero, its columns or rows of unit length, below which it is
-        one that vanishes there: the accuracy of a computed zero.
-    known_direction : largest relative error of the directions in which a control acts, or a measurement sees, at one
-        frequency; with more, the response there gives no bound. Rank is never taken for lost because it is small: a
-        control that has rolled off acts all the same, and a lost direction raises the bound.
-    response_tolerance : largest difference of two responses off the imaginary axis, relative to their size, that counts
-        as round-off.
-    axis_tolerance : real part of an eigenvalue of the Hamiltonian relative to its magnitude, up to which it counts as
-        lying on the imaginary axis: its round-off.
-    lagrangian_tolerance : largest asymmetry of X1' X2, whose entries are below 1: with more, the stable subspace is not
-        known to six digits.
-    negative : magnitude of a negative eigenvalue of X relative to the largest one, up to which it counts as round-off
-        and is not examined further.
-    zero_gamma : gamma relative to the gain of the open channel w -> z, below which it counts as round-off.
+    no_column : length of a column of D12, or row of D21, relative to the typical size of its channel, below which it
+        counts as zero: round-off of the plant data.
+    rank_at_zero : singular value of a channel at one of its zeros (columns or rows of unit length) below which the
+        direction counts as lost there: the accuracy of a computed zero.
+    known_direction : largest relative error of the directions in which a control acts, or which a measurement detects,
+        at one frequency; with a larger error the response there gives no bound. A direction never counts as lost
+        because its gain is small: a control that has rolled off still acts, and a lost direction raises the bound.
+    response_tolerance : largest relative difference of two responses off the imaginary axis that counts as round-off.
+    axis_tolerance : real part of a Hamiltonian eigenvalue, relative to its magnitude, up to which it counts as lying on
+        the imaginary axis: its round-off.
+    lagrangian_tolerance : largest asymmetry of X1' X2, whose entries are below 1: with a larger asymmetry the stable
+        subspace is not accurate to six digits.
+    negative : magnitude of a negative eigenvalue of X, relative to the largest eigenvalue, up to which it counts as
+        round-off and is not examined further.
+    zero_gamma : gamma relative to the gain of the open-loop channel w -> z, below which it counts as round-off.
     norm_accuracy : relative accuracy of a norm or a bound that is compared with gamma: that of `hinf_norm`.
-    well_posed : condition of I + D_K D22 from which another controller than the central one is taken, whose fast poles
-        would cost half of the digits.
-    off_centre : norm of the constant parameter Q of that controller, relative to gamma; at 1 the loop's norm may be
-        gamma, at 0 it is the central one.
-    loop_accuracy : relative amount by which a closed loop's norm must pass a bound to contradict it: ten times the
-        accuracy of the norm, to allow for the round-off of the loop.
-    same_gamma : relative difference between two computations of gamma from which round-off is reported; a smaller one
-        changes no decision.
-    far_beyond : controller poles faster than this many times the plant's fastest come from the formulas, not from the
-        plant, on which they act as a gain.
+    well_posed : condition number of I + D_K D22 above which the central controller, whose fast poles would cost half of
+        the digits, is replaced by another.
+    off_centre : norm of the constant parameter Q of that controller, relative to gamma; at 1 the norm of the loop may
+        equal gamma, at 0 the controller is the central one.
+    loop_accuracy : relative amount by which the norm of a closed loop must exceed a bound to contradict it: ten times
+        the accuracy of the norm, to allow for the round-off of the loop.
+    same_gamma : relative difference between two computations of gamma above which round-off is reported; a smaller
+        difference changes no decision.
+    far_beyond : controller poles faster than this multiple of the fastest plant pole come from the formulas, not from
+        the plant; for the plant they act as a static gain.
     closer : fractions of the back-off at which a controller without those poles is tried: the smaller the fraction, the
-        faster these poles are.
+        faster these poles.
     """
 
     rank_tolerance: float = 1e-8

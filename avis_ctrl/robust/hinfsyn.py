@@ -1,11 +1,12 @@
-"""H-infinity synthesis: K with u = K y that makes ||F_l(P, K)|| small, and stabilises.
+"""H-infinity synthesis: a stabilising K with u = K y and small ||F_l(P, K)||.
 
-The optimum is bracketed by the two-Riccati test; the controller is taken at most `backoff` above it. As gamma falls
-to its optimum, I - X Y / gamma^2 or an inverse of X or Y becomes singular, and poles of the central controller go to
-infinity as 1 / backoff: in the limit they are a gain (Safonov, Limebeer and Chiang, Int. J. Control 50, 1989). Where
-asked for, poles far beyond the plant's are therefore replaced by their gain, in a controller nearer to the optimum
-where that is nearly exact, if the loop is then measured to keep the target of the back-off. Every figure reported is
-measured on the closed loop of the plant as it was given, before any scaling or regularisation.
+The optimum is bracketed by the two-Riccati test; the controller is computed at most `backoff` above it. As gamma
+approaches its optimum, I - X Y / gamma^2 or an inverse of X or Y becomes singular, and poles of the central controller
+go to infinity as 1 / backoff: in the limit they are a static gain (Safonov, Limebeer and Chiang, Int. J. Control 50,
+1989). On request, poles far beyond those of the plant are therefore replaced by their static gain. This is done in a
+controller closer to the optimum, where the replacement is nearly exact, and only if the measured norm of the loop stays
+within the target of the back-off. All reported values are measured on the closed loop with the plant as given, before
+any scaling or regularisation.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from avis_ctrl.summary import Shown
 
 
 class Status(Enum):
-    """How a synthesis ended; the value is the diagnosis."""
+    """Outcome of a synthesis; the value is the diagnosis."""
 
     OPTIMAL = "the optimum is bracketed and the closed loop was measured below its target"
     REGULARISED = ("the problem is singular: small extra channels were added; the closed loop measured is that "
@@ -62,13 +63,13 @@ class Synthesis(Shown):
     """Result of an H-infinity synthesis.
 
     K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.
-    gamma : H-infinity norm of `closed_loop`, measured (relative accuracy 1e-6).
-    gamma_optimal_bounds : (largest gamma found infeasible for certain, smallest found feasible). Where channels were
-        added, the lower one is the pointwise bound of `hinf_lower_bound`; there, and where the controller missed its
-        target, the upper one is the measured gamma.
-    fastest_pole : largest magnitude [rad/s] of a controller pole (of its continuous image when P is sampled).
+    gamma : measured H-infinity norm of `closed_loop` (relative accuracy 1e-6).
+    gamma_optimal_bounds : (largest gamma proved infeasible, smallest gamma found feasible). If channels were added, the
+        lower bound is the pointwise bound of `hinf_lower_bound`. In this case, or if the controller missed its target,
+        the upper bound is the measured gamma.
+    fastest_pole : largest magnitude [rad/s] of a controller pole (of its continuous image if P is sampled).
     limited_by : the condition that fails just below the optimum.
-    notes : what was done that the caller did not ask for, and what it cost.
+    notes : actions that the caller did not request, and their cost.
     """
 
     K: StateSpace
@@ -82,7 +83,7 @@ class Synthesis(Shown):
 
     @property
     def abscissa(self) -> float:
-        """Largest real part of the closed loop's poles (largest magnitude minus 1 when sampled)."""
+        """Largest real part of the closed-loop poles (largest magnitude minus 1 if sampled)."""
         poles = self.closed_loop.poles()
         return float(np.max(np.abs(poles) - 1 if self.closed_loop.dt else poles.real, initial=-np.inf))
 
@@ -94,21 +95,21 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
 
     Parameters
     ----------
-    P : StateSpace (ours or python-control's) from (w, u) to (z, y), u and y last.
+    P : StateSpace (avis_ctrl or python-control) from (w, u) to (z, y), u and y last.
     nmeas, ncon : number of measurements y and of controls u.
-    backoff : relative distance from the optimum at which the controller is taken.
+    backoff : relative distance of the controller from the optimum.
     tolerance : relative width to which the optimum is bracketed.
-    method : "riccati" (Glover and Doyle 1988), or "lmi" (Gahinet and Apkarian 1994) as a slow second opinion
-        on the optimum; the controller then comes from the Riccati formulas at the gamma which the LMI found.
-    sample_rate_Hz : the rate at which the controller is to run; its fastest pole is compared with half of it.
-    gamma_hint : a gamma expected to be near the optimum; shortens the search.
-    far_poles : "kept", or "gain": controller poles far beyond the plant's are replaced by their gain where the measured
-        loop keeps the target of the back-off (see `notes`). D-K iteration uses "kept".
+    method : "riccati" (Glover and Doyle 1988), or "lmi" (Gahinet and Apkarian 1994) as a slow independent check of the
+        optimum; the controller is then computed by the Riccati formulas at the gamma of the LMI.
+    sample_rate_Hz : sample rate of the implementation; the fastest controller pole is compared with half of it.
+    gamma_hint : expected gamma near the optimum; shortens the search.
+    far_poles : "kept", or "gain": controller poles far beyond those of the plant are replaced by their static gain if
+        the measured loop stays within the target of the back-off (see `notes`). D-K iteration uses "kept".
 
     Raises
     ------
     InputError : wrong shapes, counts or options.
-    ComputationError : a mode that cannot be stabilised (named), or no gamma that can be reached.
+    ComputationError : a mode that cannot be stabilised (named), or no achievable gamma.
 
     Examples
     --------
@@ -135,7 +136,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff,
                                      far_poles == "gain")
     if notes and method != "lmi":
-        # Extra channels only add to the problem: what fails with them may be possible without.
+        # Extra channels only make the problem harder: a gamma that fails with them may be feasible without them.
         bounds = pointwise_bound(problem.plant).gamma, result.gamma
     if raised:
         status, notes = Status.BACKED_OFF, (*notes, raised)
@@ -153,21 +154,21 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
 
 def hinf_controller(P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None,
                     tolerance: float = 1e-3) -> Synthesis:
-    """The controller of `hinfsyn` with the same parameters, without a lower bound of the optimum: for iterations."""
+    """The controller of `hinfsyn` with the same parameters, without a lower bound of the optimum; for iterations."""
     problem = _Problem.of(as_plant(P, nmeas, ncon), nmeas, ncon)
     form, bracket, notes = problem.solve(tolerance, gamma_hint, proved=False)
     result, raised = problem.realise(form, bracket.upper.gamma, backoff, False)
-    # With extra channels, and where the target was missed, only the measured gamma is known to be possible.
+    # With extra channels, or if the target was missed, only the measured gamma is known to be feasible.
     upper = result.gamma if notes or raised else min(bracket.upper.gamma, result.gamma)
     return replace(result, gamma_optimal_bounds=(0.0, upper), status=Status.UNPROVED,
                    notes=(*notes, raised) if raised else notes)
 
 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
-    """The central controller at a given gamma, without a search: for iterations that know what they want.
+    """The central controller at a given gamma, without a search; for iterations with a known gamma.
 
-    ComputationError where that gamma cannot be reached, with the condition that fails, or where the closed loop is
-    measured not to keep it.
+    ComputationError if gamma cannot be achieved (with the condition that fails), or if the measured norm of the closed
+    loop exceeds it.
     """
     P = as_plant(P, nmeas, ncon)
     if not (np.isfinite(gamma) and gamma > 0):
@@ -192,7 +193,7 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The plant as given, its continuous balanced partition without hidden states, and which assumptions fail."""
+    """The plant as given, its continuous balanced partition without hidden states, and rank deficiency of D12, D21."""
 
     P: StateSpace
     plant: Plant
@@ -206,7 +207,7 @@ class _Problem:
 
     def form(self, of_D12: bool, of_D21: bool, epsilon: float, of_states: bool = False) -> tuple[NormalForm,
                                                                                                  tuple[str, ...]]:
-        """Normal form, regularised where asked, with a note that says so."""
+        """Normal form, regularised as requested, with a note about the regularisation."""
         if not (of_D12 or of_D21 or of_states):
             return normal_form(self.plant), ()
         said = []
@@ -224,7 +225,7 @@ class _Problem:
 
     def solve(self, tolerance: float, hint: float | None,
               proved: bool = True) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
-        """The bracket of the optimum; extra channels are shrunk until they cost less than a per cent."""
+        """Bracket of the optimum; extra channels are reduced until a further reduction gains less than one per cent."""
         if not any(self.singular):
             form, _ = self.form(False, False, 0.0)
             try:
@@ -252,7 +253,7 @@ class _Problem:
 
     def _regularised(self, epsilon: float, tolerance: float, hint: float | None,
                      proved: bool) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
-        """The bracket with extra channels on u and y where they are missing, and on the states where those fail."""
+        """Bracket with extra channels on u and y as needed, and on the states if these do not suffice."""
         for of_states in (False, True) if any(self.singular) else (True,):
             form, notes = self.form(*self.singular, epsilon, of_states)
             try:
@@ -262,7 +263,7 @@ class _Problem:
         raise failure
 
     def realise(self, form: NormalForm, gamma: float, backoff: float, slow: bool) -> tuple[Synthesis, str]:
-        """The first controller above the optimum whose measured closed loop keeps its promise."""
+        """The first controller above the optimum whose measured norm meets its target; a note if the back-off grew."""
         best: Synthesis | None = None
         for k in range(12):
             margin = backoff * 2.0 ** k if backoff > 0 else 1e-6 * 4.0 ** k
@@ -287,7 +288,7 @@ class _Problem:
         return best, f"no back-off was confirmed; the best measured is {best.gamma:.6g} against an optimum {gamma:.6g}"
 
     def _slower(self, form: NormalForm, result: Synthesis, gamma: float, target: float) -> Synthesis:
-        """A controller without poles far beyond the plant's and its own others that keeps the target, or the given."""
+        """The controller without its poles far beyond those of the plant, if it meets the target; else `result`."""
         plant_fastest = float(np.max(np.abs(la.eigvals(self.plant.A)), initial=0.0))
         if not result.fastest_pole > SETTINGS.far_beyond * plant_fastest > 0:
             return result
@@ -308,7 +309,7 @@ class _Problem:
         return result
 
     def measured(self, K: StateSpace) -> Synthesis:
-        """K in the plant's time domain and names, with the closed loop it makes measured on the plant as given."""
+        """K in the time domain of the plant, with the closed loop measured on the plant as given."""
         fastest = float(np.max(np.abs(K.poles()), initial=0.0))
         K = balance(K)
         if self.P.dt:
@@ -318,10 +319,10 @@ class _Problem:
 
 
 def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
-    """A note where the loop's gain, computed from the responses of P and K, differs from that of the closed loop.
+    """A note if the loop gain computed from the responses of P and K differs from that of the closed loop.
 
     Gamma is then a small difference of large terms. P and K are evaluated at the peak and at the magnitudes of the
-    loop's poles: where these are round-off, the two computations have their peaks at different frequencies.
+    closed-loop poles: if these are dominated by round-off, the two computations peak at different frequencies.
     """
     peak = hinf_norm(result.closed_loop).omega
     poles = result.closed_loop.poles()
@@ -329,7 +330,7 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     p, k = (one.frequency_response(np.concatenate([[peak], at_poles[at_poles > 0]])) for one in (P, result.K))
     u, y = k.shape[1:]
     w, z = P.ninputs - u, P.noutputs - y
-    # On a pole of P or K, an integrator at rest say, they have no response.
+    # At a pole of P or K, such as an integrator at zero frequency, the response is not finite.
     there = np.all(np.isfinite(p), axis=(1, 2)) & np.all(np.isfinite(k), axis=(1, 2))
     p, k = p[there], k[there]
     loop = p[:, :z, :w] + p[:, :z, w:] @ np.linalg.solve(np.eye(u) - k @ p[:, z:, w:], k @ p[:, z:, :w])
@@ -343,7 +344,7 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
-    """The magnitude [rad/s] in the middle of the widest gap (as a ratio) of the poles beyond the plant's."""
+    """Magnitude [rad/s] in the middle of the widest gap (as a ratio) between the poles beyond those of the plant."""
     sizes = np.sort(np.abs(poles))
     sizes = np.concatenate([[plant_fastest], sizes[sizes > plant_fastest]])
     widest = int(np.argmax(sizes[1:] / sizes[:-1]))
@@ -352,7 +353,7 @@ def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
 
 def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, zero: float, status: Status,
                 notes: tuple[str, ...]) -> tuple[tuple[float, float], Status, tuple[str, ...]]:
-    """Bounds that do not contradict what was measured, and a status that says so where they are far apart.
+    """Bounds that are consistent with the measured gamma, and a status that reports if they are far apart.
 
     zero : width below which an optimum is zero to working precision.
     """

@@ -23,7 +23,7 @@ from avis_ctrl.summary import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MixedSensitivity(Shown):
-    """K of u = K (r - y), gamma measured on the loop, and the loop's responses.
+    """K with u = K (r - y), gamma measured on the loop, and the closed-loop transfer matrices.
 
     S, KS, T : from r to e, u and y. P : the generalized plant (r, u -> z, e). synthesis : the H-infinity result.
     """
@@ -42,13 +42,13 @@ def mixed_sensitivity(G: Any, W_S: Any = None, W_KS: Any = None, W_T: Any = None
 
     Parameters
     ----------
-    G : plant (ours or python-control's), continuous or sampled. W_S, W_KS, W_T : weights (systems, filters, numbers),
-        with one channel for all signals, or with as many inputs as there are signals; None omits the term.
-    options : of `hinfsyn`.
+    G : plant (avis_ctrl or python-control), continuous or sampled. W_S, W_KS, W_T : weights (systems, filters,
+        numbers), with one channel for all signals, or with one input per signal; None omits the term.
+    options : options of `hinfsyn`.
 
     Raises
     ------
-    InputError : no weight, or one that does not fit. ComputationError : no stabilising controller.
+    InputError : no weight, or a weight that does not fit. ComputationError : no stabilising controller.
 
     Examples
     --------

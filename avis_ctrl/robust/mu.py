@@ -1,9 +1,9 @@
 """Structured singular value of matrices: bounds with their proofs.
 
-    w = Delta z,  z = M w:    mu(M) = 1 / min{ ||Delta|| : det(I - M Delta) = 0 },  0 where no Delta does it.
+    w = Delta z,  z = M w:    mu(M) = 1 / min{ ||Delta|| : det(I - M Delta) = 0 },  0 if there is no such Delta.
 
-The upper bound comes with the scalings that prove it, the lower one with a perturbation that makes
-I - M Delta singular; both are recomputed from what is returned.
+The upper bound comes with the scalings that prove it, the lower bound with a perturbation that makes I - M Delta
+singular. Both bounds are recomputed from the returned scalings and perturbation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MuUpper(Shown):
-    """Upper bound of mu with its scalings; a leading frequency axis where M had one.
+    """Upper bound of mu with its scalings; arrays have a leading frequency axis if M has one.
 
     upper : scalar or (n_omega,).
     D, D_w : (.., n_z, n_z) and (.., n_w, n_w), Hermitian positive definite, commuting with Delta.
@@ -41,11 +41,11 @@ class MuUpper(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MuBounds(MuUpper):
-    """Both bounds of mu; a leading frequency axis where M had one.
+    """Both bounds of mu; arrays have a leading frequency axis if M has one.
 
-    lower : scalar or (n_omega,); 0 where no singular perturbation was found (mu itself may be 0).
-    delta : (.., n_w, n_z) with the block structure, ||delta|| = 1/lower and I - M delta singular. Where lower
-        is 0 there is none: None for a single M, entries NaN in a stack.
+    lower : scalar or (n_omega,); 0 if no singular perturbation was found (mu itself may be 0).
+    delta : (.., n_w, n_z) with the block structure, ||delta|| = 1/lower and I - M delta singular. If lower is 0, delta
+        is None for a single M, and has NaN entries in a stack.
     """
 
     lower: float | Array
@@ -53,7 +53,7 @@ class MuBounds(MuUpper):
 
 
 def checked(M: Array, blocks: BlockStructure | Sequence[Block]) -> tuple[Array, BlockStructure]:
-    """M as complex (n_omega, n_z, n_w) and the structure that fits it; an InputError where it does not."""
+    """M as complex (n_omega, n_z, n_w) and its block structure; InputError if they do not fit."""
     structure = BlockStructure.of(blocks)
     M = np.asarray(M, complex)
     if M.ndim not in (2, 3):
@@ -72,7 +72,7 @@ def mu_upper(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: floa
     Parameters
     ----------
     M : (n_z, n_w) or (n_omega, n_z, n_w) complex; n_z = sum of the blocks' cols, n_w = sum of their rows.
-    tolerance : relative accuracy in upper^2 at which the optimisation stops. The value returned is an upper
+    tolerance : relative accuracy in upper^2 at which the optimisation stops. The returned value is an upper
         bound in any case: it is recomputed from the scalings by an eigenvalue computation.
 
     Raises
@@ -95,7 +95,7 @@ def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e
     Parameters
     ----------
     M : (n_z, n_w) or (n_omega, n_z, n_w) complex; n_z = sum of the blocks' cols, n_w = sum of their rows.
-    tolerance : relative accuracy in upper^2 at which the scalings' optimisation stops.
+    tolerance : relative accuracy in upper^2 at which the optimisation of the scalings stops.
 
     Raises
     ------

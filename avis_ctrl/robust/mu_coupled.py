@@ -1,7 +1,7 @@
-"""Blocks that no loop goes through: their z stays zero or their w moves nothing, whatever Delta is.
+"""Removal of blocks that are not part of a loop: their z is always zero or their w has no effect, for any Delta.
 
-mu and the worst-case gain do not depend on them. They are read off the pattern of zeros of A, B, C, D, so that
-nothing is decided by round-off; states that the rest does not reach or see go as well.
+mu and the worst-case gain do not depend on these blocks. They are identified from the zero pattern of A, B, C, D, so
+that round-off has no influence. States that are unreachable or unobservable from the rest are removed as well.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True, eq=False)
 class Coupled:
-    """What is left of N and its blocks, and the places w (n,), z (m,) that these blocks have in the whole Delta."""
+    """The remaining part of N and its blocks, and the indices w (n,), z (m,) of these blocks in the whole Delta."""
 
     N: StateSpace
     structure: BlockStructure
@@ -26,7 +26,7 @@ class Coupled:
     z: Array
 
     def restored(self, delta: Array | None) -> Array | None:
-        """Delta (n_w, n_z) of all blocks, zero in those left out."""
+        """Delta (n_w, n_z) of all blocks, zero in the removed blocks."""
         if delta is None:
             return None
         full = np.zeros((self.whole.n_w, self.whole.n_z), complex)
@@ -35,7 +35,7 @@ class Coupled:
 
 
 def coupled(N: StateSpace, structure: BlockStructure) -> Coupled:
-    """Leave out the blocks without a loop; all are kept where none has one. The channels after them always stay."""
+    """Remove the blocks without a loop; if no block has one, all are kept. The channels after the blocks are kept."""
     places = list(structure.slices())
     kept = np.ones(len(places), bool)
     while True:
@@ -67,7 +67,7 @@ def _places(places: list, kept: Array, structure: BlockStructure) -> tuple[Array
 
 
 def _spread(linked: Array, start: Array) -> Array:
-    """States that signals entering at `start` come to; linked[i, k]: state k moves state i."""
+    """States reachable from the states `start`; linked[i, k]: state k drives state i."""
     reached = start
     while True:
         grown = reached | np.any(linked[:, reached], axis=1)

@@ -1,4 +1,4 @@
-"""A guarantee between frequencies: fixed scalings hold up to an imaginary eigenvalue of a Hamiltonian matrix.
+"""Proof of upper bounds of mu between frequencies, from the imaginary eigenvalues of a Hamiltonian matrix.
 
 For N(s) = D + C inv(sI - A) B and constant scalings X, G the function
 
@@ -9,9 +9,9 @@ is singular only where j omega is an eigenvalue of
 
     H = [A - B inv(R) S^H,  -B inv(R) B^H;  S inv(R) S^H - Q,  S inv(R) B^H - A^H]
 
-(Zhou, Doyle and Glover, Robust and Optimal Control, 1996, chapter 13; here with complex weights). Where Phi > 0
-at one frequency it is so on the whole interval between the eigenvalues around it: intervals that cover the
-band prove mu <= 1 at every frequency of it, not at those computed.
+(Zhou, Doyle and Glover, Robust and Optimal Control, 1996, chapter 13; here with complex weights). If Phi > 0 at one
+frequency, then Phi > 0 on the whole interval between the neighbouring eigenvalues. Intervals that cover the band prove
+mu <= 1 at every frequency of the band, not only at the computed frequencies.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Interval = tuple[float, float]
 NARROW = 1e-6
-# So many gaps at one level mean that mu is flat there: a level a little higher needs far fewer intervals.
+# This number of gaps at one level means that mu is flat: a slightly higher level needs far fewer intervals.
 PATIENCE = 250
 WIDENINGS = 5
 
 
 def midpoint(low: float, high: float) -> float:
-    """A frequency between two others: geometric mean, half or double where one of them is 0 or inf."""
+    """A frequency between two frequencies: geometric mean, or half or double if one of them is 0 or inf."""
     if low == 0.0:
         return 1.0 if np.isinf(high) else high / 2
     return 2 * low if np.isinf(high) else float(np.sqrt(low) * np.sqrt(high))
 
 
 def possible_crossings(N: StateSpace, scalings: Scalings) -> Array:
-    """Frequencies [rad/s] >= 0 where Phi may turn singular: a superset, sorted. Scalings without a batch axis."""
+    """Sorted superset of the frequencies [rad/s] >= 0 where Phi is singular. The scalings have no batch axis."""
     if not N.nstates:
         return np.zeros(0)
     X_z, X_w, G = scalings
@@ -58,7 +58,7 @@ def possible_crossings(N: StateSpace, scalings: Scalings) -> Array:
     F, BRB = A - B @ RS, B @ RB
     Q = S @ RS + C.T @ X_z @ C
     size_b, size_q = np.linalg.norm(BRB), np.linalg.norm(Q)
-    # Both halves alike in size, so that the eigenvalue computation does not mix magnitudes.
+    # Off-diagonal blocks of equal norm, so that the eigenvalue computation does not mix magnitudes.
     t = np.sqrt(size_q / size_b) if size_b > 0 and size_q > 0 else 1.0
     H = np.block([[F, -t * BRB], [Q / t, -dagger(F)]])
     values = la.eigvals(H, check_finite=False)
@@ -68,7 +68,7 @@ def possible_crossings(N: StateSpace, scalings: Scalings) -> Array:
 
 
 def _positive(N: StateSpace, scalings: Scalings, omega: Array) -> Array:
-    """Whether Phi(omega) > 0, for each frequency, with a margin of round-off."""
+    """Whether Phi(omega) > 0 at each frequency, with a round-off margin."""
     M = N.frequency_response(omega)[:, None]
     repeated = Scalings(*(np.broadcast_to(s, (omega.size, *s.shape)) for s in scalings))
     level = np.ones(N.ninputs, bool)
@@ -78,7 +78,7 @@ def _positive(N: StateSpace, scalings: Scalings, omega: Array) -> Array:
 
 
 def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> list[Interval]:
-    """Closed parts of an interval on which fixed scalings keep Phi > 0."""
+    """Closed parts of an interval on which Phi > 0 with the given scalings."""
     low, high = inside
     crossings = possible_crossings(N, scalings)
     crossings = crossings[(crossings > low) & (crossings < high)]
@@ -88,7 +88,7 @@ def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> lis
     parts: list[Interval] = []
     start = None
     for k in range(middles.size):
-        # A true crossing has a singular Phi, so an edge that is positive is only near the axis.
+        # Phi is singular at a true crossing; if it is positive at an edge, the eigenvalue is only near the axis.
         if not between[k]:
             start = None
             continue
@@ -104,9 +104,9 @@ def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> lis
 
 @dataclass
 class Cover:
-    """What came out: the level reached, the gaps that are left, and where the level had to be raised.
+    """Result: the level reached, the remaining gaps, and the frequencies where the level was raised.
 
-    looked : gaps looked at since the level was last raised for their number; widened : how often that was done.
+    looked : gaps processed since the level was last raised because of their number; widened : how often it was raised.
     """
 
     level: float
@@ -120,12 +120,12 @@ class Cover:
 def cover(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace, float], StateSpace],
           bound: Callable[[Array], Array], level: float, band: Interval, samples: Array, *, slack: float,
           rounds: int = 60, most: int = 1500) -> Cover:
-    """Prove the level on a whole band, raising it where a gap's own bound asks for it.
+    """Prove a level on a whole band, and raise it if the bound of a gap requires a higher level.
 
-    scaled(N, level) is the system whose mu must stay at or below 1 for the level to hold; bound(M) gives the level
-    that scalings shared along axis 1 of M (B, n_shared, n_z, n_w) prove. `samples` are frequencies worth a look.
-    A level is raised by the share `slack` more than asked; where it still needs too many intervals, by twice, four
-    times .. `slack`. What `rounds` rounds or `most` gaps leave unproved stays in `gaps`.
+    scaled(N, level) is the system whose mu must be at most 1 for the level to be valid; bound(M) gives the level that
+    scalings shared along axis 1 of M (B, n_shared, n_z, n_w) prove. The band is first split at `samples`. The level is
+    raised to the required level plus the fraction `slack`; if it needs too many intervals, it is raised by `slack`,
+    then by twice, four times .. `slack`. Gaps that are not proved within `rounds` rounds or `most` gaps stay in `gaps`.
     """
     state = Cover(level)
     samples = np.unique(samples[(samples >= band[0]) & (samples <= band[1])])
@@ -170,7 +170,7 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
 
 def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, bound: Callable[[Array], Array],
                     state: Cover, open_gaps: list[Interval], slack: float) -> None:
-    """Halve the gaps; where a single frequency in them (or a gap too narrow to halve) needs more, raise the level.
+    """Halve the gaps; raise the level if a single frequency in a gap (or a gap too narrow to halve) requires it.
 
     unit : N scaled so that the level is one.
     """
@@ -196,7 +196,7 @@ def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, 
 
 
 def accuracy_of(slack: float) -> float:
-    """Accuracy of lambda = beta^2 that goes with a slack of beta."""
+    """Accuracy of lambda = beta^2 that is appropriate for a slack of beta."""
     return max(slack / 5, 1e-4)
 
 
@@ -206,7 +206,7 @@ def _is_narrow(gap: Interval) -> bool:
 
 
 def _without(gap: Interval, parts: list[Interval]) -> list[Interval]:
-    """What the parts leave of a gap; what is left almost whole is halved, lest it lose but slivers."""
+    """The rest of a gap without the parts; a rest that is almost the whole gap is halved, so that progress is made."""
     left, at = [], gap[0]
     for low, high in parts:
         if low > at:

@@ -1,17 +1,17 @@
 """Descent on the upper bound of mu over the entries of a controller.
 
-At each frequency the least level of mu's upper bound, lambda = beta^2, moves with K as
+At each frequency the minimum level of mu's upper bound, lambda = beta^2, varies with K as
 
     d lambda = 2 Re tr(G dK),   G = R Z M^H X_z L,   dM = L dK R,   Z = inv(F) / tr(X_w inv(F)),
 
-for the optimal scalings do not move it to first order (F, X_z, X_w as in `mu_lmi`); Z is the dual solution, so that the
-slope is right where several singular values meet, too. The largest of them over the frequencies is smoothed by a
-log-sum-exp that is sharpened from stage to stage, and lowered by BFGS with a weak Wolfe line search, which needs no
-smoothness (Lewis and Overton, Mathematical Programming 141, 2013; Burke, Henrion, Lewis and Overton, HIFOO, 2006). A
-step that makes the loop unstable is refused. What the result is worth between the frequencies is for `mu_peak` to say.
+because changes of the optimal scalings do not affect it to first order (F, X_z, X_w as in `mu_lmi`). Z is the dual
+solution, so that the slope is also correct where several singular values coincide. The maximum over the frequencies is
+smoothed by a log-sum-exp that is sharpened from stage to stage, and minimised by BFGS with a weak Wolfe line search,
+which requires no smoothness (Lewis and Overton, Mathematical Programming 141, 2013; Burke, Henrion, Lewis and Overton,
+HIFOO, 2006). A step that makes the loop unstable is rejected. `mu_peak` evaluates the result between the frequencies.
 
-A limit of the controller's gain at high frequency is part of what is lowered: its largest singular value over the limit
-is one more figure beside mu, with the slope u v^H for its singular vectors.
+A limit of the controller gain at high frequency is part of the objective: the largest singular value of K relative to
+the limit is treated like a value of mu, with the slope u v^H from its singular vectors.
 """
 
 from __future__ import annotations
@@ -34,20 +34,19 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """sharpness : exponents of the smoothed maximum over frequency, one stage each: its error is log(frequencies) over
-        it, so the last one leaves less than a per cent.
-    iterations : most BFGS steps of a stage.
-    stall : relative fall of the smoothed maximum over ten steps below which a stage ends.
-    accuracy : relative accuracy of beta^2 at each frequency, and the distance above it at which the slope is taken: a
-        nearer one makes the slope less smooth, a farther one less true.
-    armijo, wolfe : fractions of the slope that a step must gain, and may leave (Lewis and Overton 2013).
-    trials : most points of a line search.
-    narrow : damping ratio of a mode of the loop below which its resonance joins the frequencies of every step.
-    negligible : weight in the smoothed maximum, relative to the largest, below which a frequency is left out: less than
-        rounding errors change.
-    first : frequencies of the largest balanced norms, whose mu tells which others count.
-    between : frequencies at which the gain is checked for each frequency of its limit, so that no peak is missed
-        between two of these.
+    """sharpness : exponents of the smoothed maximum over frequency, one per stage. The error of the maximum is
+        log(number of frequencies) / exponent, less than one per cent in the last stage.
+    iterations : maximum number of BFGS steps per stage.
+    stall : relative decrease of the smoothed maximum over ten steps below which a stage ends.
+    accuracy : relative accuracy of beta^2 at each frequency, and the distance above it at which the slope is evaluated:
+        a smaller distance makes the slope less smooth, a larger distance less accurate.
+    armijo, wolfe : fractions of the slope in the Armijo and the weak Wolfe condition (Lewis and Overton 2013).
+    trials : maximum number of points of a line search.
+    narrow : damping ratio below which the resonance of a closed-loop mode is added to the frequencies of every step.
+    negligible : weight in the smoothed maximum, relative to the largest, below which a frequency is omitted: less than
+        the effect of rounding errors.
+    first : number of frequencies with the largest balanced norms, whose mu determines which other frequencies count.
+    between : number of points per interval of the gain limit at which the gain is checked, so that no peak is missed.
     """
 
     sharpness: tuple[float, ...] = (20.0, 80.0, 300.0, 1000.0)
@@ -68,25 +67,25 @@ SETTINGS = DescentSettings()
 
 @dataclass(frozen=True, eq=False)
 class GainLimit:
-    """Largest gain of a controller [of K], (n,), at frequencies omega (n,) [rad/s]; it counts as mu does."""
+    """Maximum gain `most` (n,) [unit of K] at frequencies omega (n,) [rad/s]; gain / limit is treated like mu."""
 
     omega: Array
     most: Array
 
     def frequencies(self, K: StateSpace, between: int) -> Array:
-        """omega with points between, and the natural frequencies of K, where its gain can have a peak."""
+        """omega with intermediate points, and the natural frequencies of K, where its gain can peak."""
         low, high, own = self.omega[0], self.omega[-1], np.abs(K.poles())
         fine = np.geomspace(low, high, (self.omega.size - 1) * between + 1)
         return merged(self.omega, np.concatenate([fine, own[(own > low) & (own < high)]]))
 
     def at(self, omega: Array) -> Array:
-        """The limit at other frequencies; a power law between neighbours."""
+        """The limit at other frequencies, by a power law between neighbouring points."""
         return np.exp(np.interp(np.log(omega), np.log(self.omega), np.log(self.most)))
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A controller on the way down, and the peak of complex mu and of its gain over the limit on its grid."""
+    """A controller of the descent, and the peak on its grid of complex mu and of its gain relative to the limit."""
 
     K: StateSpace
     peak: float
@@ -94,8 +93,8 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is lowered. P continuous, u and y last; `structure` complex, performance last; a decentralised controller
-    moves u_k by y_k alone."""
+    """The minimisation problem: P continuous, u and y last; `structure` complex, performance last. In a decentralised
+    controller u_k depends on y_k only."""
 
     P: StateSpace
     structure: BlockStructure
@@ -104,7 +103,7 @@ class Task:
     settings: DescentSettings = SETTINGS
 
     def peak(self, K: StateSpace, omega: Array) -> float:
-        """On a grid; inf where the loop is unstable."""
+        """Peak of mu and relative gain on a grid; inf if the loop is unstable."""
         closed = lft_lower(self.P, K)
         if not closed.is_stable():
             return np.inf
@@ -113,12 +112,12 @@ class Task:
         return max(float(np.max(beta)), self.gain(K))
 
     def gain(self, K: StateSpace) -> float:
-        """Largest gain of K over its limit; zero without one."""
+        """Largest gain of K relative to its limit; zero without a limit."""
         return float(np.exp(np.max(self.over_limit(K)[1], initial=-np.inf)))
 
     def over_limit(self, K: StateSpace) -> tuple[Array, Array, Array]:
-        """Frequencies (n,) [rad/s], log of the gain of K over its limit there, and G (n, n_y, n_u) with its change
-        Re tr(G dK); n is zero without a limit."""
+        """Frequencies (n,) [rad/s], log of the gain of K relative to its limit there, and G (n, n_y, n_u), where
+        Re tr(G dK) is the change of this log; n is zero without a limit."""
         if self.limit is None:
             return np.empty(0), np.empty(0), np.empty((0, K.ninputs, K.noutputs), complex)
         omega = self.limit.frequencies(K, self.settings.between)
@@ -127,7 +126,7 @@ class Task:
         return omega, np.log(s[:, 0] / self.limit.at(omega)), dagger(U[:, :, :1] @ Vh[:, :1]) / s[:, :1, None]
 
     def descended(self, K: StateSpace, stages: Sequence[float]) -> Step:
-        """The best controller after each of some stages of descent from K, K among them."""
+        """The best of K and the controllers after each stage of descent from K."""
         best, omega = self.measured(K)
         for sharpness in stages:
             form = Entries.of(K, self.decentralised)
@@ -137,8 +136,8 @@ class Task:
         return best
 
     def measured(self, K: StateSpace, omega: Array | None = None) -> tuple[Step, Array]:
-        """K with its peak, infinite where the loop is unstable; and the grid: that of the loop and `omega`, with the
-        local maxima of mu between."""
+        """K with its peak (inf if the loop is unstable), and the grid: that of the loop and `omega`, refined at the
+        local maxima of mu."""
         closed = lft_lower(self.P, K)
         grid = frequency_grid(closed) if omega is None else merged(omega, frequency_grid(closed))
 
@@ -150,8 +149,8 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The smoothed maximum of log mu over a frequency grid, and of the gain over its limit, as a function of the
-    entries of K, with its slope."""
+    """Smoothed maximum of log mu and of log(gain / limit) over a frequency grid, as a function of the entries of K,
+    with its slope."""
 
     task: Task
     form: Entries
@@ -159,7 +158,7 @@ class Objective:
     sharpness: float
 
     def value(self, x: Array) -> tuple[float, Array]:
-        """log of the smoothed peak and its slope; inf where the loop is unstable."""
+        """log of the smoothed peak and its slope; inf if the loop is unstable."""
         K = self.form.controller(x)
         try:
             closed = lft_lower(self.task.P, K)
@@ -167,7 +166,7 @@ class Objective:
             return np.inf, np.zeros(x.size)
         if not closed.is_stable():
             return np.inf, np.zeros(x.size)
-        # Narrow modes move from step to step; on the grid alone descent would hide their peaks between its points.
+        # Narrow modes move from step to step; on a fixed grid the descent would hide their peaks between its points.
         narrow = resonances(closed.poles(), damping=self.task.settings.narrow)
         total, omega, G = smoothed_peak(self.task, K, np.concatenate([self.omega, narrow]), np.concatenate(
             [self.response, self.task.P.frequency_response(narrow)]), self.sharpness)
@@ -190,9 +189,9 @@ class Objective:
 
 def smoothed_peak(task: Task, K: StateSpace, omega: Array, response: Array, sharpness: float
                   ) -> tuple[float, Array, Array]:
-    """The smoothed maximum of log mu and of log(gain over its limit), and its slope Re sum_k tr(G_k dK(j omega_k)).
+    """Smoothed maximum of log mu and of log(gain / limit), and its slope Re sum_k tr(G_k dK(j omega_k)).
 
-    `response` is P at omega (n,). The frequencies of the slope are those that count, (m,), with G (m, n_y, n_u).
+    `response` is P at omega (n,). The slope is returned as the frequencies (m,) that count, and G (m, n_y, n_u).
     """
     p, settings = response, task.settings
     n_u, n_y = K.noutputs, K.ninputs
@@ -222,11 +221,11 @@ def smoothed_peak(task: Task, K: StateSpace, omega: Array, response: Array, shar
 def _highest(task: Task, M: Array, sharpness: float) -> tuple[Array, UpperBound]:
     """Indices of the frequencies that count in the smoothed maximum, and the bounds of mu there.
 
-    M (n_omega, n_z, n_w). The norm after Osborne's scaling is cheap and no less than the bound: where it is small,
-    the frequency does not count. The highest norms come first: their mu tells which of the others count.
+    M (n_omega, n_z, n_w). The norm after Osborne's scaling is cheap and at least the bound: a frequency with a small
+    norm does not count. mu at the frequencies with the largest norms determines which other frequencies count.
     """
     structure, settings = task.structure, task.settings
-    # The signals of a design plant are scaled alike, so that no norm has to be levelled first.
+    # The signals of a design plant have similar sizes, so that the block norms need no preliminary scaling.
     d_z, d_w = expand(structure, block_balance(M[:, None], structure, goal=np.inf))
     size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
     falling = np.argsort(-size)
@@ -246,7 +245,7 @@ def _resolvent(K: StateSpace, omega: Array) -> Array:
 
 
 def _bfgs(value: Callable[[Array], tuple[float, Array]], x: Array, settings: DescentSettings) -> Array:
-    """BFGS with a weak Wolfe line search by bisection; ends where ten steps gain less than `stall`."""
+    """BFGS with a weak Wolfe line search by bisection; ends when ten steps gain less than `stall`."""
     f, g = value(x)
     H = np.eye(x.size) / max(float(np.linalg.norm(g)), 1e-12) * 0.1
     history = [f]

@@ -1,11 +1,11 @@
-"""The compiled path to the least level of `mu_lmi` where every scaling is one number a block.
+"""Compiled path to the minimum level of `mu_lmi` for structures with one number per block as scaling.
 
-Single complex scalars and full blocks have scalings p_k > 0 alone. With W = S M^H, T = M S M^H and S the inverse of
+Single complex scalars and full blocks have only scalings p_k > 0. With W = S M^H, T = M S M^H and S the inverse of
 
     F = lambda P_w - M^H P_z M,
 
-the barrier sum_k c_k p_k - log det F - sum_k c_k log p_k and its derivatives are sums of |S|^2, |W|^2 and
-|T|^2 over blocks: a Newton step costs three products of matrices. Matrices along axis 1 of M share p.
+the derivatives of the barrier sum_k c_k p_k - log det F - sum_k c_k log p_k are sums of |S|^2, |W|^2 and |T|^2 over
+blocks: a Newton step costs three matrix products. Matrices along axis 1 of M share p.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _level_matrix(M, p_z, p_w, F):
 
 @njit(cache=True)
 def _factor(F):
-    """Lower Cholesky factor in place of F; False where F is not positive definite."""
+    """Lower Cholesky factor in place of F; False if F is not positive definite."""
     n = F.shape[0]
     for j in range(n):
         total = F[j, j].real
@@ -72,7 +72,7 @@ def _add_block_norms(X, rows, cols, weight, out):
 
 @njit(cache=True)
 def _solve_positive(H, b):
-    """Solution of H x = b for positive definite H with its diagonal scaled to one, a ridge where it is singular."""
+    """Solution of H x = b for positive definite H, scaled to unit diagonal, with a small ridge for singular H."""
     n = b.size
     d, A = np.empty(n), np.empty((n, n))
     for i in range(n):
@@ -103,9 +103,9 @@ def _solve_positive(H, b):
 
 @njit(cache=True)
 def _derivatives(M, p, lam, of_z, of_w, copies, gradient, slope, hessian, falling):
-    """Gradient, its derivative by lambda, and Hessian of the barrier at (p, lam); False outside.
+    """Gradient, its derivative by lambda, and Hessian of the barrier at (p, lam); False outside its domain.
 
-    falling (n_blocks + 1,) : tr(S P_w S dF/dp_k), and tr(S P_w S P_w), for the speed at which F falls.
+    falling (n_blocks + 1,) : tr(S P_w S dF/dp_k), and tr(S P_w S P_w), for the rate at which F decreases.
     """
     n_b = p.size
     n_z, n_w = M.shape[1:]
@@ -159,11 +159,11 @@ def _inside(M, p, lam, of_z, of_w, F):
 
 @njit(cache=True)
 def follow_diagonal(M, of_z, of_w, copies, lam, floor, tolerance, settings):
-    """Scalings (B, n_blocks) and the levels (B,) that they prove, from p = 1 at lam (B,) down to the least or `floor`.
+    """Scalings (B, n_blocks) and the levels (B,) that they prove, from p = 1 at lam (B,) to the minimum or `floor`.
 
-    M (B, n_shared, n_z, n_w) complex, of_z (n_z,) and of_w (n_w,) the block of each entry, copies (n_blocks,) how often
-    its scaling counts. Ends where the way to the boundary is below `tolerance` lambda, at the centre where `floor` > 0
-    ends it.
+    M (B, n_shared, n_z, n_w) complex, of_z (n_z,) and of_w (n_w,) the block of each entry, copies (n_blocks,) the
+    weights c_k. Ends when the distance to the boundary is below `tolerance` lambda, or at the analytic centre when a
+    `floor` > 0 is reached.
     """
     batch, n_b = M.shape[0], copies.size
     found, level = np.ones((batch, n_b)), lam.copy()
@@ -183,20 +183,20 @@ def follow_diagonal(M, of_z, of_w, copies, lam, floor, tolerance, settings):
                     break
                 p = p - step * (1.0 if decrement < settings.near else 1.0 / (1.0 + decrement))
             if not sound or not _inside(M[b], p, at, of_z, of_w, F):
-                # Round-off ended the path here; the last verified point stands.
+                # Round-off ends the path here; the last verified point is kept.
                 break
             found[b], level[b] = p, at
             if floor[b] > 0 and at <= floor[b]:
                 break
             towards = _solve_positive(hessian, slope)
-            # dF / d lambda in the metric of F, by its Frobenius norm, tells the way to the boundary to a small factor.
+            # The Frobenius norm of dF / d lambda in the metric of F gives the distance to the boundary up to a factor.
             speed = falling[n_b]
             for k in range(n_b):
                 speed += towards[k] * (slope[k] - 2 * falling[k]) - copies[k] * (towards[k] / p[k]) ** 2
             whole = at - max(floor[b], 0.0)
             fall = min(whole, settings.first / np.sqrt(max(speed, 1e-300)))
             for _ in range(40):
-                # d p / d lambda = -towards: lambda falls, p moves along towards.
+                # d p / d lambda = -towards: lambda decreases, p moves along `towards`.
                 if _inside(M[b], p + fall * towards, at - fall, of_z, of_w, F):
                     break
                 fall *= settings.shrink
@@ -214,7 +214,7 @@ def follow_diagonal(M, of_z, of_w, copies, lam, floor, tolerance, settings):
 
 @njit(cache=True)
 def balanced_squares(norm2, sweeps):
-    """Squares (B, n) of Osborne's scalings from the squared norms (B, n, n) of the blocks, the diagonal left out."""
+    """Squares (B, n) of Osborne's scalings from the squared norms (B, n, n) of the off-diagonal blocks."""
     batch, n = norm2.shape[:2]
     d2 = np.ones((batch, n))
     for b in range(batch):
@@ -230,13 +230,13 @@ def balanced_squares(norm2, sweeps):
 
 @njit(cache=True)
 def level_squares(norm2, enough2, most):
-    """d2 (B, n) > 0 for which every norm2_kj d2_k / d2_j is at most the largest geometric mean of norm2 (B, n, n)
-    around a cycle of blocks, or at most enough2 (B,) if that is larger; 1 without a cycle where enough2 is zero. The
-    mean does not depend on the units of the signals.
+    """d2 (B, n) > 0 such that every norm2_kj d2_k / d2_j is at most the largest geometric mean of norm2 (B, n, n)
+    around a cycle of blocks, or at most enough2 (B,) if that is larger; 1 if there is no cycle and enough2 is zero.
+    The mean does not depend on the units of the signals.
 
-    The mean is found by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walk to each block.
+    The mean is computed by Karp's theorem (Discrete Mathematics 23, 1978), log d2 as the longest walk to each block.
 
-    most : largest distance of log d2 from the middle of its range.
+    most : maximum distance of log d2 from the middle of its range.
     """
     batch, n = norm2.shape[:2]
     d2 = np.ones((batch, n))

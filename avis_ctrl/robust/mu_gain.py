@@ -4,8 +4,8 @@ With E = N22 + N21 Delta inv(I - N11 Delta) N12 and its largest singular triple 
 
     d sigma = Re(a^H dDelta x),   x = inv(I - N11 Delta) N12 v,   a = inv(I - Delta N11)^H N21^H u,
 
-so the block that raises sigma most is a_k x_k^H / (|a_k| |x_k|), the phase of x^H a or the sign of Re(x^H a).
-The performance block absorbs every phase, hence nothing has to be kept real here.
+so that the block that raises sigma most is a_k x_k^H / (|a_k| |x_k|) (full), the phase of x^H a (complex scalar) or the
+sign of Re(x^H a) (real scalar). The performance block absorbs every phase, so that no quantity has to be real here.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True)
 class GainSettings:
-    """steps : lengths of a step towards the steepest Delta, tried in this order.
+    """steps : step lengths towards the steepest Delta, tried in this order.
     accuracy : an ascent ends when a step raises the gain by less than this fraction.
-    dyad_loss : relative loss of gain that is accepted for a dyad in place of a full block.
+    dyad_loss : relative loss of gain that is accepted to replace a full block by a dyad (matrix of rank one).
     """
 
     steps: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
@@ -35,7 +35,7 @@ SETTINGS = GainSettings()
 
 
 class WorstGain(NamedTuple):
-    """gain (B,) reached by delta (B, n_w, n_z) with ||delta|| <= 1."""
+    """gain (B,) attained by delta (B, n_w, n_z) with ||delta|| <= 1."""
 
     gain: Array
     delta: Array
@@ -99,7 +99,7 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
 
 
 def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockStructure) -> None:
-    """One step of the problems `which`, in place: the first of the step lengths that raises the gain."""
+    """One step of the problems `which`, in place, with the first step length that raises the gain."""
     direction = _steepest(M[which], delta[which], structure) - delta[which]
     for step in SETTINGS.steps:
         trial = delta[which] + step * direction
@@ -110,8 +110,8 @@ def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockSt
 
 
 def _take_dyads(M: Array, delta: Array, gain: Array, structure: BlockStructure) -> None:
-    """Full blocks as dyads of the gradient, which they are at a maximum: only that form is realised with constant
-    norm. In place, where the gain falls by at most `dyad_loss`."""
+    """Replace full blocks by dyads of the gradient, which they are at a maximum: only dyads can be realised with
+    constant norm. In place, if the gain decreases by at most `dyad_loss`."""
     steepest, dyads = _steepest(M, delta, structure), delta.copy()
     for block, w, z in structure.slices():
         if block.kind == "full":

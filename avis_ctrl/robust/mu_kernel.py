@@ -1,12 +1,12 @@
-"""The compiled path of `mu_lmi`: damped Newton steps to each analytic centre, one problem after the other.
+"""Compiled path of `mu_lmi`: damped Newton steps to each analytic centre, one problem at a time.
 
 For V = [I  M^H], K(theta) = sum_k theta_k K_k given by its entries, F = V K V^H and T = V^H inv(F) V
 
     d(-log det F) = -tr(T K_k),
     d2(-log det F) = tr(T K_k T K_l) = sum over the entries of v_i v_j T[c_i, r_j] T[c_j, r_i].
 
-Matrices are small and each problem needs its own number of steps: plain loops are several times faster than stacks.
-Only the Newton step itself, with up to hundreds of parameters, is left to LAPACK.
+Matrices are small and the number of steps differs between problems: plain loops are several times faster than stacked
+arrays. Only the Newton step itself, with up to hundreds of parameters, uses LAPACK.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from numba import njit
 
 class PathSettings(NamedTuple):
     """central : Newton decrement below which a point counts as the analytic centre.
-    near : Newton decrement below which a full step is taken, for it converges quadratically there.
-    reach : fraction of the way to the boundary that lambda falls in one step: the nearer to 1, the fewer steps, but the
-        more Newton steps each.
-    first, shrink : first trial of that way, in units of the least that it can be, and the factor to the next trial.
-    newton, steps : most Newton steps to a centre, and most centres; both are never needed.
+    near : Newton decrement below which a full step is taken, because convergence is quadratic there.
+    reach : fraction of the distance to the boundary by which lambda decreases in one step: values closer to 1 need
+        fewer steps, but more Newton steps for each.
+    first, shrink : first trial of that distance, relative to its lower bound, and the factor to the next trial.
+    newton, steps : maximum number of Newton steps to a centre, and of centres; neither is reached in practice.
     """
 
     central: float = 0.3
@@ -39,7 +39,7 @@ SETTINGS = PathSettings()
 
 
 class Entries(NamedTuple):
-    """Non-zero entries of the matrices K_k: place, value, parameter k, and 1.0 where lambda multiplies the entry."""
+    """Non-zero entries of the matrices K_k: indices, value, parameter k, and whether lambda multiplies the entry."""
 
     row: np.ndarray
     col: np.ndarray
@@ -60,7 +60,7 @@ def _matrix(theta, entries, lam):
 
 @njit(cache=True)
 def _inverse(A):
-    """Inverse of a Hermitian matrix by its Cholesky factor; NaN where it is not positive definite."""
+    """Inverse of a Hermitian matrix by its Cholesky factor; NaN if it is not positive definite."""
     n = A.shape[0]
     L = np.zeros((n, n), np.complex128)
     for j in range(n):
@@ -109,8 +109,8 @@ def _residual(M, K):
 def _add_derivatives(T, entries, lam, gradient, hessian):
     """Subtract tr(T K_k) from the gradient and add tr(T K_k T K_l), l <= k, to the Hessian's lower triangle.
 
-    The entries are in the order of their parameters. All matrices are Hermitian, so that only entries on and above the
-    diagonal of K_k are visited; those below add the conjugate.
+    The entries are sorted by parameter. All matrices are Hermitian, so that only entries on and above the diagonal of
+    K_k are visited; the entries below contribute the conjugate.
     """
     n = entries.row.size
     v = np.empty(n, np.complex128)
@@ -143,7 +143,7 @@ def _gram(M, S):
 
 @njit(cache=True)
 def _add_slope(T, K, entries, lam, slope):
-    """Derivative by lambda of the gradient, from dT = -T Xp T with Xp = dK / d lambda, and from lambda's entries."""
+    """Derivative of the gradient by lambda, from dT = -T Xp T with Xp = dK / d lambda, and from entries with lambda."""
     n = entries.size
     W = np.zeros((n, n), np.complex128)
     for e in range(entries.row.size):
@@ -164,11 +164,11 @@ def _add_slope(T, K, entries, lam, slope):
 
 @njit(cache=True)
 def _newton(hessian, right, is_g):
-    """-inv(hessian) right, with unit-diagonal scaling; ridges of round-off size where it is singular. Only the lower
-    triangle of the hessian is read. NaN where it is not finite or no inverse exists.
+    """-inv(hessian) right, with unit-diagonal scaling and ridges of round-off size for singular cases. Only the lower
+    triangle of the Hessian is read. NaN if it is not finite or has no inverse.
 
-    A G that multiplies a real entry of M has no effect and no curvature: its ridge is measured against the
-    largest curvature, so that round-off does not drive it away.
+    A G that multiplies a real entry of M has no effect and no curvature: its ridge is relative to the largest
+    curvature, so that G does not drift by round-off.
     """
     n = right.size
     top = 0.0
@@ -190,9 +190,10 @@ def _newton(hessian, right, is_g):
 
 @njit(cache=True)
 def _to_centre(M, x, lam, form, core, trace, is_g, settings):
-    """Moves x (p,) to the analytic centre at lam and returns d x / d lambda, the direction of the path of centres.
+    """Move x (p,) to the analytic centre at lam and return d x / d lambda, the direction of the path of centres.
 
-    Of trace x - log det F - log det X, F of every matrix of M (n_shared, n_z, n_w). NaN where it failed.
+    The centre minimises trace x - log det F - log det X, with an F for every matrix of M (n_shared, n_z, n_w). NaN on
+    failure.
     """
     n_p = trace.size
     gradient, slope, hessian = np.empty(n_p), np.zeros(n_p), np.empty((n_p, n_p))
@@ -207,7 +208,7 @@ def _to_centre(M, x, lam, form, core, trace, is_g, settings):
         _add_derivatives(_inverse(_matrix(x, core, 1.0)), core, 1.0, gradient, hessian)
         step = _newton(hessian, gradient, is_g)
         decrement = np.sqrt(max(-np.dot(step, gradient), 0.0))
-        # Not a number is not far either: `_inside` sorts such problems out.
+        # NaN ends the loop as well; `_inside` detects such problems.
         if not decrement >= settings.central or count == settings.newton:
             break
         x += step * (1.0 if decrement < settings.near else 1.0 / (1.0 + decrement))
@@ -219,7 +220,7 @@ def _to_centre(M, x, lam, form, core, trace, is_g, settings):
 
 @njit(cache=True)
 def _positive(A):
-    """Whether a Hermitian matrix is positive definite, with a margin of round-off; its lower triangle is lost."""
+    """Whether a Hermitian matrix is positive definite, with a round-off margin; overwrites its lower triangle."""
     n = A.shape[0]
     least = 0.0
     for i in range(n):
@@ -253,8 +254,8 @@ def _inside(M, x, lam, form, core):
 
 @njit(cache=True)
 def _speed(M, x, lam, direction, form, core):
-    """Frobenius norm of d (F, X) / d lambda along the path, in the metric of F and X: at least the largest eigenvalue,
-    whose inverse is the way to the boundary."""
+    """Frobenius norm of d (F, X) / d lambda along the path, in the metric of F and X. It is an upper bound of the
+    largest eigenvalue, whose inverse is the distance to the boundary."""
     K, moved = _matrix(x, form, lam), _matrix(direction, form, lam)
     for e in range(form.row.size):
         if form.on_level[e]:
@@ -269,11 +270,11 @@ def _speed(M, x, lam, direction, form, core):
 
 @njit(cache=True)
 def follow_path(M, theta, lam, floor, form, core, trace, is_g, tolerance, settings):
-    """Scalings theta (B, p) and levels lam (B,), moved in place along the path of centres down to the least level or to
-    `floor` (B,); feasible with each other.
+    """Move scalings theta (B, p) and levels lam (B,) in place along the path of centres down to the minimum level or to
+    `floor` (B,); each pair remains feasible.
 
-    M (B, n_shared, n_z, n_w) complex; form and core are Entries of F and X. Ends where the way to the boundary is below
-    `tolerance` lambda; where a positive floor is reached, at its centre.
+    M (B, n_shared, n_z, n_w) complex; form and core are Entries of F and X. Ends when the distance to the boundary is
+    below `tolerance` lambda, or at the analytic centre when a positive floor is reached.
     """
     for b in range(M.shape[0]):
         x = theta[b].copy()
@@ -281,7 +282,7 @@ def follow_path(M, theta, lam, floor, form, core, trace, is_g, tolerance, settin
             at = lam[b]
             direction = _to_centre(M[b], x, at, form, core, trace, is_g, settings)
             if not np.all(np.isfinite(direction)) or not _inside(M[b], x, at, form, core):
-                # Round-off ended the path here; the last verified point stands.
+                # Round-off ends the path here; the last verified point is kept.
                 break
             theta[b] = x
             if floor[b] > 0 and at <= floor[b]:

@@ -1,15 +1,15 @@
 """Convex upper bound of the structured singular value, for many frequencies at once.
 
-For w = Delta z, z = M w with ||Delta|| <= 1/beta no loop exists if scalings that commute with Delta satisfy
+w = Delta z, z = M w has only the zero solution for all ||Delta|| <= 1/beta if scalings that commute with Delta satisfy
 
     F(X, G, lambda) = lambda X_w - M^H X_z M - j (G M - M^H G^H) > 0,   X > 0,   lambda = beta^2
 
-(Fan, Tits and Doyle, IEEE TAC 36, 1991). X_z and X_w carry the same numbers on both sides of a block, G
-lives on real blocks. The least lambda is a generalized eigenvalue problem, solved here by following the
-analytic centres of {F > 0, X > 0} as lambda falls (Boyd and El Ghaoui, Linear Algebra and its
-Applications 188/189, 1993), with a tangent step in lambda between the Newton steps (compiled, see `mu_kernel`).
+(Fan, Tits and Doyle, IEEE TAC 36, 1991). X_z and X_w have the same parameters on the two sides of a block; G is
+non-zero on real blocks only. The minimum lambda is a generalized eigenvalue problem, solved here by following the
+analytic centres of {F > 0, X > 0} as lambda decreases (Boyd and El Ghaoui, Linear Algebra and its Applications
+188/189, 1993), with a tangent step in lambda between the Newton steps (compiled, see `mu_kernel`).
 
-Several matrices may share one set of scalings (axis 1 of M): their bound then holds for all of them.
+Several matrices may share one set of scalings (axis 1 of M); the bound is then valid for all of them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = np.ndarray
 
 
 class Scalings(NamedTuple):
-    """X_z (B, n_z, n_z), X_w (B, n_w, n_w), G (B, n_w, n_z): one set for each problem of a batch."""
+    """X_z (B, n_z, n_z), X_w (B, n_w, n_w), G (B, n_w, n_z): one set per problem of a batch."""
 
     X_z: Array
     X_w: Array
@@ -34,10 +34,10 @@ class Scalings(NamedTuple):
 
 
 class LinearForm:
-    """A Hermitian matrix linear in real parameters, K(theta) = sum_k theta_k K_k, by its non-zero entries."""
+    """Hermitian matrix linear in real parameters, K(theta) = sum_k theta_k K_k, stored by its non-zero entries."""
 
     def __init__(self, size: int, parameters: int, entries: list[tuple[int, int, complex, int]]):
-        order = sorted(entries, key=lambda entry: entry[3])  # the compiled code relies on it
+        order = sorted(entries, key=lambda entry: entry[3])  # the compiled code relies on this order
         self.size, self.parameters = size, parameters
         self.row = np.array([e[0] for e in order], int)
         self.col = np.array([e[1] for e in order], int)
@@ -58,7 +58,7 @@ class LinearForm:
         return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
 
     def entries(self, on_level: Array) -> Entries:
-        """The entries as the compiled code takes them; `on_level` marks those that lambda multiplies."""
+        """The entries in the form of the compiled code; `on_level` marks the entries multiplied by lambda."""
         return Entries(self.row, self.col, self.value, self.parameter, on_level, self.size)
 
 
@@ -66,8 +66,8 @@ class LinearForm:
 class ScalingSpace:
     """Real coordinates theta of the scalings that commute with a block structure.
 
-    `level` marks the entries of w whose X_w is multiplied by lambda: all of them for mu, the performance
-    channel alone for the worst-case gain (skewed mu).
+    `level` marks the entries of w whose X_w is multiplied by lambda: all entries for mu, only the performance channel
+    for the worst-case gain (skewed mu).
     """
 
     structure: BlockStructure
@@ -143,7 +143,7 @@ def dagger(A: Array) -> Array:
 
 
 def residual(M: Array, scalings: Scalings, lam: Array, level: Array) -> Array:
-    """F (B, n_shared, n_w, n_w) for M (B, n_shared, n_z, n_w), lam (B,): positive definite where the bound holds."""
+    """F (B, n_shared, n_w, n_w) for M (B, n_shared, n_z, n_w), lam (B,): positive definite if the bound is proved."""
     Mh = dagger(M)
     GM = scalings.G[:, None] @ M
     weight = np.where(level, lam[:, None], 1.0)
@@ -152,7 +152,7 @@ def residual(M: Array, scalings: Scalings, lam: Array, level: Array) -> Array:
 
 
 def least_level(M: Array, scalings: Scalings, level: Array) -> Array:
-    """Least lambda (B,) for which given scalings make F >= 0, by an eigenvalue computation; inf where none does."""
+    """Minimum lambda (B,) for which the scalings make F >= 0, by an eigenvalue computation; inf if there is none."""
     F = residual(M, scalings, np.zeros(M.shape[0]), level)
     p, r = np.flatnonzero(level), np.flatnonzero(~level)
     Fpp = F[..., p[:, None], p]
@@ -169,10 +169,10 @@ def least_level(M: Array, scalings: Scalings, level: Array) -> Array:
 
 def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5
            ) -> tuple[Array, Array]:
-    """Follow the analytic centres from a feasible (theta, lam) down to the least lambda, or to `goal`.
+    """Follow the analytic centres from a feasible (theta, lam) down to the minimum lambda, or to `goal`.
 
-    M (B, n_shared, n_z, n_w). Returns theta (B, p) and lambda (B,), feasible with each other. Problems whose
-    lambda reaches a positive `goal` stop there, at its centre.
+    M (B, n_shared, n_z, n_w). Returns a feasible pair theta (B, p) and lambda (B,). Problems whose lambda reaches a
+    positive `goal` stop at the analytic centre there.
     """
     theta, lam = theta.copy(), lam.copy()
     floor = np.broadcast_to(np.asarray(goal, float), lam.shape).copy()

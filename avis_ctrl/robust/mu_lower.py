@@ -1,18 +1,18 @@
 """Lower bound of mu: perturbations that make I - M Delta singular, found by repeated linearisation.
 
-An eigenvalue of M Delta is followed to 1. To first order it is linear in Delta,
+An eigenvalue of M Delta is moved to 1. To first order it is linear in Delta,
 
     lambda(Delta) = y^H M Delta x / (y^H x) = sum_real g_i delta_i + sum_complex g_i delta_i
                     + sum_full a_k^H Delta_k x_k / (y^H x),           a = M^H y,
 
-and the Delta of least norm k that makes this 1 is known in closed form: with the multiplier 1 + j t,
+and the Delta of minimum norm k that makes it 1 is known in closed form: with the multiplier 1 + j t,
 
     1/k = min over t of  sum_real |Re g_i + t Im g_i| + C sqrt(1 + t^2),
     C   = sum_complex |g_i| + sum_full |a_k| |x_k| / |y^H x|,
 
-convex in t with kinks where a real delta leaves its bound. For complex blocks alone this is the power
+which is convex in t, with kinks where a real delta leaves its bound. For complex blocks alone this is the power
 iteration of Packard, Fan and Doyle (Proc. 27th CDC, 1988); for real blocks alone it is Newton's method on
-det(I - M Delta) = 0 with the least ||Delta||. Starts come from the null vectors of the upper bound's LMI.
+det(I - M Delta) = 0 with minimum ||Delta||. The initial Delta come from the null vectors of the upper bound's LMI.
 """
 
 from __future__ import annotations
@@ -31,21 +31,22 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True)
 class MuLowerSettings:
-    """singular : I - M Delta counts as singular if its smallest singular value is below this plus the round-off of
-        M Delta: an error of this size in Delta changes no digit of mu that is printed.
+    """singular : I - M Delta counts as singular if its smallest singular value is below this value plus the round-off
+        of M Delta: an error of this size in Delta changes no printed digit of mu.
     meaningless : round-off of M Delta above which a small singular value proves nothing, and I - M Delta never counts
         as singular.
-    eigenvalue : distance from 1 of the nearest eigenvalue of M Delta, up to which I - M Delta counts as singular. Where
-        M Delta is far from normal, a small singular value alone proves nothing: I - d J of a nilpotent J has the
-        determinant 1 for every d, but a smallest singular value that falls as a power of 1/d. Dividing Delta by the
-        eigenvalue makes I - M Delta singular, so this is the relative error of the bound, one in the printed digits.
-    round_off : a lower bound of a peak relative to the largest gain of N at any frequency, up to which it is given as
-        zero: half the sample rate of a sampled N is where its terms cancel, and leave round-off of that gain.
-    few, many : starts of a first and of a thorough search over complex blocks, from null vectors of the upper bound's
-        LMI and mixtures of the three least: with 16 scalars, six reach on average what fifteen undamped ones do.
-    sweeps : most steps from one start; settled : relative change of ||Delta|| that ends it before, its square that ends
-        the best one, which is continued.
-    damping : weight of the last Delta in the next one. Without it the iteration runs in cycles where mu is reached by
+    eigenvalue : maximum distance from 1 of the nearest eigenvalue of M Delta at which I - M Delta counts as singular.
+        If M Delta is far from normal, a small singular value alone proves nothing: for a nilpotent J, I - d J has
+        determinant 1 for every d, but its smallest singular value decreases as a power of 1/d. Dividing Delta by the
+        eigenvalue makes I - M Delta singular, so that this value is the relative error of the bound: one unit in the
+        last printed digit.
+    round_off : a lower bound of a peak is set to zero up to this fraction of the largest gain of N at any frequency. At
+        the Nyquist frequency the terms of a sampled N cancel, and only round-off of that gain remains.
+    few, many : number of starts of a quick and of a thorough search over complex blocks, from null vectors of the upper
+        bound's LMI and mixtures of the best three. With 16 scalars, six do on average as well as 15 without damping.
+    sweeps : maximum number of steps from one start; settled : relative change of ||Delta|| that ends it earlier. The
+        best start is continued until the change is below the square of `settled`.
+    damping : weight of the last Delta in the next Delta. Without damping the iteration cycles if mu is attained by
         several eigenvalues, and ends 1 % lower with 16 scalars.
     """
 
@@ -64,17 +65,17 @@ SETTINGS = MuLowerSettings()
 
 
 class _Step(NamedTuple):
-    """Least-norm solution of the linearised equation."""
+    """Minimum-norm solution of the linearised equation."""
 
     k: Array  # (B,) norm of Delta
-    phase: Array  # (B,) unit complex number that complex blocks are turned to
+    phase: Array  # (B,) unit complex number, the common phase of the complex blocks
     real: Array  # (B, m) values of the real scalars
 
 
 def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
-    """min ||Delta|| so that the linearised eigenvalue is 1; g (B, m) of the real scalars, C (B,) of the others.
+    """Minimum ||Delta|| for a linearised eigenvalue of 1; g (B, m) of the real scalars, C (B,) of the other blocks.
 
-    `t_fixed` (B,) prescribes the multiplier (a free frequency does); the imaginary part is then left to it.
+    `t_fixed` (B,) prescribes the multiplier if the frequency is free; the frequency then zeroes the imaginary part.
     """
     a, b = g.real, g.imag
     batch, m = g.shape
@@ -98,7 +99,7 @@ def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
         slope = np.sum(np.sign(a[:, None] + middle[..., None] * b[:, None]) * b[:, None], axis=2)
         inner = np.maximum(C[:, None] ** 2 - slope ** 2, 0.0)
         flat = np.where(inner > 0, -slope / np.sqrt(np.maximum(inner, 1e-300)), 0.0)
-        # Kinks first: where an interval's own minimum is clipped to its end, the kink is what is meant.
+        # Kinks come first: an interval minimum that is clipped to the end of the interval means the kink.
         t = np.concatenate([sorted_kinks, np.clip(flat, low, high), np.zeros((batch, 1))], axis=1)
         owner = np.where(np.take_along_axis(bends, order, axis=1), order, -1)
         kink = np.concatenate([owner, np.full((batch, m + 2), -1)], axis=1)
@@ -134,7 +135,7 @@ def _eigenpair(A: Array, near: Array, rng: np.random.Generator) -> tuple[Array, 
 
 
 def _inverse(B: Array) -> Array:
-    """Inverse of each matrix, of its nearest regular neighbour where a pivot vanishes."""
+    """Inverse of each matrix, or of the nearest regular matrix if a pivot vanishes."""
     try:
         return np.linalg.inv(B)
     except np.linalg.LinAlgError:
@@ -144,7 +145,7 @@ def _inverse(B: Array) -> Array:
 
 
 class Linearised(NamedTuple):
-    """The next Delta, the norm predicted for it, and the move of a free frequency (0 where it is fixed)."""
+    """The next Delta, its predicted norm, and the step of a free frequency (0 if it is fixed)."""
 
     delta: Array
     k: Array
@@ -153,7 +154,7 @@ class Linearised(NamedTuple):
 
 def next_delta(M: Array, delta: Array, structure: BlockStructure, rng: np.random.Generator, near: Array,
                slope: Array | None = None) -> Linearised:
-    """One step: M (B, n_z, n_w), delta (B, n_w, n_z). `slope` dM/d omega frees the frequency as well."""
+    """One step: M (B, n_z, n_w), delta (B, n_w, n_z). With `slope` dM/d omega the frequency is free, too."""
     x, y = _eigenpair(M @ delta, near, rng)
     e = np.sum(np.conj(y) * x, axis=1)
     e = np.where(np.abs(e) < 1e-12, 1e-12, e)
@@ -170,7 +171,7 @@ def next_delta(M: Array, delta: Array, structure: BlockStructure, rng: np.random
     q = None
     if slope is not None:
         q = np.einsum("bi,bij,bjk,bk->b", np.conj(y), slope, delta, x) / e
-        # The multiplier must be orthogonal to what the frequency can do by itself.
+        # The multiplier must be orthogonal to the effect of the frequency.
         across = 1j * q * np.where(q.imag > 0, -1.0, 1.0)
         t_fixed = across.imag / np.maximum(across.real, 1e-9 * np.abs(q) + 1e-300)
         step = _least_norm(g_real, C, t_fixed)
@@ -205,7 +206,7 @@ def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
     """Whether I - M Delta is singular (B,): smallest singular value below 1e-9 plus the round-off of M Delta, and an
     eigenvalue of M Delta within 1e-6 of 1.
 
-    Judged on the balanced M, which has the same determinant: a badly scaled M looks singular to any Delta.
+    The balanced M is tested, which gives the same determinant; a badly scaled M appears singular for any Delta.
     """
     if not M.shape[0]:
         return np.zeros(0, bool)
@@ -231,10 +232,10 @@ def _complex_part(structure: BlockStructure) -> Array:
 
 
 def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
-    """Delta with its complex blocks turned and scaled together so that I - M Delta is exactly singular.
+    """Delta with its complex blocks multiplied by a common complex factor so that I - M Delta is exactly singular.
 
-    Where there are none, the real ones are scaled (exact at frequencies where M Delta has a real eigenvalue).
-    Entries become inf where it is impossible.
+    Without complex blocks, the real blocks are scaled (exact at frequencies where M Delta has a real eigenvalue).
+    Entries are inf if this is impossible.
     """
     mask = _complex_part(structure)
     n_z = structure.n_z
@@ -257,14 +258,14 @@ def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 
 def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
            rng: np.random.Generator) -> Array:
-    """First perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
+    """Initial perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
     return np.stack([_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None]
                      for w in null_vectors(M, scalings, beta, structure, count, rng)])
 
 
 def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
                  rng: np.random.Generator) -> Array:
-    """Vectors w (count, B, n_w) that the upper bound's LMI nearly annuls: the three least, then mixtures of them."""
+    """Approximate null vectors w (count, B, n_w) of the upper bound's LMI: the best three, then random mixtures."""
     batch = M.shape[0]
     F = residual(M[:, None], scalings, beta ** 2, np.ones(structure.n_w, bool))[:, 0]
     values, vectors = np.linalg.eigh(scalings.X_w)
@@ -280,7 +281,7 @@ def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStru
 
 
 def _aligned(w: Array, z: Array, structure: BlockStructure) -> Array:
-    """Delta of norm 1 that comes nearest to w = Delta z, block by block."""
+    """Delta of norm 1 that best satisfies w = Delta z, block by block."""
     delta = np.zeros((w.shape[0], structure.n_w, structure.n_z), complex)
     for block, iw, iz in structure.slices():
         wk, zk = w[:, iw], z[:, iz]
@@ -306,26 +307,26 @@ class LowerBound(NamedTuple):
 
 def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, *, enough: float = 0.99,
                 stages: int = 3, seed: int = 0) -> LowerBound:
-    """Best verified perturbation for each M (B, n_z, n_w), from starts at the null vectors of the upper bound.
+    """Best verified perturbation for each M (B, n_z, n_w), starting from the null vectors of the upper bound's LMI.
 
-    Where three starts do not reach `enough` times the upper bound, more are made in further `stages`, with shorter
-    steps too.
+    If the first three starts do not reach `enough` times the upper bound, further `stages` use more starts, the last
+    stage with damping. Structures without real blocks use the compiled search first.
     """
     rng = np.random.default_rng(seed)
     batch = M.shape[0]
-    # Scalings of one number a block commute with every Delta: the search runs on the balanced M.
+    # Scalings of one number per block commute with every Delta: the search uses the balanced M.
     d_z, d_w = expand(structure, block_balance(M[:, None], structure))
     M = M * d_z[:, :, None] / d_w[:, None, :]
     scalings = rescaled(scalings, 1 / d_z, 1 / d_w, np.ones(batch))
     best = LowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
-    # An upper bound that is round-off of M means mu = 0: nothing to search for.
+    # An upper bound at the level of the round-off of M means mu = 0: no search.
     above_noise = upper > 1e-10 * np.linalg.norm(M, ord=2, axis=(1, 2))
     if all(block.kind != "real" for block in structure.blocks):
         live = np.flatnonzero(above_noise)
         if live.size:
             _search_complex(best, M, structure, upper, scalings, live, enough,
                             SETTINGS.few if stages == 1 else SETTINGS.many, rng)
-        # What was found but not verified goes the slower way.
+        # Matrices without a verified perturbation go on to the slower search.
         above_noise &= best.beta == 0.0
     for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5))[:stages]:
         live = np.flatnonzero(above_noise & (best.beta < enough * upper))
@@ -336,7 +337,7 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Sca
 
 def _search_complex(best: LowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: Scalings,
                     live: Array, enough: float, count: int, rng: np.random.Generator) -> None:
-    """The compiled search, for blocks none of which is real."""
+    """The compiled search, for structures without real blocks."""
     size = upper[live]
     unit = M[live] / size[:, None, None]
     part = Scalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live])
@@ -346,7 +347,7 @@ def _search_complex(best: LowerBound, M: Array, structure: BlockStructure, upper
     unit = np.ascontiguousarray(unit)
     value, found, vector = search_complex(unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough,
                                           SETTINGS.settled)
-    # The best one to its end.
+    # Continue from the best start to convergence.
     further, settled, _ = search_complex(unit, vector[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf,
                                          SETTINGS.settled ** 2)
     _keep(best, live, size, unit, np.where((further > value)[:, None, None], settled, found), structure)
@@ -368,7 +369,7 @@ def _search(best: LowerBound, M: Array, structure: BlockStructure, upper: Array,
 
 def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
           structure: BlockStructure) -> None:
-    """Enter into `best` what is verified and better."""
+    """Update `best` with perturbations that are verified and better."""
     exact = made_singular(unit, delta, structure)
     for candidate in (exact, delta) if not np.any(_complex_part(structure)) else (exact,):
         finite = np.all(np.isfinite(candidate), axis=(1, 2))
@@ -377,7 +378,7 @@ def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
         good = finite & (norm > 0)
         good[good] &= _balanced_is_singular(unit[good], candidate[good])
         value = np.where(good, size / np.where(good, norm, 1.0), 0.0)
-        # unit is M over its upper bound: what exceeds that is round-off that passed for singular.
+        # unit is M over its upper bound: a value above the bound is round-off that passed the singularity test.
         better = (value > best.beta[live]) & (value <= size * (1 + 1e-6))
         best.beta[live[better]] = value[better]
         best.delta[live[better]] = candidate[better] / size[better, None, None]
@@ -385,9 +386,9 @@ def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
 
 def singular_frequency(N: StateSpace, structure: BlockStructure, near: Array, level: float, band: tuple[float, float],
                        *, count: int = 6, iterations: int = 40, seed: int = 2) -> tuple[float, float, Array] | None:
-    """A small Delta and the frequency at which it makes I - N Delta singular, both free: (beta, omega, delta).
+    """A small Delta that makes I - N Delta singular, and the frequency, also free: (beta, omega, delta); None if none.
 
-    For real perturbations, whose critical frequency is a point that no grid meets. `near` (n,) are starts [rad/s].
+    For real perturbations, whose critical frequency is in general not on a grid. `near` (n,) : initial values [rad/s].
     """
     rng = np.random.default_rng(seed)
     omega = np.repeat(near[np.isfinite(near) & (near > 0)], count)

@@ -1,11 +1,11 @@
-"""Peak over all frequencies of the structured singular value, and of the gain under the worst perturbation.
+"""Peak over frequency of the structured singular value, and of the worst-case gain.
 
              Delta <--.
         w |           | z          mu_peak:          sup over omega of mu(N(j omega))
           '--> [ N ] -'            worst_case_gain:  sup over omega and ||Delta|| <= 1 of
         d ---> [   ] ---> e                          sigma_max of the map from d to e
 
-The upper bound is proved between the frequencies computed (see `mu_cover`), or the result says that it is not.
+The upper bound is also proved between the computed frequencies (see `mu_cover`), or the result states that it is not.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
 @dataclass(frozen=True)
 class CurveSettings:
-    """points : frequencies of a curve whose bounds take long, evenly chosen: enough for a plot.
-    highest : in addition those of so many highest values, from which the peak is refined.
+    """points : number of evenly chosen frequencies of a curve if its bounds take long: enough for a plot.
+    highest : number of highest values whose frequencies are added; the peak is refined from these.
     """
 
     points: int = 40
@@ -52,11 +52,11 @@ CURVES = CurveSettings()
 class MuPeak(Shown):
     """Bounds of a supremum over frequency.
 
-    upper : never exceeded in the band if `guaranteed`; else proved at the frequencies computed only.
-    lower : reached at `omega` [rad/s] by `delta`.
+    upper : never exceeded in the band if `guaranteed`; otherwise proved at the computed frequencies only.
+    lower : attained at `omega` [rad/s] by `delta`.
     delta : (n_w, n_z). For mu_peak ||delta|| = 1/lower and I - N(j omega) delta is singular; for worst_case_gain
-        (first blocks only) ||delta|| <= 1. None where there is none (lower 0).
-    covers : in words, what the upper bound covers.
+        (without the performance block) ||delta|| <= 1. None if none was found (lower 0).
+    covers : description of the range where the upper bound is proved.
     frequencies, upper_curve, lower_curve : (n,) [rad/s] and both bounds there, for plotting; about 40 frequencies with
         many blocks.
     """
@@ -73,7 +73,7 @@ class MuPeak(Shown):
 
 
 class Stability(Protocol):
-    """Bounds of mu of the blocks alone: a `MuPeak`, or what a caller keeps of one."""
+    """Bounds of mu of the blocks without performance: a `MuPeak`, or the part of it that a caller keeps."""
 
     @property
     def upper(self) -> float: ...
@@ -87,7 +87,7 @@ class Stability(Protocol):
     def delta(self) -> Array | None: ...
 
 
-# What a search finds at some frequencies: bounds with their proofs.
+# Result of a search at some frequencies: bounds with their proofs.
 Found = TypeVar("Found", UpperBound, WorstGain)
 
 
@@ -100,14 +100,14 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     N : stable system (avis_ctrl or python-control) with sum(cols) outputs z and sum(rows) inputs w.
     band : (low, high) in rad/s; the Nyquist frequency replaces infinity for sampled systems.
     known_upper : a bound that the caller has proved for the whole band, such as the measured norm of the loop scaled
-        by a realised D(s); if it is within 0.5 % of the peak found, it is used as the upper bound.
-    slack : fraction by which the level to be proved lies above the highest value found; a larger one needs fewer
-        intervals. Where mu is flat over frequency, a larger fraction is needed (see `mu_cover`).
+        by a realised D(s); it is used as the upper bound if it is within 0.5 % of the level to be proved.
+    slack : relative amount by which the level to be proved exceeds the highest value found; a larger slack needs fewer
+        intervals. If mu is flat over frequency, the level is raised further (see `mu_cover`).
 
     Raises
     ------
     InputError : blocks that do not fit N, an empty band, a slack outside 1e-5 to 0.1.
-    ComputationError : N has a pole that is not stable (named): mu is not defined for such a loop.
+    ComputationError : N has an unstable pole (named): mu is not defined for such a loop.
 
     Examples
     --------
@@ -137,17 +137,17 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     Parameters
     ----------
     N : stable system; the first sum(cols) outputs and sum(rows) inputs belong to the blocks, the rest are e and d.
-    band : (low, high) in rad/s. The gain is that in the band; robust stability is asked at all frequencies.
+    band : (low, high) in rad/s, for the gain; robust stability is required at all frequencies.
     slack : as for mu_peak.
-    robust : bounds of `mu_peak` for the blocks' own channels at all frequencies, if known; computed otherwise.
-    points : frequencies of the two curves, beside those of the highest gains; fewer take less time.
+    robust : bounds of `mu_peak` for the channels of the blocks at all frequencies, if known; otherwise computed.
+    points : number of frequencies of the two curves, in addition to those of the highest gains; fewer take less time.
 
-    upper is inf where robust stability is not proved; lower is inf where `delta` (norm at most 1) destabilises.
+    upper is inf if robust stability is not proved; lower is inf if `delta` (norm at most 1) destabilises the loop.
 
     Raises
     ------
-    InputError : blocks that leave no performance channel, an empty band, a slack outside 1e-5 to 0.1.
-    ComputationError : N has a pole that is not stable (named).
+    InputError : no performance channel besides the blocks, an empty band, a slack outside 1e-5 to 0.1.
+    ComputationError : N has an unstable pole (named).
     """
     system, structure = _checked(N, blocks, slack)
     n_d, n_e = system.ninputs - structure.n_w, system.noutputs - structure.n_z
@@ -161,17 +161,17 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
             found = _worst_case_gain(part.N, part.structure, inside, slack, system.dt, robust, points)
             return _in_rad_s(system, part, found)
         found = _destabilised(part.N, part.structure, robust, first_frequencies(part.N, inside))
-        # Frequency and perturbation of `robust` are those of the whole system already.
+        # Frequency and perturbation of `robust` already refer to the whole system.
         return replace(_in_rad_s(system, part, replace(found, delta=None)), omega=robust.omega, delta=robust.delta)
 
 
 def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> MuPeak:
-    """Bounds of mu at all frequencies, no closer than it takes to prove robust stability: with mu < 1 the upper bound
-    is just below 1, and there is no lower one. For several `worst_case_gain` of one loop.
+    """Bounds of mu at all frequencies, only as tight as needed to prove robust stability: if mu < 1, the upper bound is
+    just below 1, and there is no lower bound. For several calls of `worst_case_gain` with one loop.
 
     Raises
     ------
-    InputError, ComputationError : as mu_peak.
+    InputError, ComputationError : as in mu_peak.
     """
     system, structure = _checked(N, blocks, SLACK)
     with one_thread():
@@ -200,7 +200,7 @@ def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
 
 
 def _prepared(N: StateSpace, structure: BlockStructure) -> Coupled:
-    """The blocks that matter with a balanced continuous-time system."""
+    """The blocks that are part of a loop, with a balanced continuous-time system."""
     part = coupled(N, structure)
     return replace(part, N=balance(continuous_image(part.N)))
 
@@ -216,7 +216,7 @@ def _continuous_band(N: StateSpace, band: Interval) -> Interval:
 
 
 def _in_rad_s(N: StateSpace, part: Coupled, result: MuPeak) -> MuPeak:
-    """Delta of all blocks, and frequencies of the bilinear image of a sampled system turned back into its own."""
+    """The result with Delta of all blocks, and with frequencies of the bilinear image mapped to those of N."""
     result = replace(result, delta=part.restored(result.delta))
     return replace(result, omega=float(sampled_frequency(result.omega, N.dt)),
                    frequencies=np.asarray(sampled_frequency(result.frequencies, N.dt)))
@@ -224,7 +224,7 @@ def _in_rad_s(N: StateSpace, part: Coupled, result: MuPeak) -> MuPeak:
 
 @dataclass
 class _Scan:
-    """Upper bounds with their scalings at the frequencies looked at."""
+    """Upper bounds with their scalings at the computed frequencies."""
 
     omega: Array
     bound: UpperBound
@@ -237,8 +237,8 @@ class _Scan:
         return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
 
     def shown(self, structure: BlockStructure) -> _Scan:
-        """What the curves show: with many blocks, whose lower bounds take long, only some frequencies, those of the
-        highest values among them."""
+        """The part for the curves: with many blocks, whose lower bounds take long, only some of the frequencies,
+        including those of the highest values."""
         if not structure.many:
             return self
         kept = _thinned(self.bound.beta, CURVES.points)
@@ -246,7 +246,7 @@ class _Scan:
 
     @property
     def peak(self) -> Array:
-        """The frequency of the highest value, the first place to split the band, as an array."""
+        """The frequency of the highest value as an array; the band is first split there."""
         return self.omega[[int(np.argmax(self.bound.beta))]]
 
     @property
@@ -255,9 +255,9 @@ class _Scan:
 
 
 def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array], Found]) -> tuple[Array, list[Found]]:
-    """Frequencies (n,) in the order of a search for the highest values, and what look(M) found at them, part by part.
+    """Frequencies (n,) in the order of a search for the highest values, and the results of look(M) there, in batches.
 
-    look : of responses M (m, n_out, n_in) what begins with the values (m,).
+    look : function of responses M (m, n_out, n_in); the first item of its result are the values (m,).
     """
     seen: list[tuple[Array, Found]] = []
 
@@ -271,23 +271,23 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
 
 
 def _thinned(values: Array, most: int) -> Array:
-    """Indices of at most `most` values, evenly spaced, and of the largest ones."""
+    """Indices of at most `most` evenly spaced values, and of the largest values."""
     even = np.linspace(0, values.size - 1, min(most, values.size)).round().astype(int)
     return np.union1d(even, np.argsort(values)[-CURVES.highest:])
 
 
 def _level(bounds: Array, slack: float) -> float:
-    """The level to prove, above the highest bound found."""
-    # A level of zero proves nothing: a small positive one lets an identically vanishing mu be covered.
+    """The level to be proved, above the highest bound found."""
+    # A level of zero cannot be proved; a small positive level allows a cover if mu vanishes identically.
     return max(float(np.max(bounds)) * (1 + slack), 1e-9)
 
 
 def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: float,
              known_upper: float | None = None, dt: float = 0.0) -> MuPeak:
-    """mu_peak of a continuous system, or of the image of one sampled at dt."""
+    """mu_peak of a continuous system, or of the image of a system sampled at dt."""
     accuracy = accuracy_of(slack)
     scan = _Scan.of(N, structure, band, slack).shown(structure)
-    # One stage draws the curve; the search goes on at the peaks only.
+    # One stage is enough for the curve; the search continues at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
     if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
         done = Cover(known_upper)
@@ -295,7 +295,7 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
         done = _cover_mu(N, structure, scan.level, band, scan.peak, accuracy, slack)
     best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
     if best > done.level:
-        # mu of real blocks can jump at a single frequency that no grid contains; the search for it found one.
+        # mu of real blocks can jump at a single frequency outside any grid; the search with free frequency found one.
         done = _cover_mu(N, structure, best * (1 + slack), band, np.array([at]), accuracy, slack)
     if best == 0.0:
         at = float(scan.peak[0])
@@ -305,14 +305,14 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
 
 def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, band: Interval, first: Array, accuracy: float,
               slack: float) -> Cover:
-    """Intervals on which constant scalings prove mu below a level, from the frequencies `first` (n,) on."""
+    """Intervals on which constant scalings prove mu below a level; the band is first split at `first` (n,)."""
     return cover(N, structure, lambda system, level: system.scaled(left=1 / level),
                  lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
 
 
 def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,
                    done: Cover, band: Interval) -> tuple[float, float, Array | None]:
-    """Largest verified lower bound: harder search at the highest peaks, with a free frequency for real blocks."""
+    """Largest verified lower bound: thorough search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))
     M = N.frequency_response(omega[top])
     hard = lower_bound(M, structure, *found.at(top), enough=0.995, seed=1)
@@ -331,7 +331,7 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
 
 def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float,
                      known: Stability | None, points: int) -> MuPeak:
-    """worst_case_gain of a continuous system, or of the image of one sampled at dt."""
+    """worst_case_gain of a continuous system, or of the image of a system sampled at dt."""
     accuracy = accuracy_of(slack)
     n_z, n_w = structure.n_z, structure.n_w
     n_e = N.noutputs - n_z
@@ -340,7 +340,7 @@ def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, s
     def scaled(system: StateSpace, level: float) -> StateSpace:
         return system.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
 
-    # Lower bounds are cheap and close: they say where the upper ones are worth computing.
+    # Lower bounds are cheap and tight: they show where upper bounds are worth computing.
     reached = _Reached.of(N, structure, band, slack)
     shown = reached.thinned(points)
     upper = skewed_upper_bound(N.frequency_response(shown.omega)[:, None], whole, accuracy).beta
@@ -364,7 +364,7 @@ def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, s
 
 @dataclass(frozen=True)
 class _Reached:
-    """Worst gains that were reached (n,), by which perturbations (n, n_w, n_z)."""
+    """Lower bounds of the worst-case gain (n,), and the perturbations (n, n_w, n_z) that attain them."""
 
     omega: Array
     gain: Array
@@ -378,20 +378,20 @@ class _Reached:
         return _Reached(omega[order], gain, delta)
 
     def thinned(self, most: int) -> _Reached:
-        """At most so many frequencies, evenly chosen, and those of the highest gains."""
+        """At most `most` evenly chosen frequencies, and those of the highest gains."""
         kept = _thinned(self.gain, most)
         return _Reached(self.omega[kept], self.gain[kept], self.delta[kept])
 
 
 def _destabilised(N: StateSpace, structure: BlockStructure, robust: Stability, omega: Array) -> MuPeak:
-    """The result where a perturbation of norm at most 1 makes the loop unstable: no gain is bounded."""
+    """The result if a perturbation of norm at most 1 makes the loop unstable: the worst-case gain is infinite."""
     gain, _ = _gain_of_stable(N.frequency_response(omega), structure, robust)
     return MuPeak(np.inf, np.inf, robust.omega, robust.delta, True,
                   "a perturbation of norm at most 1 makes the loop unstable", omega, np.full(omega.size, np.inf), gain)
 
 
 def _gain_of_stable(M: Array, structure: BlockStructure, robust: Stability) -> tuple[Array, Array]:
-    """Gains (n,) and perturbations (n, n_w, n_z) at each frequency, of those that provably keep the loop stable."""
+    """Worst gains (n,) and perturbations (n, n_w, n_z) at each frequency, of a norm that keeps the loop stable."""
     radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
     n_z = structure.n_z
     found = worst_gain(M * np.r_[np.full(n_z, radius), np.ones(M.shape[1] - n_z)][:, None], structure)
@@ -399,7 +399,7 @@ def _gain_of_stable(M: Array, structure: BlockStructure, robust: Stability) -> t
 
 
 def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -> bool:
-    """Whether mu < 1 is proved at all frequencies; a cover of all of them with performance proves it on its own."""
+    """Whether mu < 1 is proved at all frequencies; a cover of all frequencies with performance implies it."""
     if band == ALL_FREQUENCIES:
         return True
     done = _stable_cover(N, structure)
@@ -407,13 +407,13 @@ def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -
 
 
 def _stable_cover(N: StateSpace, structure: BlockStructure) -> Cover:
-    """All frequencies covered at a level just below 1, or the attempt."""
+    """Cover of all frequencies at a level just below 1, if it exists; otherwise with gaps or a higher level."""
     first = first_frequencies(N, ALL_FREQUENCIES, 0)
     return _cover_mu(N, structure, 1.0 - 1e-6, ALL_FREQUENCIES, first, accuracy=1e-4, slack=0.0)
 
 
 def _in_words(done: Cover, band: Interval, dt: float) -> str:
-    """What was proved; frequencies of the image of a system sampled at dt in those of the system."""
+    """Description of what was proved, in frequencies of the system (sampled at dt), not of its image."""
     end = "half the sample rate" if dt else "infinity"
     low, high = sampled_frequency(band[0], dt), sampled_frequency(band[1], dt)
     span = f"all frequencies from 0 to {end}" if band == ALL_FREQUENCIES else f"{low:g} to {high:g} rad/s"

@@ -1,7 +1,8 @@
-"""The compiled search of `mu_lower` for complex blocks: repeated linearisation, one matrix after the other.
+"""Compiled search of `mu_lower` for complex blocks: repeated linearisation, one matrix at a time.
 
-An eigenvalue of M Delta near 1 with its eigenvectors x, y by inverse iteration; then the Delta of least norm that makes
-it 1 to first order, every block at that norm (the power iteration of Packard, Fan and Doyle, Proc. 27th CDC, 1988).
+Inverse iteration gives an eigenvalue of M Delta near 1 with its eigenvectors x, y. The next Delta has minimum norm and
+makes this eigenvalue 1 to first order; every block has that norm (the power iteration of Packard, Fan and Doyle, Proc.
+27th CDC, 1988).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ FULL = 1
 
 @njit(cache=True)
 def _factor(A, pivot):
-    """LU factors in place of A with row pivots; a pivot that vanishes becomes the round-off of its column."""
+    """LU factors in place of A with row pivoting; a vanishing pivot is replaced by 1e-15."""
     n = A.shape[0]
     for k in range(n):
         best = k
@@ -37,7 +38,7 @@ def _factor(A, pivot):
 
 @njit(cache=True)
 def _solve(A, pivot, x):
-    """x = inv(A) x from its factors, scaled to length one."""
+    """x = inv(A) x from the LU factors, normalised to unit length."""
     n = x.size
     for k in range(n):
         if pivot[k] != k:
@@ -54,7 +55,7 @@ def _solve(A, pivot, x):
 
 @njit(cache=True)
 def _solve_adjoint(A, pivot, y):
-    """y = inv(A^H) y from the factors of A, scaled to length one."""
+    """y = inv(A^H) y from the LU factors of A, normalised to unit length."""
     n = y.size
     for i in range(n):
         for k in range(i):
@@ -78,7 +79,7 @@ def _unit(x):
 
 @njit(cache=True)
 def _linearised(a, x, e, kinds, w, z, new):
-    """Fill `new` with the Delta of least norm k for which the eigenvalue is 1 to first order; k, inf where none is."""
+    """Fill `new` with the Delta of minimum norm k that makes the eigenvalue 1 to first order; return k, inf if none."""
     total = 0.0
     for b in range(kinds.size):
         if kinds[b] == FULL:
@@ -106,7 +107,7 @@ def _linearised(a, x, e, kinds, w, z, new):
 
 @njit(cache=True)
 def _aligned(v, u, kinds, w, z, delta):
-    """Fill `delta` with the Delta of norm 1 that comes nearest to v = Delta u, block by block."""
+    """Fill `delta` with the Delta of norm 1 that best satisfies v = Delta u, block by block."""
     delta[:] = 0.0
     for b in range(kinds.size):
         if kinds[b] == FULL:
@@ -123,11 +124,11 @@ def _aligned(v, u, kinds, w, z, delta):
 
 @njit(cache=True)
 def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled):
-    """The largest 1/||Delta|| (B,) found, its Delta (B, n_w, n_z) and Delta x (B, n_w), from starts w (count, B, n_w).
+    """The largest 1/||Delta|| (B,) found, its Delta (B, n_w, n_z) and Delta x (B, n_w), from starts (count, B, n_w).
 
-    M (B, n_z, n_w) in units of its upper bound; kinds (n_blocks,) FULL or not, w, z (n_blocks + 1,) where the blocks
-    begin. A start ends where the norm changes by less than `settled`, the matrix where `enough` is reached. Nothing is
-    verified here.
+    M (B, n_z, n_w) in units of its upper bound; kinds (n_blocks,) FULL or not; w, z (n_blocks + 1,) first indices of
+    the blocks. A start ends when the norm changes by less than `settled`, the search for a matrix when `enough` is
+    reached. The results are not verified here.
     """
     batch, n_z, n_w = M.shape
     value, found = np.zeros(batch), np.zeros((batch, n_w, n_z), np.complex128)
@@ -169,7 +170,7 @@ def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled)
                 if not np.isfinite(k):
                     break
                 if sweep > 0 and damping > 0:
-                    # Same norm after mixing, block by block at most.
+                    # Each block of the mixture has at most this norm.
                     norm = damping * norm + (1 - damping) * k
                     delta = damping * delta + (1 - damping) * new
                 else:

@@ -1,4 +1,4 @@
-"""A worst perturbation as a real stable system of constant norm that can be simulated."""
+"""Realisation of a worst-case perturbation as a stable real-rational system of constant norm, for simulation."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ REAL = 1e-7
 
 
 def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[Block], dt: float = 0.0) -> StateSpace:
-    """Stable real-rational Delta(s) with the block structure and Delta(j omega) = delta, all-pass up to its size.
+    """Stable real-rational Delta(s) with the block structure, constant norm and Delta(j omega) = delta.
 
     A complex number |d| e^{j theta} becomes +-|d| (s - a)/(s + a), a > 0 (Zhou, Doyle and Glover, 1996, proof of
-    theorem 9.1); a full block of rank one sigma u v^H has one such factor in every entry of u and of v. Real scalars
-    stay constant. Every block keeps its norm at all frequencies.
+    theorem 9.1). In a full block of rank one, sigma u v^H, every entry of u and v becomes such an all-pass factor. Real
+    scalars are constant. Every block has the same norm at all frequencies.
 
     Parameters
     ----------
-    delta : (n_w, n_z) with the structure; full blocks of rank one, as mu_peak and worst_case_gain return them.
-    omega : rad/s; at 0 and infinity (half the sample rate) only a real delta can be met.
-    dt : sample time [s] of the system that delta perturbs; 0 for a continuous one. A sampled delta is the image of a
-        continuous one under the bilinear map, which keeps its norm at all frequencies.
+    delta : (n_w, n_z) with the structure; full blocks of rank one, as returned by mu_peak and worst_case_gain.
+    omega : rad/s; at 0 and infinity (or the Nyquist frequency) only a real delta can be realised.
+    dt : sample time [s] of the perturbed system; 0 if continuous. A sampled Delta is the image of a continuous Delta
+        under the bilinear map, which preserves the norm at all frequencies.
 
     Raises
     ------
-    InputError : a delta without the structure.
+    InputError : delta does not have the block structure.
     ComputationError : a full block of higher rank, or a complex delta at frequency 0 or infinity.
     """
     structure = BlockStructure.of(blocks)
@@ -54,7 +54,7 @@ def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[
 
 
 def _all_pass(value: complex, omega: float) -> StateSpace:
-    """+-|value| (s - a)/(s + a) that equals value at s = j omega."""
+    """+-|value| (s - a)/(s + a), equal to value at s = j omega."""
     size, angle = abs(value), float(np.angle(value))
     if abs(value.imag) <= REAL * size:
         return gain(value.real)
@@ -86,6 +86,6 @@ def _rank_one(value: Array, omega: float) -> StateSpace:
 
 
 def _unique(parts: list[StateSpace]) -> list[StateSpace]:
-    """The same systems under signal names that differ."""
+    """The same systems with distinct signal names."""
     return [part.renamed([f"u{k}_{i}" for i in range(part.ninputs)], [f"y{k}_{i}" for i in range(part.noutputs)])
             for k, part in enumerate(parts)]

@@ -1,4 +1,4 @@
-"""Where a bound over frequency is looked at: frequencies read off the poles, and refinement of local maxima."""
+"""Frequencies at which a bound is evaluated: initial ones from the poles, and refinement of local maxima."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avis_ctrl.robust.mu_lmi import Array
 
 
 def first_frequencies(N: StateSpace, band: Interval, grid: int = 40) -> Array:
-    """Frequencies [rad/s] of a first look: band ends, poles, their resonances, and a modest logarithmic grid."""
+    """Initial frequencies [rad/s]: band ends, natural frequencies and resonances, and a coarse logarithmic grid."""
     poles = N.poles()
     size = np.abs(poles)
     resonance = np.sqrt(np.maximum(size ** 2 - 2 * poles.real ** 2, 0.0))
@@ -32,7 +32,7 @@ def refine_maxima(value: Callable[[Array], Array], omega: Array, values: Array, 
                   worth: float = 0.9, most: int = 4, rounds: int = 12) -> tuple[Array, Array]:
     """Add points around the highest local maxima until their brackets agree to `tolerance`; sorted omega, values.
 
-    Maxima lower than `worth` times the highest, and those beyond the `most` highest, are left as they are.
+    Only the `most` highest maxima are refined, and only those of at least `worth` times the highest.
     """
     for _ in range(rounds):
         if not np.all(np.isfinite(values)):

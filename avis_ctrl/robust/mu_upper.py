@@ -1,7 +1,7 @@
-"""Upper bounds of mu and of the skewed mu from the scalings of `mu_lmi`: start, normalisation, final check.
+"""Upper bounds of mu and skewed mu from the scalings of `mu_lmi`: initialisation, normalisation, final check.
 
-The number reported is always recomputed from the final scalings by an eigenvalue computation, so that it is
-an upper bound however far the optimisation got.
+The reported value is always recomputed from the final scalings by an eigenvalue computation. It is therefore an upper
+bound even if the optimisation did not converge.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 
 @dataclass(frozen=True)
 class UpperBoundSettings:
-    """batch_bytes : memory of the matrices that are treated together.
-    worth : of many blocks, the matrices whose bound with one number a block is above this fraction of the largest get
-        the full bound.
-    most_decades : largest distance of a squared scaling from the middle of their range, in decades: chains that only
-        round-off closes would need a range that floating-point numbers do not have.
-    room : a start from scalings that prove a level begins at this multiple of the level's square.
+    """batch_bytes : memory of the matrices that are processed together.
+    worth : with many blocks, the full bound is computed only for matrices whose bound with one number per block exceeds
+        this fraction of the largest bound.
+    most_decades : maximum distance of a squared scaling from the middle of the range, in decades: chains of blocks that
+        are closed only by round-off would need a range beyond that of floating-point numbers.
+    room : a search that starts from scalings that prove a level begins at this multiple of the squared level.
     """
 
     batch_bytes: float = 64e6
@@ -44,19 +44,19 @@ class UpperBound(NamedTuple):
     scalings: Scalings
 
     def at(self, which: Array) -> UpperBound:
-        """Some of the batch, by number."""
+        """Part of the batch, by index."""
         return UpperBound(self.beta[which], Scalings(*(one[which] for one in self.scalings)))
 
     @staticmethod
     def joined(parts: Sequence[UpperBound]) -> UpperBound:
-        """One batch of several."""
+        """Concatenate several batches."""
         return UpperBound(np.concatenate([part.beta for part in parts]),
                           Scalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts),
                                                                         strict=True))))
 
 
 def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0, sweeps: int = 20) -> Array:
-    """Osborne's scaling: d (B, n_blocks) > 0 that evens out the block norms of M (B, n_shared, n_z, n_w); norms below
+    """Osborne's scaling: d (B, n_blocks) > 0 that balances the block norms of M (B, n_shared, n_z, n_w); norms below
     goal (B,) need no scaling."""
     power = np.sum(np.abs(M) ** 2, axis=1)
     places = list(structure.slices())
@@ -64,24 +64,24 @@ def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0
     norm2 = np.stack([rows[:, :, w].sum(axis=2) for _, w, _ in places], axis=2)
     n = len(places)
     norm2[:, np.arange(n), np.arange(n)] = 0.0
-    # First remove the units of the blocks: the floor below is relative to the largest entry.
+    # First remove the effect of the signal units, because the floor below is relative to the largest entry.
     goal2 = np.broadcast_to(np.square(goal), M.shape[:1]).astype(float)
     units = level_squares(norm2, goal2, SETTINGS.most_decades * np.log(10.0))
     norm2 = norm2 * units[:, :, None] / units[:, None, :]
-    # A floor keeps the scaling finite where a block is not coupled both ways.
+    # A floor keeps the scaling finite if a block is not coupled in both directions.
     norm2 = norm2 + 1e-16 * np.max(norm2, axis=(1, 2), initial=0.0)[:, None, None] + 1e-300
     d2 = units * balanced_squares(norm2, sweeps)
     return np.sqrt(d2 / np.exp(np.mean(np.log(d2), axis=1, keepdims=True)))
 
 
 def expand(structure: BlockStructure, d: Array) -> tuple[Array, Array]:
-    """Per-entry scalings (d_z (B, n_z), d_w (B, n_w)) from one number a block."""
+    """Per-entry scalings (d_z (B, n_z), d_w (B, n_w)) from one number per block."""
     return (np.repeat(d, [b.cols for b in structure.blocks], axis=1),
             np.repeat(d, [b.rows for b in structure.blocks], axis=1))
 
 
 def rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scalings:
-    """Scalings of the original M from those of diag(d_z) M / diag(d_w) / size."""
+    """Convert scalings of diag(d_z) M / diag(d_w) / size to scalings of M."""
     return Scalings(d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
                     d_w[:, :, None] * scalings.X_w * d_w[:, None, :],
                     size[:, None, None] * d_w[:, :, None] * scalings.G * d_z[:, None, :])
@@ -89,11 +89,11 @@ def rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scaling
 
 def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, goal: Array | float = 0.0,
                 start: UpperBound | None = None) -> UpperBound:
-    """Least beta with scalings that prove mu <= beta, for M (B, n_shared, n_z, n_w).
+    """Minimum beta with scalings that prove mu <= beta, for M (B, n_shared, n_z, n_w).
 
-    Matrices along axis 1 share scalings. With `goal` > 0 the search stops where beta <= goal, at the analytic
-    centre of the scalings that prove it: the ones with most room around them. start : a bound to begin from, whose
-    scalings fit `structure`, such as that of the simplified blocks.
+    Matrices along axis 1 share scalings. With `goal` > 0 the search stops when beta <= goal, at the analytic centre of
+    the scalings that prove it, where the margin is largest. start : initial bound whose scalings fit `structure`, such
+    as the bound of the simplified blocks.
     """
     goals = np.broadcast_to(goal, M.shape[:1])
     if _is_diagonal(structure):
@@ -105,7 +105,7 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, go
 
 
 def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
-    """`upper_bound` with a goal > 0; of many blocks first with one number each, in full where that is not enough."""
+    """`upper_bound` with a goal > 0; with many blocks, full scalings only if one number per block misses the goal."""
     if not structure.many:
         return upper_bound(M, structure, tolerance, goal)
     found = upper_bound(M, structure.simplified(), tolerance, goal)
@@ -115,7 +115,7 @@ def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -
 
 
 def highest(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound:
-    """`upper_bound`, of many blocks in full only where that decides on the largest of all."""
+    """`upper_bound`; with many blocks, full scalings only for the matrices that can determine the largest bound."""
     if not structure.many:
         return upper_bound(M, structure, tolerance)
     found, full = upper_bound(M, structure.simplified(), tolerance), np.zeros(M.shape[0], bool)
@@ -137,7 +137,7 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
     live = size > 0
-    # Below the goal nothing need be resolved.
+    # Values below the goal need not be resolved.
     size = np.where(live, np.maximum(size, goal), 1.0)
     unit = balanced / size[:, None, None, None]
     floor = np.where(goal > 0, (goal / size) ** 2, -1e-8)
@@ -160,12 +160,12 @@ def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Ar
 
 
 def _is_diagonal(structure: BlockStructure) -> bool:
-    """Whether every block has one number for its scaling."""
+    """Whether the scaling of every block is a single number."""
     return all(block.kind == "full" or (block.kind == "complex" and block.rows == 1) for block in structure.blocks)
 
 
 def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, tolerance: float) -> Scalings:
-    """Scalings of one number a block, by the compiled path; 1 where M is zero (not live)."""
+    """Scalings of one number per block, by the compiled path; 1 where M is zero (not live)."""
     of_z, of_w = (np.repeat(np.arange(len(structure.blocks)), sizes)
                   for sizes in zip(*((b.cols, b.rows) for b in structure.blocks), strict=True))
     p = np.ones((M.shape[0], len(structure.blocks)))
@@ -177,16 +177,16 @@ def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, to
 
 
 def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5) -> UpperBound:
-    """Least beta for which the last block of `structure` (performance) may have gain beta, the others norm 1.
+    """Minimum upper bound beta of the gain of the performance channel (last block) if the other blocks have norm 1.
 
-    M (B, n_shared, n_z, n_w). beta = inf where the scalings cannot prove robust stability (the upper bound of
-    mu over the first blocks is not below 1).
+    M (B, n_shared, n_z, n_w). beta = inf if the scalings cannot prove robust stability (the upper bound of mu of the
+    other blocks is not below 1).
     """
     robust = BlockStructure(structure.blocks[:-1])
     r_w, r_z = robust.n_w, robust.n_z
     if not r_w:
         return upper_bound(M, structure, tolerance)
-    # In units of its own size, so that the search does not depend on those of the performance channel.
+    # Normalise the performance channel, so that the search does not depend on its units.
     unit = np.max(np.linalg.norm(M[:, :, r_z:], axis=(2, 3)), axis=1)
     unit = np.where(unit > 0, unit, 1.0)
     scale = np.ones((M.shape[0], structure.n_z))
@@ -198,7 +198,7 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
 
 
 def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, tolerance: float) -> UpperBound:
-    """`skewed_upper_bound` of a performance channel near one in size."""
+    """`skewed_upper_bound` for a normalised performance channel."""
     batch, r_w, r_z = M.shape[0], robust.n_w, robust.n_z
     beta = np.full(batch, np.inf)
     found = Scalings(*(np.zeros((batch, *shape), complex) for shape in
@@ -206,7 +206,7 @@ def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, toleran
     inner = upper_bound(M[:, :, :r_z, :r_w], robust, tolerance)
     safe = np.flatnonzero(inner.beta < 1.0 - 1e-9)
     if safe.size:
-        # Between the least level and 1 the analytic centre leaves room for the performance block.
+        # At a level between the minimum and 1, the analytic centre has a margin for the performance block.
         goal = np.maximum(np.sqrt(inner.beta[safe]), 0.3)
         start = upper_bound(M[safe][:, :, :r_z, :r_w], robust, tolerance, goal).scalings
         beta[safe], part = _skewed_from(M[safe], structure, start, tolerance)
@@ -216,7 +216,7 @@ def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, toleran
 
 
 def _skewed_from(M: Array, structure: BlockStructure, start: Scalings, tolerance: float) -> tuple[Array, Scalings]:
-    """Skewed bound from scalings of the robust blocks that hold with room at level 1."""
+    """Skewed bound, starting from scalings of the robust blocks that are feasible with a margin at level 1."""
     batch, r_w, r_z = M.shape[0], start.X_w.shape[1], start.X_z.shape[1]
     space = ScalingSpace.of(structure, np.arange(structure.n_w) >= r_w)
     X_w = np.repeat(np.eye(structure.n_w, dtype=complex)[None], batch, axis=0)

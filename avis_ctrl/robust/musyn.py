@@ -1,12 +1,12 @@
-"""mu synthesis: a controller that makes the peak of the structured singular value small.
+"""mu synthesis: a controller that minimises the peak of the structured singular value.
 
-D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order: of several
-fits to the best scalings at each frequency, one is taken whose gamma is the smallest to 0.5 %. Where it stalls, it is
-followed by descent on the H-infinity optimum over the scalings themselves (`gamma_descent`). If the first H-infinity
+D-K iteration (Doyle 1985; Zhou, Doyle and Glover 1996, section 11.4) with scalings of automatic order: among several
+fits to the best scalings at each frequency, one is used whose gamma is within 0.5 % of the smallest. When D-K iteration
+stalls, it is followed by descent on the H-infinity optimum over the scalings (`gamma_descent`). If the first H-infinity
 controller is no better than no control, the iteration starts from other constant scalings. See `musyn_iteration`.
 
-Real uncertainty is synthesised for as if it were complex, which is conservative: every real perturbation is a
-complex one. What that costs is measured on the final loop, where mu is computed both ways.
+The synthesis treats real uncertainty as complex. This is conservative, because every real perturbation is also a
+complex perturbation. The conservatism is measured on the final loop, where mu is computed both ways.
 """
 
 from __future__ import annotations
@@ -35,24 +35,25 @@ from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
-# What the certificate may leave above mu of the final loop.
+# Largest relative difference between the certificate and mu of the final loop that is accepted.
 TIGHT = 0.003
 NORM_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MuSynthesis(Shown):
-    """The best controller of all iterations, and its closed loop's figures.
+    """The best controller of all iterations, and the properties of its closed loop.
 
-    mu_upper, mu_lower : bounds of the peak of mu over all frequencies with the blocks as given (real ones real).
-    mu_upper_complex : the same upper bound with real blocks taken as complex, as the synthesis did.
-    delta : the perturbation behind mu_lower, at omega_peak [rad/s].
-    guaranteed : whether mu_upper is an upper bound between the frequencies computed, too.
-    scalings, gamma : measured norm of the scaled loop, no less than complex mu at any frequency. Those of a sampled
-        loop are functions of its continuous image's frequency (`lti.bilinear.image_frequency`).
-    fastest_pole : largest magnitude [rad/s] of a pole of K (of its continuous image where K is sampled).
-    closed_loop : of the generalized plant with K; `mu_peak(closed_loop, blocks)` has mu over frequency.
-    saved_state : JSON-able; `musyn(..., state=saved_state)` goes on from here.
+    mu_upper, mu_lower : bounds of the peak of mu over all frequencies with the blocks as given (real blocks real).
+    mu_upper_complex : the same upper bound with real blocks treated as complex, as in the synthesis.
+    delta : the perturbation that proves mu_lower, at omega_peak [rad/s].
+    guaranteed : whether mu_upper is also an upper bound between the computed frequencies.
+    scalings, gamma : D-scalings and measured norm of the scaled loop, an upper bound of complex mu at every frequency.
+        For a sampled loop the scalings are functions of the frequency of its continuous image
+        (`lti.bilinear.image_frequency`).
+    fastest_pole : largest magnitude [rad/s] of a pole of K (of its continuous image if K is sampled).
+    closed_loop : the generalized plant with K; `mu_peak(closed_loop, blocks)` gives mu over frequency.
+    saved_state : JSON-serialisable; `musyn(..., state=saved_state)` continues from here.
     """
 
     in_line = ("K", "mu_upper", "mu_lower", "omega_peak", "guaranteed", "status")
@@ -85,37 +86,37 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
 
     Parameters
     ----------
-    P : StateSpace (ours or python-control's), inputs (w_delta, w, u), outputs (z_delta, z, y). If it is sampled,
-        K is designed for its continuous image (`lti.bilinear`) and has the same sample rate; every figure is computed
+    P : StateSpace (avis_ctrl or python-control), inputs (w_delta, w, u), outputs (z_delta, z, y). If P is sampled,
+        K is designed for its continuous image (`lti.bilinear`) and has the same sample rate; all results are computed
         from the sampled loop.
-    blocks : uncertainty in the order of w_delta; the rest of w and z is the performance block.
+    blocks : uncertainty in the order of w_delta; the remaining w and z form the performance block.
     nmeas, ncon : number of measurements y and controls u.
     callback : called with each `Iteration`; returning False or "stop" ends the iteration.
     target : stop as soon as the norm of the scaled loop is below this value (so is mu, at every frequency).
-    max_iterations : largest number of K-steps, including the first H-infinity controller. There is no time limit, so
+    max_iterations : maximum number of K-steps, including the first H-infinity controller. There is no time limit, so
         the same call gives the same controller on the same machine; on another processor, rounding may lead D-K
-        iteration along another path. A call with more iterations, or with a lower target, repeats the steps of one with
-        fewer and continues; only the step that reaches the target may differ.
+        iteration along another path. A call with more iterations, or with a lower target, repeats the steps of a
+        shorter call and continues; only the step that reaches the target may differ.
     backoff : relative distance of each controller from the H-infinity optimum. It raises mu by about the same fraction;
         a smaller value gives faster controller poles.
-    polish : where D-K iteration stalls, continue with descent on gamma (and scalings of higher order where they lower
+    polish : when D-K iteration stalls, continue with descent on gamma (and scalings of higher order if they lower
         it), then with D-K iteration again, until a whole round no longer improves the result.
-    max_added_states : largest number of states that all scalings together may add to the plant.
-    starts : known controllers u = K y. The iteration starts from the best of them and of the H-infinity controller of
-        P; the result is never worse (in complex mu on the grid) than any of them that stabilises P.
+    max_added_states : maximum number of states that all scalings together may add to the plant.
+    starts : known controllers u = K y. The iteration starts from the best of these and the H-infinity controllers; the
+        result is never worse (in complex mu on the grid) than any of them that stabilises P.
     state : `saved_state` of an earlier result, to continue from. If it belongs to another plant with the same y and u
         (a changed weight, more uncertainty), its controllers are used as `starts`.
-    order : largest number of states of the controller. The order of the full controller is reduced; the result is
-        improved by descent on mu over its entries (`fixed_order`), and all figures are those of this controller.
-        `saved_state` is that of the full order.
-    structure : "decentralised": u_k depends on y_k only; K has the given order (by default that of the full one).
+    order : maximum number of states of the controller. The order of the full controller is reduced; the result is
+        improved by descent on mu over its entries (`fixed_order`), and all results are those of this controller.
+        `saved_state` belongs to the full-order controller.
+    structure : "decentralised": u_k depends on y_k only; K has the given order (default: that of the full controller).
     sample_rate_Hz : `notes` compare the controller's fastest pole with half of this rate.
 
     Raises
     ------
-    InputError : blocks that do not fit P, counts or options that are wrong, controllers that do not fit, a state of
-        other controllers.
-    ComputationError : no stabilising controller (the mode is named), or none found.
+    InputError : blocks that do not fit P, invalid counts or options, controllers that do not fit, a saved state with
+        controllers of other dimensions or sample time.
+    ComputationError : no stabilising controller exists (the mode is named), or none was found.
 
     Examples
     --------
@@ -152,10 +153,10 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
 
 @dataclass(frozen=True, eq=False)
 class DKIteration:
-    """Where D-K iteration ended, before the bounds of the result are computed.
+    """Result of D-K iteration, before the final bounds are computed.
 
-    P, uncertainty : as given, performance as the last block. problem : as the synthesis sees them.
-    best : the controller of least complex mu on the grid of the iteration; of a sampled plant its continuous image.
+    P, uncertainty : as given, performance as the last block. problem : P and blocks as used in the synthesis.
+    best : the controller with the smallest complex mu on the grid; for a sampled plant its continuous image.
     """
 
     P: StateSpace
@@ -175,7 +176,7 @@ class DKIteration:
 
     @cached_property
     def omega_peak(self) -> float:
-        """Where complex mu of the best loop is largest on the grid of the last iteration [rad/s]."""
+        """Frequency of the largest complex mu of the best loop on the grid of the last iteration [rad/s]."""
         points = self.state.points
         assert points is not None
         if self.state.last is not self.best:
@@ -188,8 +189,8 @@ def dk_iteration(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, n
                  max_iterations: int = 30, backoff: float = 0.01, polish: bool = True,
                  max_added_states: int | None = None, starts: Sequence[StateSpace] = (),
                  state: dict[str, Any] | None = None) -> DKIteration:
-    """The iteration of `musyn` alone, with its parameters and errors: for callers who change the controller before
-    they compute its bounds."""
+    """The iteration of `musyn` alone, with the same parameters and errors, for callers that change the controller
+    before its bounds are computed."""
     P = as_plant(P, nmeas, ncon)
     uncertainty, complexified = _structures(P, blocks, nmeas, ncon)
     cap = P.nstates + 20 if max_added_states is None else max_added_states
@@ -206,8 +207,8 @@ def dk_iteration(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, n
 
 def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
                 ncon: int) -> tuple[BlockStructure, BlockStructure]:
-    """The blocks as given with performance, and as the synthesis sees them: complex, and many of them with one number
-    for the scaling of each."""
+    """The given blocks with performance, and the blocks used in the synthesis: complex, and with one number per
+    scaling if there are many blocks."""
     uncertainty = BlockStructure.of(blocks)
     n_w, n_z = P.ninputs - ncon - uncertainty.n_w, P.noutputs - nmeas - uncertainty.n_z
     if n_w < 1 or n_z < 1:
@@ -220,7 +221,7 @@ def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: 
 
 
 def _named(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:
-    """A controller given, with the plant's names."""
+    """A given controller with the signal names of the plant."""
     if not isinstance(K, StateSpace) or (K.ninputs, K.noutputs) != (nmeas, ncon) or K.dt != P.dt:
         clock = f"sampled at {P.dt:g} s" if P.dt else "continuous"
         raise InputError(f"expected {clock} controllers with {nmeas} inputs and {ncon} outputs", field="starts",
@@ -242,9 +243,9 @@ def _options(target: float | None, max_iterations: int, backoff: float, polish: 
 
 
 def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scalings, float]:
-    """Realised scalings that bound mu of a loop (the image of the sampled one) at every frequency, and the bound.
+    """Realised scalings that bound mu of a loop (the image of a sampled loop) at every frequency, and the bound.
 
-    Those that K was made with, or others of the least peak where they leave more than `TIGHT` above mu on the grid.
+    These are the scalings of the K-step, or tightened ones if the former bound exceeds mu on the grid by over `TIGHT`.
     """
     def bound(scalings: Scalings) -> float:
         return hinf_norm(scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
@@ -258,11 +259,11 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
 
 
 def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, said: tuple[str, ...]) -> MuSynthesis:
-    """A controller in the clock of P, with mu measured anew on its loop with P as given."""
+    """The controller in the time domain of P, with mu recomputed on its loop with P as given."""
     P, problem, uncertainty, state = made.P, made.problem, made.uncertainty, made.state
     K = sampled_image(best.K, P.dt) if P.dt else best.K
     closed = lft_lower(P, K)
-    # The norm of the scaled loop holds between all frequencies; with real blocks taken as complex it bounds theirs.
+    # The norm of the scaled loop bounds complex mu at all frequencies, and therefore mu with real blocks, too.
     scalings, gamma = _certificate(problem, best, continuous_image(closed))
     peak = mu_peak(closed, uncertainty, known_upper=gamma)
     has_real = any(block.kind == "real" for block in uncertainty.blocks)

@@ -1,13 +1,14 @@
-"""The iteration of a mu synthesis: which scalings come next, the K-step, the analysis, and when it ends.
+"""Iteration of a mu synthesis: choice of the next scalings, K-step, analysis, termination.
 
-Phases of a path in turn: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`); the same
-with one more order where gamma asks for it ("growth"); then D-K iteration again from the best loop. Each ends where a
-step gains less than `stall`, the whole where a round of all three gains less than `round`. Another path begins, once,
-at the best constant scalings ("start"): first of all where the controllers to start from do nothing, next where a D-K
-step from them leads nowhere, else in the end. The best loop of all paths is kept.
+A path consists of these phases: D-K iteration; descent on the H-infinity optimum over the scalings (`gamma_descent`);
+descent with scalings of higher order where gamma is sensitive to it ("growth"); then D-K iteration again from the best
+loop. A phase ends when a step gains less than `stall`; the iteration ends when a round of all three phases gains less
+than `round`. Once, another path starts at the best constant scalings ("start"): at the beginning if the initial
+controllers have no effect, after the first D-K phase if it gains nothing, otherwise at the end. The best loop of all
+paths is kept.
 
-Only counts end the iteration, never a clock. The target and the number of iterations allowed decide only where it
-ends, and the target which scalings the last step takes: a short run is the beginning of a long one.
+Elapsed time never ends the iteration. The target and the maximum number of iterations determine only where it ends; the
+target also determines the scalings of the last step. A short run therefore equals the beginning of a long run.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from avis_ctrl.robust.musyn_state import DONE, GIVEN, HINF, NOMINAL, Iteration, 
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# Which phase follows which.
+# Successor of each phase.
 FOLLOWING = {"first start": "D-K", "D-K": "descent", "other start": "descent", "descent": "growth",
              "growth": "last start", "last start": DONE}
 STOPPED = "stopped by the caller, before the iteration had ended"
@@ -39,14 +40,14 @@ STOPPED = "stopped by the caller, before the iteration had ended"
 
 @dataclass(frozen=True)
 class IterationSettings:
-    """stall : a step that lowers mu by a smaller fraction than this ends its phase: another is not worth a synthesis.
+    """stall : a step that lowers mu by a smaller fraction than this ends its phase; another is not worth a synthesis.
     round : a round of all phases that lowers mu by a smaller fraction than this ends the iteration.
-    fast : a D-K step that lowers mu by a larger fraction than this is followed by another with an equally coarse fit of
-        the scalings; after a smaller gain the fit must become finer for mu to fall further.
-    idle : a controller does nothing if its mu is within this fraction of that of the plant without control: ten times
-        the accuracy of that mu.
-    constants : constant scalings of the uncertainty relative to the performance, tried as starts where the identity
-        leads nowhere: over six decades, because the units of the signals may differ.
+    fast : after a D-K step that lowers mu by a larger fraction than this, the next fit of the scalings is equally
+        coarse; after a smaller gain the fit must become finer for mu to decrease further.
+    idle : a controller counts as idle (no control action) if its mu is within this fraction of mu of the plant without
+        control; ten times the accuracy of that mu.
+    constants : constant scalings of the uncertainty relative to the performance, tried as starting points if the
+        identity fails. They cover six decades, because the units of the signals may differ.
     """
 
     stall: float = 0.005
@@ -61,7 +62,7 @@ SETTINGS = IterationSettings()
 
 @dataclass(frozen=True)
 class Options:
-    """What the caller of `musyn` asked for."""
+    """Options of `musyn`."""
 
     target: float | None
     max_iterations: int
@@ -73,7 +74,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """P (w_delta, w, u -> z_delta, z, y) and its blocks as the synthesis sees them: complex, performance last."""
+    """P (w_delta, w, u -> z_delta, z, y) and its blocks as used in the synthesis: complex, performance last."""
 
     P: StateSpace
     structure: BlockStructure
@@ -82,12 +83,12 @@ class Problem:
 
     @cached_property
     def scaled(self) -> ScaledProblem:
-        """For tests of the gamma that scalings allow."""
+        """The plant for tests of the gamma that is achievable with given scalings."""
         return ScaledProblem.of(self.P, self.nmeas, self.ncon)
 
 
 def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], options: Options) -> tuple[State, str]:
-    """The H-infinity controller and the ones given, then scalings, K-step and analysis until something says stop."""
+    """Initial controllers, then scalings, K-step and analysis until a stopping criterion is met: state and status."""
     if not state.history:
         state, stopped = _first(problem, starts, options)
         if stopped:
@@ -116,17 +117,18 @@ def _stopped_by(options: Options, row: Iteration) -> bool:
 
 
 def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -> tuple[State, bool]:
-    """The state with the best of the controllers that the iteration may start from; whether the callback said stop.
+    """The state with the best initial controller, and whether the callback stopped the iteration.
 
-    They are the H-infinity controller of the plant as it is, that of the nominal plant, and those given; the ones that
-    do not stabilise the plant are left out. The nominal one is often the best by far: its loop tells the D-step where
-    the uncertainty is felt by a controller that does its work, while large uncertainty unscaled forbids any work.
+    The candidates are the H-infinity controller of the unscaled plant, that of the nominal plant, and the given
+    controllers; candidates that do not stabilise the plant are discarded. The nominal controller is often by far the
+    best: its loop shows the D-step where the uncertainty affects a controller that achieves performance. With large
+    unscaled uncertainty, the H-infinity optimal controller does not act at all.
     """
     state, failure = State(), None
     many = problem.structure.many
     candidates = _candidates(problem, starts, options)
-    # With many blocks unscaled, that of the plant as it is does nothing, and takes longest: only where the ones given,
-    # or that of the nominal plant, do not stabilise.
+    # With many unscaled blocks, the first candidate does not act and takes longest. The order is therefore reversed,
+    # and the search ends when a given controller, or the nominal one, stabilises the plant.
     for kind, make in reversed(candidates) if many else candidates:
         if many and kind != GIVEN and state.best is not None:
             break
@@ -151,7 +153,7 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
 
 def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
                 options: Options) -> list[tuple[str, Callable[[], StateSpace]]]:
-    """Kinds of the controllers to start from, and what makes each."""
+    """Kind and constructor of each initial controller."""
     def optimal(P: StateSpace) -> StateSpace:
         return hinf_controller(P, problem.nmeas, problem.ncon, options.backoff).K
     performance = problem.structure.blocks[-1]
@@ -167,7 +169,7 @@ def _itself(K: StateSpace) -> StateSpace:
 
 
 def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
-    """A controller to start from with its analysis; ComputationError where it does not stabilise the plant."""
+    """Loop of an initial controller with its analysis; ComputationError if it does not stabilise the plant."""
     closed = lft_lower(problem.P, K)
     if not closed.is_stable():
         raise ComputationError("a controller to start from does not stabilise the plant",
@@ -177,10 +179,10 @@ def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
 
 
 def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal, Synthesis] | None:
-    """The scalings of least H-infinity optimum and their controller; None if no proposal has a controller.
+    """Scalings with the smallest H-infinity optimum and their controller; None if no proposal has a controller.
 
-    The fit of scalings to the last loop does not tell what the next one will be; one test of gamma does. In a D-K step
-    scalings that are fitted quickly come first, and suffice if their gamma makes mu fall by more than `stall`.
+    The fit of scalings to the last loop does not predict the next loop; one gamma test does. In a D-K step the scalings
+    that are fitted quickly are tried first. They are accepted if their gamma lowers mu by more than `stall`.
     """
     assert state.path is not None
     hint = state.path.gamma
@@ -193,8 +195,8 @@ def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal,
 
 def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hint: float, below: float = np.inf
           ) -> tuple[Proposal, Synthesis] | None:
-    """The proposal of least H-infinity optimum, at most `below`, and its controller: another one is preferred if its
-    optimum is smaller by more than `stall`. The first that reaches the target ends the search."""
+    """The proposal with the smallest H-infinity optimum, at most `below`, and its controller. A later proposal is
+    preferred if its optimum is smaller by more than `stall`. A proposal that reaches the target ends the search."""
     best: tuple[Proposal, Synthesis] | None = None
     for proposal in proposals:
         try:
@@ -212,7 +214,7 @@ def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hin
 
 
 def _no_further(state: State, options: Options) -> str:
-    """Why no further iteration starts; empty where one does."""
+    """Reason to end the iteration; empty if it continues."""
     if state.phase == DONE:
         return (f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
                 f"{100 * SETTINGS.round:g} %")
@@ -226,7 +228,7 @@ def _no_further(state: State, options: Options) -> str:
 
 
 class Proposal(NamedTuple):
-    """Scalings, what their realisation costs against the best at each frequency, and how they were made."""
+    """Scalings, the cost of their realisation relative to the best scalings at each frequency, and their origin."""
 
     scalings: Scalings
     cost: float
@@ -234,7 +236,7 @@ class Proposal(NamedTuple):
 
 
 def _equal_orders(state: State, options: Options) -> Iterator[Proposal]:
-    """Scalings of one order in all blocks; their cost is measured on the grid only."""
+    """Scalings of equal order in all blocks; their cost is measured on the grid only."""
     assert state.points is not None
     try:
         for step in equal_order_fits(state.points, options.max_added_states):
@@ -244,7 +246,7 @@ def _equal_orders(state: State, options: Options) -> Iterator[Proposal]:
 
 
 def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
-    """The next scalings to choose from; none where the phase has nothing more to offer."""
+    """Candidates for the next scalings; none if the phase is exhausted."""
     assert state.last is not None and state.path is not None and state.points is not None
     if "start" in state.phase:
         tried = any(row.kind == "start" for row in state.history)
@@ -258,7 +260,7 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
                                 max_states=options.max_added_states):
                 yield Proposal(step.scalings, step.cost, "D-K")
         except np.linalg.LinAlgError:
-            # A loop that no decomposition takes (entries beyond all scale) ends the D-K phase, not the synthesis.
+            # A loop whose decompositions fail (entries of extreme magnitude) ends the D-K phase, not the synthesis.
             return
         return
     band = band_of(state.points.omega)
@@ -275,9 +277,9 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
 
 
 def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
-    """Whether a controller that reaches this mu does nothing: the plant without control reaches it, too.
+    """Whether a controller with this mu is idle: mu of the plant without control is no larger (within `idle`).
 
-    With K = 0 the uncertainty of the drives sees no signal and no D is better than another: no D-step leads away.
+    With K = 0 the actuator uncertainty receives no signal and all D-scalings are equivalent: no D-step can improve it.
     """
     P = problem.P
     at_rest = lft_lower(P, gain(np.zeros((problem.ncon, problem.nmeas)), P.outputs[P.noutputs - problem.nmeas:],
@@ -289,7 +291,7 @@ def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
 
 
 def _other_constants(problem: Problem, gamma: float, options: Options) -> Proposal | None:
-    """The constant scalings, alike for all uncertainty, of least H-infinity optimum; None where none is below gamma."""
+    """Constant scalings, equal for all uncertainty, of smallest H-infinity optimum; None if none is below gamma."""
     best = None
     for d in SETTINGS.constants:
         scalings = Scalings.uniform(problem.structure, d)
@@ -305,25 +307,25 @@ def _other_constants(problem: Problem, gamma: float, options: Options) -> Propos
 
 
 def _falls_fast(state: State) -> bool:
-    """Whether the last step lowered mu by more than `fast`, or no step was taken yet on this path."""
+    """Whether the last step lowered mu by more than `fast`, or this path has no step yet."""
     steps = _steps(state)
     return len(steps) < 2 or state.history[-1].kind == "start" or steps[-1] < (1 - SETTINGS.fast) * steps[-2]
 
 
 def _steps(state: State) -> list[float]:
-    """mu after each K-step of the scaled plant; the other controllers to start from do not count."""
+    """mu after each K-step of the scaled plant; nominal and given initial controllers do not count."""
     return [row.mu_upper for row in state.history if row.kind not in (NOMINAL, GIVEN)]
 
 
 def _next_grid(state: State, closed_loop: StateSpace) -> np.ndarray:
-    """Frequencies of the next analysis: those of the last one, with more around its peaks."""
+    """Frequencies of the next analysis: those of the last analysis, refined around its peaks."""
     if state.points is None:
         return frequency_grid(closed_loop)
     return refined_grid(state.points.omega, state.points.mu)
 
 
 def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points: PointwiseScalings) -> State:
-    """The state after an iteration: the best loops kept, the phase moved on where nothing was gained on this path."""
+    """The state after an iteration: best loops updated, and the next phase if too little was gained on this path."""
     path = state.path
     assert state.best is not None and path is not None
     state = replace(state, points=points, last=loop, best=loop if loop.mu < state.best.mu else state.best,
@@ -336,11 +338,11 @@ def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points
 
 
 def _moved_on(problem: Problem, state: State) -> State:
-    """The state in the next phase; after growth a new round from the path's best loop, where this one gained enough."""
+    """The state in the next phase; after growth, a new round from the path's best loop if this round gained enough."""
     assert state.path is not None and state.last is not None and state.points is not None
     if state.phase == "D-K" and state.path.mu >= state.round_mu:
         return replace(state, phase="other start")
-    # Where neither descent nor growth found a step, D-K iteration would only repeat its last one.
+    # If neither descent nor growth found a step, D-K iteration would only repeat its last step.
     over = state.path.mu > (1 - SETTINGS.round) * state.round_mu or state.history[-1].kind == "D-K"
     if state.phase != "growth" or over:
         return replace(state, phase=FOLLOWING[state.phase])

@@ -1,4 +1,4 @@
-"""Where a mu synthesis stands, in a form that a JSON file holds: history, best and last loop, grid, phase."""
+"""State of a mu synthesis, with conversion to and from JSON: history, best and last loop, grid, phase."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Iteration:
 
     gamma : measured H-infinity norm of the loop scaled by D(s); an upper bound of complex mu at every frequency.
     mu_upper : largest upper bound of complex mu over the frequency grid.
-    order : states of K; d_order : sum of the orders of the scalings that K was made with.
-    d_fit_error : what those realised scalings cost against the best ones at each frequency, relative; of scalings with
-        one order in all blocks on the grid, of others between its frequencies, too.
-    kind : how the scalings were made: "H-infinity" (identity), "start" (other constants, where the controllers to start
-        from do nothing), "D-K", "descent" or "growth"; "nominal" is the H-infinity controller of the plant without its
-        uncertainty, "given" one that the caller gave to start from.
+    order : states of K; d_order : sum of the orders of the scalings used for K.
+    d_fit_error : relative cost of these realised scalings compared with the best scalings at each frequency; for
+        scalings of equal order in all blocks on the grid only, otherwise also between its frequencies.
+    kind : origin of the scalings: "H-infinity" (identity), "start" (other constants), "D-K", "descent" or "growth".
+        "nominal" is the H-infinity controller of the plant without its uncertainty, "given" an initial controller of
+        the caller.
     """
 
     iteration: int
@@ -49,7 +49,7 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A controller, the scalings it was made with, the norm of the loop they scale, and its peak mu on the grid."""
+    """A controller, the scalings of its synthesis, the norm of the scaled loop, and its peak mu on the grid."""
 
     K: StateSpace
     scalings: Scalings
@@ -65,8 +65,8 @@ class Loop:
 class State:
     """Phase (see `musyn_iteration`), last loop with its analysis, best loop, history.
 
-    path : the best loop since the iteration began, or began again from other scalings; round_mu : its mu when this
-        round of phases began.
+    path : the best loop since the iteration started, or restarted from other scalings; round_mu : its mu at the start
+        of this round of phases.
     """
 
     phase: str = "D-K"
@@ -78,7 +78,7 @@ class State:
     round_mu: float = np.inf
 
     def as_dict(self, P: StateSpace, structure: BlockStructure, nmeas: int, ncon: int, dt: float) -> dict[str, Any]:
-        """JSON form, with what tells its problem from others."""
+        """JSON form, with a digest that identifies the problem."""
         assert self.last is not None and self.best is not None and self.path is not None and self.points is not None
         return {"format": FORMAT, "version": VERSION, "controller": [nmeas, ncon, dt],
                 "problem": _digest(P, structure), "phase": self.phase, "round_mu": self.round_mu,
@@ -88,10 +88,10 @@ class State:
     @staticmethod
     def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int,
                   dt: float) -> tuple[State, tuple[StateSpace, ...]]:
-        """The state to go on from; of another problem (a changed weight, say) an empty one, and its controllers.
+        """The state to continue from; for another problem (a changed weight, say) an empty state and its controllers.
 
-        Nothing that was measured on another plant is carried over: its controllers are candidates to start from.
-        Raises InputError for another format, and for controllers of other sizes or sample time.
+        No measurement on another plant is reused; its controllers become candidates for the initial controller.
+        Raises InputError for another format, and for controllers of other dimensions or sample time.
         """
         if not isinstance(saved, dict) or saved.get("format") != FORMAT or saved.get("version") != VERSION:
             raise InputError(f"expected a saved state of format {FORMAT!r}, version {VERSION}", field="state")
@@ -117,7 +117,7 @@ class State:
 
 
 def _digest(P: StateSpace, structure: BlockStructure) -> str:
-    """Tells a problem from others: the same plant and blocks give the same digest."""
+    """Digest that identifies a problem: the same plant and blocks give the same digest."""
     numbers = hashlib.sha256(repr([block.as_dict() | {"name": ""} for block in structure.blocks]).encode())
     for matrix in (P.A, P.B, P.C, P.D):
         numbers.update(repr(matrix.shape).encode() + np.ascontiguousarray(matrix).tobytes())

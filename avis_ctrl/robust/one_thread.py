@@ -1,4 +1,4 @@
-"""One BLAS thread for many small matrices; the libraries are searched for once, which takes milliseconds."""
+"""Limit to one BLAS thread for many small matrices; the libraries are located only once (it takes milliseconds)."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ def _libraries() -> ThreadpoolController:
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """A context in which the BLAS and OpenMP libraries loaded at the first call use one thread."""
+    """Context in which the BLAS and OpenMP libraries loaded at the first call use one thread."""
     return _libraries().limit(limits=1)

@@ -1,7 +1,7 @@
-"""Controllers of lower order: what each step costs is measured, not assumed.
+"""Controller order reduction: the cost of each step is measured, not assumed.
 
-Balanced truncation bounds the error of K itself; what counts is the closed loop. So a reduced controller is kept
-only if the figure that the caller measures with it (gamma, mu, ...) grows by no more than was allowed.
+Balanced truncation bounds the error of K itself, but the closed loop matters. A reduced controller is therefore
+accepted only if the caller's figure of merit (gamma, mu, ...) grows by no more than allowed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class LagSettings:
     """Fit of `replace_fast_by_lags`.
 
     kept : poles slower than this fraction of the corner frequency are kept.
-    lowest, points : the fit uses so many frequencies, evenly spaced on a logarithmic axis from `lowest` times the
-        corner to the corner. They begin far below it, because fast poles contribute phase there.
+    lowest, points : the fit uses `points` logarithmically spaced frequencies from `lowest` times the corner to the
+        corner. They begin far below the corner, because fast poles contribute phase there.
     """
 
     kept: float = 2 / 3
@@ -37,10 +37,10 @@ LAGS = LagSettings()
 
 @dataclass(frozen=True)
 class Reduction:
-    """The controller kept and what was measured on the way.
+    """The selected controller and the figures of merit of all controllers tried.
 
-    figures : (order, figure) of every controller tried; inf where the closed loop is unstable.
-    full, figure : the measured figure before and after.
+    figures : (order, figure) of every controller tried; inf if the closed loop is unstable.
+    full, figure : the figure before and after.
     """
 
     K: StateSpace
@@ -56,28 +56,28 @@ class Reduction:
 
 
 def closed_loop_gamma(P: StateSpace, K: StateSpace) -> float:
-    """H-infinity norm of F_l(P, K); inf where it is unstable."""
+    """H-infinity norm of F_l(P, K); inf if it is unstable."""
     return hinf_norm(lft_lower(P, K)).gain
 
 
 def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], float] | None = None,
                       growth: float = 0.01, orders: range | None = None, limit: float | None = None) -> Reduction:
-    """The controller of lowest order whose measured figure grows by at most `growth` (relative).
+    """The controller of lowest order whose figure of merit grows by at most `growth` (relative).
 
     Parameters
     ----------
     P : generalized plant, u and y last; a candidate must stabilise it.
-    K : controller; its unstable part is kept whole, its stable part reduced by balanced truncation.
-    measure : figure of merit of a controller, smaller is better; by default the closed loop's H-infinity norm.
+    K : controller; its unstable part is kept, its stable part is reduced by balanced truncation.
+    measure : figure of merit of a controller, smaller is better; default: H-infinity norm of the closed loop.
     growth : allowed relative growth of the figure.
-    orders : orders to choose from, by default all from the unstable part's to K's own. They are searched by halving:
-        the order below the one returned was tried and failed; the figure is not looked at on every order.
-    limit : largest figure of a reduced controller, instead of `growth`. `measure` then need only be exact above the
-        limit; the figures returned below it are upper bounds. If no reduced controller stays below it, K is returned.
+    orders : candidate orders; default: all from that of the unstable part to that of K. They are searched by bisection:
+        the next lower order was tried and failed, but not every order is tried.
+    limit : maximum figure of a reduced controller, instead of `growth`. `measure` then has to be exact only above the
+        limit; figures below it are upper bounds. If no reduced controller stays within the limit, K is returned.
 
     Raises
     ------
-    InputError : growth negative, K that does not fit P, or that does not stabilise it.
+    InputError : negative growth, or a K that does not fit P or does not stabilise it.
     """
     P = as_plant(P, K.ninputs, K.noutputs)
     if not (np.isfinite(growth) and growth >= 0):
@@ -104,19 +104,19 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
 
 
 def split_stable(K: StateSpace) -> tuple[StateSpace, StateSpace]:
-    """K = stable + unstable (poles on the stability boundary count as unstable); the direct term stays in the first."""
-    # A margin relative to the fastest pole: a slow pole that round-off could move over is kept, not truncated.
+    """K = stable + unstable (poles on the stability boundary count as unstable); the first has the direct term."""
+    # The margin is relative to the fastest pole: a slow pole within round-off of the boundary counts as unstable.
     margin = 1e-12 * float(np.max(np.abs(K.poles()), initial=0.0))
     inside = (lambda re, im: np.hypot(re, im) < 1 - 1e-12) if K.dt else (lambda re, im: re < -margin)
     return split(K, inside)
 
 
 def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -> StateSpace:
-    """K with every pole faster than `limit` [rad/s] replaced by what it contributes at rest.
+    """K with every pole faster than `limit` [rad/s] replaced by its static gain; K(0) is unchanged.
 
-    A controller that runs at a sample rate cannot have them, and one taken close to the optimum often does; K(0) is
-    kept exactly. Raises InputError for sampled K, ComputationError where a fast pole is unstable (unless
-    `also_unstable`, for callers who measure the loop that results).
+    A controller close to the H-infinity optimum often has poles too fast for its sample rate. Raises InputError for
+    sampled K, ComputationError if a fast pole is unstable (unless `also_unstable`, for callers that check the resulting
+    loop).
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
@@ -133,11 +133,11 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
 def replace_fast_by_lags(K: StateSpace, corner: float, order: int = 3) -> StateSpace:
     """K with its poles faster than `LAGS.kept` times `corner` [rad/s] replaced by first-order lags of that corner.
 
-    Fast poles may give K phase lead below the corner, which is lost if only their gain at zero frequency is kept
-    (`residualise_fast`). Their sum is approximated by that of G_k / (1 + s/corner)^k, k = 0 to `order`, with constant
-    matrices G_k: by least squares at frequencies up to the corner, relative to the largest singular value of K. K(0) is
-    unchanged. The lags have `order` times K.ninputs states. Unstable fast poles are replaced, too; the caller
-    must check the stability of the closed loop. Raises InputError for sampled K.
+    Fast poles may give K phase lead below the corner, which is lost if only their static gain is kept
+    (`residualise_fast`). The fast part is approximated by the sum of G_k / (1 + s/corner)^k, k = 0 to `order`, with
+    constant matrices G_k, by least squares at frequencies up to the corner, relative to the largest singular value of
+    K. K(0) is unchanged. The lags have `order` times K.ninputs states. Unstable fast poles are replaced, too; the
+    caller must check the stability of the closed loop. Raises InputError for sampled K.
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
@@ -160,10 +160,10 @@ def replace_fast_by_lags(K: StateSpace, corner: float, order: int = 3) -> StateS
 
 
 def truncate_slow(K: StateSpace, limit: float) -> StateSpace:
-    """K without its stable poles slower than `limit` [rad/s]; its response far above them is kept.
+    """K without its stable poles slower than `limit` [rad/s]; its response far above them is unchanged.
 
-    Synthesis leaves such poles where no weight changes any more. They hardly act, but a processor carries their states
-    for hours. Raises InputError for sampled K.
+    Synthesis produces such poles at frequencies where all weights are constant. They have little effect, but their
+    states decay only within hours. Raises InputError for sampled K.
     """
     if K.dt:
         raise InputError("expected a continuous controller", field="K.dt", value=K.dt)
@@ -171,7 +171,7 @@ def truncate_slow(K: StateSpace, limit: float) -> StateSpace:
 
 
 def split(K: StateSpace, first: Callable[[float, float], bool]) -> tuple[StateSpace, StateSpace]:
-    """K as a sum of the part with the poles that `first` picks (and the direct term), and the rest."""
+    """Split K into the part with the poles selected by `first` (and the direct term), and the rest."""
     n = K.nstates
     if not n:
         return K, StateSpace(K.A, K.B, K.C, 0 * K.D, K.dt, K.inputs, K.outputs)

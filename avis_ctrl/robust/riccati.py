@@ -2,19 +2,20 @@
 
     A' X + X A + X R X + Q = 0,     A + R X stable,     Hamiltonian H = [A  R; -Q  -A']
 
-The stable invariant subspace [X1; X2] of H comes from an ordered real Schur form (Laub 1979) after a
-symplectic diagonal balancing, and is judged before it is used: eigenvalues on the imaginary axis,
-or a subspace that is not Lagrangian, mean that no stabilising solution exists.
+The stable invariant subspace [X1; X2] of H is computed from an ordered real Schur form (Laub 1979) after a symplectic
+diagonal balancing. It is checked before use: with eigenvalues on the imaginary axis no stabilising solution exists, and
+a subspace that is not Lagrangian is too inaccurate.
 
-Whether X >= 0 cannot be read off its eigenvalues where X is singular, which is common (X vanishes on stable modes
-that the cost does not see): round-off decides the sign. So it is asked whether a negative eigenvalue is larger
-than the error of X. To first order an error of the residual between -W and W moves X by no more than E,
+If X is singular, the signs of its computed eigenvalues do not show whether X >= 0, because round-off decides them. This
+is common, because X vanishes on stable modes that are unobservable in the cost. The test is therefore whether a
+negative eigenvalue exceeds the error of X. To first order, an error of the residual between -W and W changes X by at
+most E,
 
     A_c' E + E A_c + W = 0,   A_c = A + R X,
 
-since a stable Lyapunov equation keeps the order of symmetric matrices. Near the smallest gamma X passes through
-infinity; (X - I) inv(X + I), a rotation of the subspace by 45 degrees, stays bounded there: X >= 0 puts its
-eigenvalues between -1 and 1.
+since a stable Lyapunov equation preserves the order of symmetric matrices. Near the minimum gamma X passes through
+infinity. There (X - I) inv(X + I), a rotation of the subspace by 45 degrees, stays bounded; X >= 0 if and only if its
+eigenvalues lie between -1 and 1.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import scipy.linalg as la
 from avis_ctrl.lti.norms import symplectic_scale
 from avis_ctrl.robust.hinf_settings import SETTINGS
 
-# Round-off of the residual in units of what each of its terms rounds to.
+# Round-off of the residual, relative to the sum of the magnitudes of its terms.
 ROUND_OFF = 8 * np.finfo(float).eps
 INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
 ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
@@ -37,11 +38,11 @@ ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
 
 @dataclass(frozen=True)
 class RiccatiSolution:
-    """X (n, n) symmetric, or None with the reason why there is none.
+    """X (n, n) symmetric, or None with the reason.
 
-    semidefinite : whether X >= 0, judged on X1' X2 = X1' X X1, whose entries stay below 1 where X blows up.
-    doubtful : X has negative eigenvalues, none of them beyond its error; `semidefinite` is then true.
-    omega : (k,) frequencies [rad/s] of the eigenvalues on, or nearest to, the imaginary axis where X is None.
+    semidefinite : whether X >= 0, tested on X and on X1' X2 = X1' X X1, whose entries stay below 1 even for infinite X.
+    doubtful : X has negative eigenvalues, but none exceeds its error; `semidefinite` is then true.
+    omega : (k,) frequencies [rad/s] of the eigenvalues on, or nearest to, the imaginary axis if X is None.
     """
 
     X: np.ndarray | None
@@ -53,9 +54,9 @@ class RiccatiSolution:
 
 def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
                   noise: Sequence[np.ndarray] | None = None) -> RiccatiSolution:
-    """The stabilising X of A'X + XA + XRX + Q = 0, with R and Q symmetric (n, n).
+    """Stabilising solution X of A'X + XA + XRX + Q = 0, with R and Q symmetric (n, n).
 
-    noise : by how much the entries of A, R and Q may be wrong, where they were themselves computed.
+    noise : error bounds of the entries of A, R and Q, if these were computed themselves.
     """
     n = A.shape[0]
     if n == 0:
@@ -78,14 +79,14 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
     if asymmetry > SETTINGS.lagrangian_tolerance:
         return RiccatiSolution(None, False, INACCURATE, omega=nearest)
     lowest = float(la.eigvalsh((gram + gram.T) / 2)[0])
-    lu, piv, _ = la.lapack.dgetrf(X1.T)  # singular is an answer here, not a warning
+    lu, piv, _ = la.lapack.dgetrf(X1.T)  # a singular matrix is a valid result here, without a warning
     if np.min(np.abs(np.diag(lu))) < 1e-15:
         return RiccatiSolution(None, False, "the Riccati solution is infinite")
     X = la.lu_solve((lu, piv), X2.T).T
     X = (X + X.T) / 2
     values = la.eigvalsh(X)
     X = X / np.outer(scale, scale)
-    # X1' X2 is small where X1 is (X near infinity), and X where its states' units are large: both must be clear.
+    # X1' X2 is small if X1 is small (X near infinity), and X is small if the state units are large: both must pass.
     if lowest >= -1e-13 * n and values[0] >= -SETTINGS.negative * values[-1]:
         return RiccatiSolution(X, True)
     error = None
@@ -99,9 +100,9 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
 
 def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray,
             noise: Sequence[np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray] | None:
-    """X after a step of Newton's method, and E >= 0 with X - E <= true solution <= X + E to first order in round-off.
+    """X after one Newton step, and E >= 0 with X - E <= exact solution <= X + E to first order in round-off.
 
-    None where A + R X is not stable or a linear equation is singular.
+    None if A + R X is not stable or a linear equation is singular.
     """
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -121,7 +122,7 @@ def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray,
 def refined_balanced(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
                      X: np.ndarray, noise: Sequence[np.ndarray] | None = None
                      ) -> tuple[np.ndarray, np.ndarray] | None:
-    """`refined` in the units of the states in which round-off counts least."""
+    """`refined` after a symplectic balancing of the states, which reduces the effect of round-off."""
     d = symplectic_scale(A, R, Q)
     both = np.outer(d, d)
     if noise is not None:
@@ -131,7 +132,7 @@ def refined_balanced(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
 
 
 def _residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residual of the equation and, entry by entry, what round-off can make of it."""
+    """Residual of the equation and an entrywise bound of its round-off."""
     a, r, x = np.abs(A), np.abs(R), np.abs(X)
     product = A.T @ X
     size = a.T @ x
@@ -139,7 +140,7 @@ def _residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tup
 
 
 def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:
-    """E of an error of the residual that is nowhere larger than `size`: a diagonal W of its row sums holds it."""
+    """E for a residual error of at most `size` in each entry; it is bounded by the diagonal matrix W of row sums."""
     if not np.all(np.isfinite(closed)) or np.max(la.eigvals(closed).real) >= 0:
         return None
     E = la.solve_continuous_lyapunov(closed.T, -np.diag(np.sum(size, axis=1)))
@@ -147,7 +148,7 @@ def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:
 
 
 def negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray | None = None) -> bool:
-    """Whether X = X2 inv(X1) has a negative eigenvalue for certain; basis = [X1; X2] of the stable subspace of H."""
+    """Whether X = X2 inv(X1) has a negative eigenvalue beyond its error; basis = [X1; X2], the stable subspace of H."""
     n = basis.shape[1]
     X1, X2 = basis[:n], basis[n:]
     turn = np.kron(np.array([[1, 1], [-1, 1]]) / np.sqrt(2), np.eye(n))
@@ -162,7 +163,7 @@ def negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray | 
                 continue
         noise = None
         if error is not None:
-            # |turn| |error| |turn'|, and nothing where the basis is as it is.
+            # |turn| |error| |turn'| for the rotated basis, error itself for the original one.
             size = error if matrix is H else np.abs(turn) @ error @ np.abs(turn).T
             noise = size[:n, :n], size[:n, n:], size[n:, :n]
         found = refined(A, R, Q, (X + X.T) / 2, noise)
@@ -175,7 +176,7 @@ def negative_beyond_error(H: np.ndarray, basis: np.ndarray, error: np.ndarray | 
 
 
 def _lowest(S: np.ndarray) -> float:
-    """Upper bound of the smallest eigenvalue of a symmetric matrix: computed, with the round-off of that."""
+    """Upper bound of the smallest eigenvalue of a symmetric matrix: the computed value plus its round-off."""
     values = la.eigvalsh(S)
     return float(values[0] + S.shape[0] * np.finfo(float).eps * max(-values[0], values[-1]))
 

@@ -1,7 +1,7 @@
 """Robust stability and performance of an uncertain system, by the peak of mu over all frequencies.
 
 Zhou, Doyle and Glover, Robust and Optimal Control, 1996, theorems 11.8 and 11.9: a nominally stable loop is stable for
-every Delta of norm below 1/mu(M11), and keeps a gain of 1 in addition for every Delta of norm below 1/mu(M).
+every Delta of norm below 1/mu(M11), and its gain is also at most mu(M) for every Delta of norm below 1/mu(M).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robustness(Shown):
-    """Size of the uncertainty that a loop tolerates, relative to the declared one.
+    """Size of the uncertainty that a loop tolerates, relative to the declared uncertainty.
 
-    lower : the property holds for all uncertainty below `lower` times the declared one (if `guaranteed` at every
-        frequency, otherwise at those computed). upper : a perturbation of this size breaks it, `delta`, at `omega`
-        [rad/s]; infinite where none was found.
-    worst : `delta` by name: values of real parameters, normalised matrices of others.
-    mu : the bounds of mu behind it.
+    lower : the loop is robust for all uncertainty below `lower` times the declared uncertainty (at every frequency if
+        `guaranteed`, otherwise at the computed frequencies). upper : the perturbation `delta` of this size violates
+        robustness at `omega` [rad/s]; inf if none was found.
+    worst : `delta` by name: values of real parameters, normalised matrices of other elements.
+    mu : the underlying bounds of mu.
     """
 
     in_line = ("lower", "upper", "omega", "guaranteed", "worst")
@@ -46,7 +46,7 @@ class Robustness(Shown):
 
     @property
     def robust(self) -> bool | None:
-        """True if proved for the declared uncertainty, False if a counterexample was found, None if neither."""
+        """True if proved for the declared uncertainty, False if a counterexample was found, otherwise None."""
         if self.lower > 1 and self.guaranteed:
             return True
         return False if self.upper <= 1 else None
@@ -54,12 +54,12 @@ class Robustness(Shown):
 
 def robust_stability(system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
                      ) -> Robustness:
-    """Size of the uncertainty, relative to the declared one, up to which a loop is stable.
+    """Size of the uncertainty, relative to the declared uncertainty, up to which a loop is stable.
 
     Parameters
     ----------
-    system : an `UncertainSystem`, or an LFT (w_delta, d -> z_delta, e) as StateSpace (ours or python-control's) with
-        its `blocks`; channels beyond the blocks are left out. slack : as for `mu_peak`.
+    system : an `UncertainSystem`, or an LFT (w_delta, d -> z_delta, e) as StateSpace (avis_ctrl or python-control) with
+        its `blocks`; channels beyond the blocks are ignored. slack : as for `mu_peak`.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def robust_performance(system: Any, blocks: BlockStructure | Sequence[Block] | N
                        ) -> Robustness:
     """Largest a for which the gain from d to e is at most 1/a with a times the declared uncertainty.
 
-    With `lower` = a this is proved: the loop is stable and its gain at most 1/a for all uncertainty of this size.
+    `lower` is a proved value of a: the loop is stable and its gain at most 1/a for all uncertainty of this size.
     Arguments and errors as for `robust_stability`; the system needs inputs d and outputs e beyond the uncertainty.
 
     Examples
@@ -107,8 +107,8 @@ def worst_case_gain(system: Any, blocks: BlockStructure | Sequence[Block] | None
     """Largest gain from d to e over the declared uncertainty; `avis_ctrl.robust.mu_peak.worst_case_gain`.
 
     system, blocks : as for `robust_stability`. band : (low, high) in rad/s. slack : as for `mu_peak`.
-    `upper` is proved, `lower` is attained by `delta`; infinite where a perturbation destabilises the loop. Raises as
-    `robust_performance`, and InputError for an empty band.
+    `upper` is proved, `lower` is attained by `delta`; both are inf if a perturbation destabilises the loop. Raises the
+    errors of `robust_performance`, and InputError for an empty band.
 
     Examples
     --------

@@ -1,8 +1,7 @@
-"""Dynamic scalings D(s) of a block structure: stable, minimum phase, with stable inverse.
+"""Dynamic D-scalings D(s) of a block structure: stable, minimum phase, with stable inverse.
 
-A block that is a full matrix or a single scalar takes a scalar d(s); a repeated scalar takes a square
-matrix D(s). Everything is relative to the performance block, whose scaling is one. Multiplied around
-the plant they leave mu unchanged: mu(N) = mu(D N D^-1) <= sigma_max(D N D^-1).
+A full block or a single scalar has a scalar d(s); a repeated scalar has a square matrix D(s). All scalings are relative
+to the performance block, whose scaling is one. They leave mu unchanged: mu(N) = mu(D N D^-1) <= sigma_max(D N D^-1).
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, gain
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# Beyond this a d(s) adds states to the controller faster than it lowers mu.
+# Maximum order of d(s): beyond it, the decrease of mu is not worth the additional controller states.
 MAX_ORDER = 6
-# Combinations of a group's signals that are smaller than this, relative to the largest, are round-off.
+# Relative size below which a combination of the signals of a group is round-off.
 RANK = 1e-10
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -29,10 +28,10 @@ Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 class ScalarScaling:
     """d(s) = g prod(zero factors) / prod(pole factors), all roots in the open left half plane.
 
-    `theta` has 1 + 2 n entries: log g, then n for the zeros, then n for the poles. Roots go in pairs
-    s^2 + 2 zeta w s + w^2 described by (log w, log zeta), real or complex alike, so that the description
-    is smooth where two real roots meet; with odd n the last is a real root -a described by log a.
-    Every theta is a stable d(s) with stable inverse: an optimiser needs no constraint.
+    `theta` has 1 + 2 n entries: log g, then n for the zeros, then n for the poles. A pair of roots, real or complex, is
+    represented by (log w, log zeta) of s^2 + 2 zeta w s + w^2. This parametrisation is smooth where two real roots
+    meet. For odd n the last root -a is real and represented by log a. Every theta gives a stable d(s) with stable
+    inverse: an optimiser needs no constraint.
     """
 
     theta: np.ndarray
@@ -52,7 +51,7 @@ class ScalarScaling:
     @staticmethod
     def from_roots(g: float, zeros: Sequence[complex] | np.ndarray,
                    poles: Sequence[complex] | np.ndarray) -> ScalarScaling:
-        """From the gain at infinite frequency and as many zeros as poles, conjugates included."""
+        """From the gain at infinite frequency and equal numbers of zeros and poles, conjugates included."""
         if len(zeros) != len(poles) or g <= 0:
             raise InputError(f"expected g > 0 and as many zeros as poles, not {g}, {len(zeros)} and {len(poles)}")
         return ScalarScaling(np.concatenate([[np.log(g)], _pair(np.asarray(zeros, complex)),
@@ -64,11 +63,11 @@ class ScalarScaling:
 
     @property
     def scalar(self) -> ScalarScaling:
-        """The part with free parameters: of a scalar scaling all of it."""
+        """The scalar part, which has the free parameters: here the whole scaling."""
         return self
 
     def with_scalar(self, d: ScalarScaling) -> ScalarScaling:
-        """The scaling with that part changed."""
+        """The scaling with its scalar part replaced."""
         return d
 
     @property
@@ -85,7 +84,7 @@ class ScalarScaling:
         return ScalarScaling(np.concatenate([[-self.theta[0]], self.theta[1 + n:], self.theta[1:1 + n]]))
 
     def within(self, band: tuple[float, float]) -> ScalarScaling:
-        """Roots beyond the band [rad/s] moved to its edge, the magnitude kept as it was far inside."""
+        """Move roots beyond the band [rad/s] to its edges; the magnitude far inside the band is unchanged."""
         n, theta = self.order, self.theta.copy()
         for start in (1, 1 + n):
             sign = 1.0 if start == 1 else -1.0
@@ -95,14 +94,14 @@ class ScalarScaling:
                     theta[k] = np.clip(theta[k], np.log(0.05), np.log(50.0))
                     continue
                 moved = np.clip(theta[k], np.log(band[0]), np.log(band[1]))
-                # A factor (s + a) is about a below its corner: a faster root lowered takes gain with it.
+                # A factor (s + a) is about a below its corner: lowering a fast root changes the gain.
                 if moved < theta[k]:
                     theta[0] += sign * (theta[k] - moved) * (1 if k == start + n - 1 and n % 2 else 2)
                 theta[k] = moved
         return ScalarScaling(theta)
 
     def with_neutral_pair(self, omega: float, split: float = 0.0) -> ScalarScaling:
-        """One more zero at omega e^split and pole at omega e^-split: the same d(s) where split = 0."""
+        """Add a zero at -omega e^split and a pole at -omega e^-split; for split = 0 d(s) is unchanged."""
         return ScalarScaling.from_roots(np.exp(self.theta[0]), np.append(self.zeros, -omega * np.exp(split)),
                                         np.append(self.poles, -omega * np.exp(-split)))
 
@@ -113,20 +112,20 @@ class ScalarScaling:
                 - _log_modulus(self.theta[1 + n:], omega)[0])
 
     def jacobian(self, omega: np.ndarray) -> np.ndarray:
-        """Derivative of `log_magnitude` to theta (n_omega, 1 + 2 n)."""
+        """Derivative of `log_magnitude` with respect to theta (n_omega, 1 + 2 n)."""
         n = self.order
         return np.hstack([np.ones((np.size(omega), 1)), _log_modulus(self.theta[1:1 + n], omega)[1],
                           -_log_modulus(self.theta[1 + n:], omega)[1]])
 
     @cached_property
     def matrices(self) -> Matrices:
-        """A, B, C, D of a cascade of first- and second-order sections, slow ones first."""
+        """A, B, C, D of a cascade of first- and second-order sections, slow sections first."""
         n = self.order
         A, B, C, D = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n)), np.exp(self.theta[:1])[:, None]
         zeros, poles = np.exp(self.theta[1:1 + n]), np.exp(self.theta[1 + n:])
         for k in range(0, n, 2):
             section = slice(k, min(k + 2, n))
-            # Fast states first: block upper triangular, as a Schur form is, which keeps eight decades accurate.
+            # Fast states first: A is block upper triangular like a Schur form, which is accurate over eight decades.
             here, before = slice(n - section.stop, n - k), slice(n - k, n)
             a, b, c = _section(zeros[section], poles[section])
             A[here, here], A[here, before], B[here] = a, b @ C[:, before], b @ D
@@ -134,7 +133,7 @@ class ScalarScaling:
         return A, B, C, D
 
     def realise(self) -> StateSpace:
-        """d(s) as a state space."""
+        """d(s) as a state-space system."""
         return StateSpace(*self.matrices)
 
     def as_dict(self) -> dict[str, Any]:
@@ -142,7 +141,7 @@ class ScalarScaling:
 
 
 def _pair(roots: np.ndarray) -> np.ndarray:
-    """(log w, log zeta) of each pair of roots by rising w, then log a of a lone real one."""
+    """(log w, log zeta) of each pair of roots in order of increasing w, then log a of a single real root."""
     if np.any(roots.real >= 0):
         raise InputError("roots must lie in the open left half plane", value=float(np.max(roots.real)))
     real = np.sort(-roots[np.abs(roots.imag) <= 1e-12 * np.abs(roots)].real)
@@ -172,7 +171,7 @@ def _roots(theta: np.ndarray) -> np.ndarray:
 
 
 def _log_modulus(theta: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """log |product of factors at j omega| (n_omega,) and its derivative to theta (n_omega, n)."""
+    """log |product of factors at j omega| (n_omega,) and its derivative with respect to theta (n_omega, n)."""
     omega = np.atleast_1d(np.asarray(omega, float))
     value, slope = np.zeros(omega.size), np.zeros((omega.size, theta.size))
     for k in range(theta.size // 2):
@@ -189,23 +188,23 @@ def _log_modulus(theta: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _section(zeros: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, b, c of 1 + c inv(s - A) b for a pair (w, zeta) of zeros over one of poles, or for lone roots (a,)."""
+    """A, b, c of 1 + c inv(s I - A) b for pairs (w, zeta) of zeros and of poles, or for single real roots (a,)."""
     if zeros.size == 1:
         a, b, c = np.array([[-poles[0]]]), np.ones((1, 1)), np.array([[zeros[0] - poles[0]]])
     else:
         (wz, zz), (wp, zp) = zeros, poles
         a, b = np.array([[0.0, wp], [-wp, -2 * zp * wp]]), np.array([[0.0], [1.0]])
         c = np.array([[(wz ** 2 - wp ** 2) / wp, 2 * zz * wz - 2 * zp * wp]])
-    # b and c of like size, smoothly in the roots even where they cancel
+    # b and c of similar size, as a smooth function of the roots even if they cancel
     root = (np.sum(c ** 2) + (0.01 * poles[0]) ** 2) ** 0.25
     return a, b * root, c / root
 
 
 @dataclass(frozen=True, eq=False)
 class MatrixScaling:
-    """Square D(s) = d(s) F(s) of a repeated scalar block; F is a state space with stable zeros and poles.
+    """Square D(s) = d(s) F(s) of a repeated scalar block; F is a system with stable zeros and poles.
 
-    Most often a constant F is enough. The factor has few parameters, which are refined together with the scalings of
+    A constant F is usually sufficient. The factor d has few parameters, which are refined jointly with the scalings of
     the other blocks.
     """
 
@@ -237,7 +236,7 @@ class MatrixScaling:
         return MatrixScaling(StateSpace(*_inverse(self.system)), self.factor.inverse())
 
     def response(self, omega: np.ndarray) -> np.ndarray:
-        """|d| F (n_omega, n, n) at omega [rad/s]: without the phase of the factor, which changes no singular value."""
+        """|d| F (n_omega, n, n) at omega [rad/s], without the phase of d, which changes no singular value."""
         return np.exp(self.factor.log_magnitude(omega))[:, None, None] * self.system.frequency_response(omega)
 
     @property
@@ -261,10 +260,10 @@ Part = ScalarScaling | MatrixScaling
 
 @dataclass(frozen=True, eq=False)
 class Scalings:
-    """One scaling a block of the structure; the last block is the performance and has d = 1.
+    """One scaling per block of the structure; the last block is the performance block and has d = 1.
 
-    groups : number of the group of each block; the scalings of a group, all of them scalar, have the same roots, and
-        their signals share the states where they depend on each other. Empty: each block by itself.
+    groups : group number of each block. The scalings of a group are scalar and have the same roots; linearly dependent
+        signals of a group share states. Empty: every block is a group of its own.
     """
 
     structure: BlockStructure
@@ -278,7 +277,7 @@ class Scalings:
 
     @staticmethod
     def uniform(structure: BlockStructure, d: float) -> Scalings:
-        """The constant d > 0 for every block but the performance."""
+        """The constant d > 0 for every block except performance."""
         parts = [MatrixScaling(gain(d * np.eye(b.rows))) if b.repeated else ScalarScaling.constant(d)
                  for b in structure.blocks[:-1]]
         return Scalings(structure, (*parts, ScalarScaling.constant(1.0)))
@@ -290,15 +289,15 @@ class Scalings:
 
     @property
     def members(self) -> tuple[tuple[int, ...], ...]:
-        """The blocks of each group, all but the performance."""
+        """The blocks of each group, without the performance block."""
         found: dict[int, list[int]] = {}
         for k in range(len(self.parts) - 1):
             found.setdefault(self.groups[k] if self.groups else k, []).append(k)
         return tuple(tuple(blocks) for blocks in found.values())
 
     def places(self) -> list[np.ndarray]:
-        """Where each block but the performance has its parameters in the vector of all: its gain, then the roots, which
-        are those of its group."""
+        """Indices of each block's parameters (without performance) in the vector of all parameters: the gain of the
+        block, then the roots of its group."""
         found: list[np.ndarray] = [np.zeros(0, int)] * (len(self.parts) - 1)
         first = {k: blocks[0] for blocks in self.members for k in blocks}
         size = 0
@@ -312,12 +311,12 @@ class Scalings:
 
     @property
     def added_states(self) -> int:
-        """Most states the scaled plant has more than the plant."""
+        """Maximum number of states that the scalings add to the plant."""
         return sum(part.order * (2 if isinstance(part, MatrixScaling) else block.rows + block.cols)
                    for part, block in zip(self.parts, self.structure.blocks, strict=True))
 
     def replace(self, index: int, part: Part) -> Scalings:
-        """The same scalings with one block's changed."""
+        """The same scalings with that of one block replaced."""
         return replace(self, parts=(*self.parts[:index], part, *self.parts[index + 1:]))
 
     def left(self) -> StateSpace:
@@ -347,7 +346,7 @@ class Scalings:
         return left, right
 
     def scale(self, P: StateSpace) -> StateSpace:
-        """diag(D_z, I) P diag(D_w^-1, I): the plant whose H-infinity problem is the K-step."""
+        """diag(D_z, I) P diag(D_w^-1, I): the plant of the H-infinity problem in the K-step."""
         z, w = self.structure.n_z, self.structure.n_w
         Al, Bl, Cl, Dl = self._diagonal(inverse=False, through=np.hstack([P.C, P.D])[:z])
         Ar, Br, Cr, Dr = self._diagonal(inverse=True, through=np.vstack([P.B, P.D])[:, :w].T)
@@ -391,8 +390,8 @@ class Scalings:
     def _diagonal(self, inverse: bool, through: np.ndarray | None = None) -> Matrices:
         """Block-diagonal A, B, C, D of D_z, or of the inverse of D_w.
 
-        through (n_signals, n) : what its signals are made of. Where those of a group depend on each other, d(s) is
-        realised once for each independent combination: exact for these signals only.
+        through (n_signals, n) : matrix that generates the signals. If those of a group are linearly dependent, d(s) is
+        realised once for each independent combination, which is exact for these signals only.
         """
         stack: list[tuple[np.ndarray, Matrices]] = []
         at = [np.arange(w.start, w.stop) if inverse else np.arange(z.start, z.stop)

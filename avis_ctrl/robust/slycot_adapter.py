@@ -1,6 +1,6 @@
-"""SLICOT routines through slycot, as a second opinion: the only module that imports it.
+"""SLICOT routines through slycot, as an independent check: the only module that imports slycot.
 
-The H-infinity norm of every design is computed by it once more; tests and benchmarks compare bounds of mu.
+The H-infinity norm of every design is recomputed with SLICOT; tests and benchmarks compare bounds of mu.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 def mu_upper_slicot(M: Array, blocks: BlockStructure | Sequence[Block]) -> float:
     """Upper bound of mu of one matrix (n, n) by AB13MD (Fan, Tits and Doyle's method).
 
-    Raises InputError for what AB13MD does not treat: repeated scalars and full blocks that are not square.
+    Raises InputError for structures that AB13MD does not support: repeated scalars and non-square full blocks.
     """
     import slycot
 

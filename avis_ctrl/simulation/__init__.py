@@ -1,4 +1,4 @@
-"""The nonlinear table under its digital controller, the linear prediction beside it, and campaigns measured on it."""
+"""Simulation of the nonlinear table under digital control, its linear prediction, and simulated campaigns."""
 
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan

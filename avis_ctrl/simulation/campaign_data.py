@@ -1,8 +1,8 @@
-"""Measurement campaigns from the nonlinear model: what a measurement on a rig would have given.
+"""Measurement campaigns simulated with the nonlinear model, in the form of a measurement on a rig.
 
-Open loop: the drives play the planned voltages and nothing is fed back. Each record is preceded by `settle_s` with the
-drives at zero on the ambient floor, so that a record begins in stationary ambient motion but before anything has
-answered the drives: the first period of a multisine holds a transient, as the contract of a campaign says.
+Open loop: the drives play the planned voltages without feedback. Each record is preceded by `settle_s` with the drives
+at zero on the ambient floor. A record therefore begins in stationary ambient motion but before any response to the
+drives: the first period of a multisine contains a transient, as specified in the contract of a campaign.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan, RecordPlan
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
 from avis_ctrl.simulation.sampled_loop import SampledLoop, rig_bank
 
-# Largest level: the share of the converter's range that the drives' answer may take on the rig as its file has it;
-# the rest is for ambient motion, noise and a table that is not as its file has it.
+# Largest level: fraction of the converter's range for the response to the drives, on the rig as specified in its file.
+# The rest is for ambient motion, noise and the table's differences from its file.
 RANGE_SHARE = 0.8
-# Range of sensors whose rig file has no converter; for the level only, nothing is clipped to it.
+# Range of sensors if the rig file has no converter; used for the level only, without clipping.
 ASSUMED_RANGE_V = 10.0
 DEFAULT_LEVEL_PERCENT = 50.0
-# The amplifiers of rigs with accelerometers, as in design files.
+# Amplifier lag of rigs with accelerometers, as in design files.
 ACCELEROMETER_AMPLIFIER_HZ = 300.0
-# What the draws of a campaign's seed are for; not 0, since trailing zeros do not change a seed.
+# Random streams of a campaign's seed; numbered from 1, since trailing zeros do not change a seed.
 _SIGNALS, _FLOOR, _NOISE, _FLOOR_SENSOR = range(1, 5)
-# What fits into memory: a record takes some 600 bytes a sample while it is simulated, and 150 after that.
+# Limits from memory: a record takes about 600 bytes per sample during its simulation, and 150 afterwards.
 MOST_SAMPLES, MOST_SAMPLES_IN_ALL = 4_000_000, 20_000_000
 
 # (u (samples, n_u) [V], floor (samples, 3) [m/s], time of the first sample [s], first and last time of the campaign
-# [s]) -> (samples, n_y) [V] that effects outside the rig file add to the sensor signals
+# [s]) -> (samples, n_y) [V] added to the sensor signals by effects outside the rig file
 SensorChange = Callable[[np.ndarray, np.ndarray, float, tuple[float, float]], np.ndarray]
-# (records done, records in all, name of the one just done)
+# (records done, records in all, name of the latest record)
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Planned:
-    """One record to come: what is played (samples, n_u) [V], over how many samples, out of which line of the plan."""
+    """A planned record: its excitation u (samples, n_u) [V], and the line of the plan that it belongs to."""
 
     plan: RecordPlan
     u: np.ndarray
@@ -61,20 +61,20 @@ class _Planned:
 
 def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig | None = None,
                       change: SensorChange | None = None, progress: Progress | None = None) -> Campaign:
-    """The records of the plan, with notes of levels, clipping and what was assumed.
+    """Simulate the records of the plan; the notes state levels, clipping and assumptions.
 
     Parameters
     ----------
-    rig : as its file has it; sensors, converter, delay, limits and levels are its.
+    rig : as specified in its file; provides sensors, converter, delay, limits and levels.
     seed : of all signals, floors and noise; the same seed gives the same campaign.
-    truth : the table that moves; `rig` by default (`perturbed_truth` makes one).
-    change : what the effects of the plan add to the sensor signals; required where the plan has effects.
+    truth : the simulated table, with its sensor chains; `rig` by default (`perturbed_truth` makes one).
+    change : what the effects of the plan add to the sensor signals; required if the plan has effects.
 
     Raises
     ------
     InputError : a plan that the rig cannot follow: a level beyond the limit, a band beyond half the sample rate, a
         multisine record shorter than two periods, no ambient motion in plan or rig, no sensors.
-    ComputationError : a table that leaves its stops.
+    ComputationError : the table goes beyond its stops.
     """
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
@@ -100,10 +100,10 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
 
 
 def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
-    """The rig with its sensors as the plan has them, and no controller."""
+    """The rig without controller, with its sensors as specified in the plan."""
     corner = plan.amplifier_corner_Hz
-    # What the controller does in each channel does not act on what is recorded.
-    # Offset and 1/f noise are left out: a campaign's noise model is white.
+    # The controller's conditioning of each channel does not affect the records. Offset and 1/f noise are omitted: a
+    # campaign's noise model is white.
     bank = replace(rig_bank(rig, 1.0).white(), conditioning=None)
     if "acceleration" in bank.quantities:
         corner = corner or ACCELEROMETER_AMPLIFIER_HZ
@@ -127,7 +127,7 @@ def _ambient(rig: Rig, plan: CampaignPlan) -> SpectrumModel | None:
 
 
 def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Planned]:
-    """Every record of the plan in order, at its level."""
+    """All records of the plan in order, at their levels."""
     fs, dealt, total = loop.sample_rate_Hz, 0, 0
     for line, one in enumerate(plan.record):
         samples = round((one.duration_s or plan.duration_s) * fs)
@@ -165,10 +165,10 @@ def _check_floor_band(band_Hz: list[float], samples: int, fs: float, field: str)
 
 def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int, dealt: int,
            seed: int) -> ExcitationSignals:
-    """The signals of one line of the plan, as large as the drives allow."""
+    """Signals of one line of the plan, at the largest level that the drives allow."""
     fs, names = loop.sample_rate_Hz, loop.rig.equations_of_motion().actuators
     low, high = one.band_Hz or plan.band_Hz
-    limit_V = float(loop.limits_V.min())  # all drives are driven alike
+    limit_V = float(loop.limits_V.min())  # the same level for all drives
     if one.excitation == "noise":
         return noise(NoiseSettings(names, fs, samples / fs, (low, high), limit_V, None, one.records, seed))
     m = plan.multisine
@@ -181,15 +181,15 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
 
 
 def _played(u: np.ndarray, samples: int) -> np.ndarray:
-    """u from its start, repeated as long as the record lasts."""
+    """u repeated from its start for the length of the record."""
     return np.resize(u, (samples, u.shape[1]))
 
 
 def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -> float:
-    """R.m.s. [V] up to which neither drives nor converter clip, by a linear noise-free run of each record.
+    """Largest r.m.s. [V] at which neither drives nor converter clip, from a linear noise-free run of each record.
 
-    On the rig as its file has it; RANGE_SHARE of the converter's range is for the answer to the drives. Where there is
-    no converter, ASSUMED_RANGE_V stands for its range.
+    Computed for the rig as specified in its file. RANGE_SHARE of the converter's range is for the response to the
+    drives; without a converter, its range is taken as ASSUMED_RANGE_V.
     """
     most = signals.scaled_to()
     level, range_V = float(np.mean(most.rms_V)), ASSUMED_RANGE_V
@@ -204,7 +204,7 @@ def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -
 
 def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None, seed: tuple[int, ...],
          nonlinear: bool) -> SimulationRecord:
-    """u (samples, n_u) after `settle` samples of silence, without noise when floor is None."""
+    """Simulate u (samples, n_u) after `settle` samples of zero voltage; without noise if floor is None."""
     samples, fs = settle + len(u), loop.sample_rate_Hz
     if floor is None:
         floor = np.zeros((samples + 1, 6))
@@ -246,7 +246,7 @@ def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spect
 
 def _floor(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None, settle: int,
            rng: np.random.Generator) -> np.ndarray:
-    """(settle + samples + 1, 6) floor velocity: ambient throughout, shaken during the record."""
+    """(settle + samples + 1, 6) floor velocity: ambient throughout, with added shaking during the record."""
     fs, samples = loop.sample_rate_Hz, settle + len(one.u)
     velocity = np.zeros((samples + 1, 6))
     if ambient is not None:
@@ -255,7 +255,7 @@ def _floor(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spectr
     if one.plan.floor_rms_m_per_s is not None:
         low, high = one.plan.band_Hz or plan.band_Hz
         velocity[settle:-1, :3] += one.plan.floor_rms_m_per_s * band_limited(len(one.u), fs, (low, high), 3, rng)
-    velocity[-1] = velocity[-2]  # ends the step behind the last sample, which nothing records
+    velocity[-1] = velocity[-2]  # end of the step after the last sample, which is not recorded
     return velocity
 
 

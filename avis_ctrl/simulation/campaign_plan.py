@@ -1,4 +1,4 @@
-"""What to record in a simulated measurement campaign. Read from a file by `avis_ctrl.study.plan_file`."""
+"""Plan of a simulated measurement campaign. Read from a file by `avis_ctrl.study.plan_file`."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ Spread = Annotated[float, Field(ge=0, lt=100)]
 
 
 class RecordPlan(Section):
-    """One record, or a set of them at one level.
+    """One record, or a set of records at one level.
 
-    level_V : r.m.s. of every drive. level_percent : instead, a share of the largest level at which neither drives nor
-        converter clip on the rig as its file has it; 50 where neither is given.
-    records : how many, with other draws; an orthogonal multisine takes as many again as the rig has drives.
-    floor_rms_m_per_s : r.m.s. velocity of the shaken floor along each of x, y, z, on top of what is ambient.
-    duration_s, band_Hz : the plan's where absent.
+    level_V : r.m.s. of every drive. level_percent : instead, percentage of the largest level at which neither drives
+        nor converter clip on the rig as specified in its file; 50 if neither is given.
+    records : number of records with different random draws; for an orthogonal multisine, multiplied by the number of
+        drives.
+    floor_rms_m_per_s : r.m.s. velocity of the shaken floor along each of x, y, z, added to the ambient motion.
+    duration_s, band_Hz : the campaign plan's by default.
     """
 
     excitation: Literal["multisine", "noise", "rest", "floor"]
@@ -53,7 +54,7 @@ class RecordPlan(Section):
 
 
 class MultisinePlan(Section):
-    """As `avis_ctrl.measurement.excitation.MultisineSettings`."""
+    """Fields as in `avis_ctrl.measurement.excitation.MultisineSettings`."""
 
     period_s: Duration = 10.0
     lines: Literal["full", "odd", "odd_detection"] = "full"
@@ -65,9 +66,9 @@ class MultisinePlan(Section):
 
 
 class AmbientPlan(Section):
-    """Floor motion that is always there, along x, y and z, independent: a measured shape at the level of the site.
+    """Ambient floor motion, independent along x, y and z: a measured spectral shape scaled to the level of the site.
 
-    velocity_rms_m_per_s : in band_Hz; what the rig's file says where absent, 0 for a floor at rest.
+    velocity_rms_m_per_s : in band_Hz; from the rig's file by default, 0 for a floor at rest.
     """
 
     spectrum: Spectrum = "kamioka_quiet"
@@ -76,21 +77,22 @@ class AmbientPlan(Section):
 
 
 class FloorSensorPlan(Section):
-    """Whether the floor's velocity is recorded, and the white noise of one sample of that measurement."""
+    """Whether the floor's velocity is recorded, and the white noise per sample of that measurement."""
 
     recorded: bool = True
     noise_rms_m_per_s: NotNegative = 0.0
 
 
 class SensorPlan(Section):
-    """Switches for what the rig's file says of noise and quantiser."""
+    """Switches for the sensor noise and the quantiser specified in the rig's file."""
 
     noise: bool = True
     quantiser: bool = True
 
 
 class TruthPlan(Section):
-    """How far the table that moves differs from the rig's file: each parameter by a uniform draw within these percent.
+    """How far the simulated table differs from the rig's file: each parameter is drawn uniformly within these
+    percentages.
 
     perturb_percent : stiffness, mass and inertia. perturb_damping_percent : damping.
     nonlinear : False for the table linearised about rest.
@@ -102,9 +104,9 @@ class TruthPlan(Section):
 
 
 class EffectPlan(Section):
-    """An effect of the table that its rig file does not contain: of the library of `avis gap`, or of the user's own.
+    """An effect of the table that its rig file does not contain, from the library of `avis gap` or defined by the user.
 
-    place : where it acts; may be left out where there is only one. values : its parameters by name, in their units.
+    place : where it acts; optional if only one place is possible. values : its parameters by name, in their units.
     """
 
     name: str
@@ -116,8 +118,8 @@ class CampaignPlan(Section):
     """A whole campaign.
 
     settle_s : time with the drives at zero before each record, on the ambient floor.
-    amplifier_corner_Hz : first-order lag of the amplifiers; none where absent, but 300 Hz for rigs with
-        accelerometers, which cannot be simulated without.
+    amplifier_corner_Hz : first-order lag of the amplifiers. Default: none, or 300 Hz for rigs with accelerometers,
+        which cannot be simulated without a lag.
     """
 
     title: str = ""

@@ -1,4 +1,4 @@
-"""Why a closed loop is unstable: the axes that move in its unstable mode, and the loops that cause it."""
+"""Cause of an unstable closed loop: the axes that move in its unstable mode, and the loops responsible."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Culprit:
     Attributes
     ----------
     plant : name of the plant. radius : spectral radius of its loop over one sample period.
-    frequency_Hz, growth_per_s : of the fastest-growing mode; the growth rate is negative if only the nonlinear
-        simulation diverges, and no loop is named then.
-    axes : coordinates that move most in that mode, the largest first, rotations as displacement of the edge.
+    frequency_Hz, growth_per_s : of the fastest-growing mode; if only the nonlinear simulation diverges, the growth rate
+        is negative and no loop is named.
+    axes : coordinates with the largest motion in that mode, in descending order, rotations as displacement of the edge.
     kind : "table" (unstable without control), "controller" (unstable with the design's controller alone), "companions"
         (unstable with the other axes' loops alone), "together" (only with both), "nonlinear" (only the simulation
         diverges).
-    loops : axes of the smallest set of other axes' loops without which this plant is stable; empty if there is none.
+    loops : axes of the smallest set of other axes' loops whose removal makes this plant stable; empty if there is none.
     """
 
     plant: str
@@ -39,7 +39,7 @@ class Culprit:
     loops: tuple[str, ...] = ()
 
     def words(self) -> str:
-        """The cause, with frequency and growth of the motion."""
+        """The cause, with frequency and growth rate of the motion."""
         at = f"(plant \"{self.plant}\", spectral radius {self.radius:.6f})"
         if self.kind == "nonlinear":
             return f"the nonlinear simulation diverges although the linear loop is stable {at}"
@@ -56,7 +56,7 @@ class Culprit:
 
 
 def find_culprit(loop: SampledLoop) -> Culprit:
-    """The cause of the instability of one plant's loop; no loop is named if its linear loop is stable."""
+    """Cause of the instability of one plant's loop; no loop is named if the linear loop is stable."""
     values, vectors = la.eig(period_map(loop))
     most = int(np.argmax(np.abs(values)))
     rate = np.log(values[most]) * loop.sample_rate_Hz

@@ -1,4 +1,4 @@
-"""The simulation check of a design: many plants under one controller, each with its pass or fail."""
+"""Simulation check of a design: many plants under one controller, with a pass or fail for each."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from avis_ctrl.simulation.spectrum_check import SpectrumAgreement, check_spectru
 
 @dataclass(frozen=True, eq=False)
 class PlantCheck:
-    """One plant's line of the report.
+    """Result for one plant, one line of the report.
 
     Attributes
     ----------
-    diverged : the nonlinear simulation left the stops.
-    spectral_radius : of the linear sampled loop; an instability too slow for the simulated time shows here.
-    spectrum : agreement with the linear prediction; None where the run diverged.
-    peak_V, limit_V : largest demanded voltage of the drive that comes nearest to its limit, and that limit.
-    rms_V : of the demanded voltages, the largest of all drives.
-    clipped_dac, clipped_adc : samples beyond the limits.
+    diverged : the nonlinear simulation went beyond the stops.
+    spectral_radius : of the linear sampled loop; reveals an instability too slow for the simulated time.
+    spectrum : agreement with the linear prediction; None if the run diverged or the linear loop is unstable.
+    peak_V, limit_V : largest demanded voltage of the drive that comes closest to its limit, and that limit.
+    rms_V : of the demanded voltages, maximum over the drives.
+    clipped_dac, clipped_adc : number of samples beyond the limits.
     payload_rms : r.m.s. velocity by controlled axis [m/s], rotations at the edge.
     """
 
@@ -48,7 +48,7 @@ class PlantCheck:
 
     @property
     def within_limits(self) -> bool:
-        """No voltage beyond its limit, at the drives or at the converter."""
+        """No voltage exceeds its limit, at the drives or at the converter."""
         return self.clipped_dac == 0 and self.clipped_adc == 0
 
     @property
@@ -69,7 +69,7 @@ class PlantCheck:
 
 @dataclass(frozen=True, eq=False)
 class SimulationCheck:
-    """All plants; `first` is the full record of the first one, for plotting against time."""
+    """Results for all plants; `first` is the full record of the first plant, for time plots."""
 
     plants: tuple[PlantCheck, ...]
     duration_s: float
@@ -82,24 +82,24 @@ class SimulationCheck:
         return all(plant.passed for plant in self.plants)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-able summary, without time series and line spectra."""
+        """JSON-serialisable summary, without time series and line spectra."""
         return {"passed": self.passed, "duration_s": self.duration_s, "seed": self.seed,
                 "false_alarm": self.false_alarm, "plants": [plant.as_dict() for plant in self.plants]}
 
 
 def check_designs(loops: Sequence[SampledLoop], duration_s: float = 60.0, seed: int = 1,
                   false_alarm: float = 0.01) -> SimulationCheck:
-    """Simulate each loop with floor and noise of its own, and judge it.
+    """Simulate each loop with its own floor motion and noise, and judge it.
 
     Parameters
     ----------
     loops : nominal first, then the worst case and the random plants; their names head the lines.
     seed : loop k draws from (seed, k).
-    false_alarm : probability that chance alone makes any band of any plant disagree.
+    false_alarm : probability that by noise alone any band of any plant disagrees.
 
     Raises
     ------
-    InputError : no loops; what `simulate` and `check_spectrum_agreement` raise.
+    InputError : no loops; errors of `simulate` and `check_spectrum_agreement`.
     """
     if not loops:
         raise InputError("at least one loop", field="loops", value=[])
@@ -111,7 +111,7 @@ def check_designs(loops: Sequence[SampledLoop], duration_s: float = 60.0, seed: 
 
 def judge(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
           false_alarm: float = 0.01) -> PlantCheck:
-    """One record's line."""
+    """Check of one simulation record."""
     loop = record.loop
     radius = spectral_radius(loop)
     # Without a stable linear loop there is no stationary spectrum to predict.

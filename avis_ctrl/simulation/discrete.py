@@ -1,10 +1,10 @@
-"""The loop made discrete: the digital controller, and the exact step of everything that is linear.
+"""Discretisation of the loop: the digital controller, and an exact step of everything that is linear.
 
-Between two instants the linear part (table linearised about rest, drives, sensor chains) is advanced exactly, with
-voltages held and floor velocity linear. What the nonlinear table adds, its excess acceleration N, is extrapolated
-linearly from the last two instants: the exponential Adams-Bashforth method of second order, ETD2 of Cox and Matthews,
-J. Comput. Phys. 176 (2002), eq. 6. At micrometre amplitudes N is parts per million of the whole, so that a
-second-order error in it vanishes, at one evaluation a step.
+Over each step the linear part (table linearised about rest, drives, sensor chains) is advanced exactly, with constant
+voltages and linearly varying floor velocity. The contribution of the nonlinear table, its excess acceleration N, is
+extrapolated linearly from the last two steps: the exponential Adams-Bashforth method of second order, ETD2 of Cox and
+Matthews, J. Comput. Phys. 176 (2002), eq. 6. At micrometre amplitudes N is parts per million of the total acceleration,
+so its second-order error is negligible, at one evaluation per step.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ N_Q = len(COORDINATES)
 class StepArrays(NamedTuple):
     """The loop as C-contiguous arrays, for compiled code. x = (q, q', q_floor, states of drives and sensors).
 
-    advance : (n, n + n_u + 24), x after a substep from (x, volts, floor velocity now, and at its end, N, N - N before)
+    advance : (n, n + n_u + 24), x after a substep from (x, volts, floor velocity at its start and end, N, N - N before)
     observe : (n_u + 6, n + n_u + 6), volts at the motors and linear acceleration from (x, volts, floor velocity)
     sense : (n_s, n + 12), sensor volts from (x, floor velocity, N)
     control : (n_c + n_u, n_c + n_s), controller state and demanded volts from (controller state, sensor volts)
@@ -46,11 +46,11 @@ class StepArrays(NamedTuple):
 
 
 def sampled(system: StateSpace, period_s: float) -> StateSpace:
-    """The system at that sample time: by Tustin's rule, or as it is when already sampled so.
+    """The system discretised by Tustin's rule, or unchanged if it is already sampled with that period.
 
-    Tustin's rule bends frequency: at 50 Hz and 1 kHz by 0.8 %, well inside the band of these loops, so that no
-    frequency is singled out for prewarping. A pole much faster than the clock becomes one near -1, which rings at half
-    the sample rate: let a controller's fast poles be removed before, as its fastest pole tells.
+    At 50 Hz and 1 kHz sampling, Tustin's rule warps frequency by 0.8 %. This is small within the band of these loops,
+    so no frequency is prewarped. A pole much faster than the sample rate becomes one near -1, which rings at half the
+    sample rate: remove such controller poles beforehand (the reported fastest pole shows them).
     """
     if system.dt and abs(system.dt - period_s) > 1e-9 * period_s:
         raise InputError(f"a continuous system, or one sampled at {period_s:g} s", field="dt", value=system.dt)
@@ -58,12 +58,12 @@ def sampled(system: StateSpace, period_s: float) -> StateSpace:
 
 
 def digital_controller(loop: SampledLoop) -> StateSpace:
-    """Sensor volts to demanded drive volts, sampled: what the processor computes, limits aside."""
+    """Sampled controller from sensor volts to demanded drive volts: what the processor computes, without limits."""
     if loop.digital is not None:
         return loop.digital
     rig, bank, T = loop.rig, loop.sensors, loop.period_s
     names = (*loop.axes, *loop.loops)
-    if not names:  # nothing is controlled, and nothing need be told apart by the sensors
+    if not names:  # nothing is controlled; the sensors need not be decoded
         return gain(np.zeros((loop.n_drives, len(bank.chains))), dt=T)
     arms = lever_arms(rig)[[COORDINATES.index(name) for name in names]]
     allocation, decoding = loop_axes(rig, loop.axes, tuple(loop.loops))
@@ -74,17 +74,18 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
         parts = [gain(1.0, dt=T) if one is None else sampled(one, T) for one in bank.filters]
         seen = seen @ append(*parts)
     elif bank.filters[0] is not None:
-        # The same filter in every channel commutes with the decoding: one copy an axis is enough.
+        # The same filter in every channel commutes with the decoding: one copy per axis is enough.
         seen = append(*[sampled(bank.filters[0], T)] * len(names)) @ seen
-    # A force F at the edge is a moment of arm times F.
+    # A force F at the edge is a moment arm * F.
     return gain(allocation * arms, dt=T) @ forces @ seen
 
 
 def loop_axes(rig: Rig, axes: Sequence[str], loops: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Allocation (n_u, n) and decoding (n, n_s) of the controlled axes and of those under loops of their own.
+    """Allocation (n_u, n) and decoding (n, n_s) of the controller's axes and of the axes with separate loops.
 
-    If drives and sensors span all six coordinates, the axes are decoupled. If not, the axes of the controller are those
-    it was designed for, whatever else is controlled, and the axis of each loop is decoupled as if it were alone.
+    If the drives and the sensors, all inertial, span all six coordinates, all axes are decoupled. Otherwise the
+    controller's axes are those of its design, regardless of the separate loops, and each separate axis is decoupled as
+    if it were alone.
     """
     whole = (*axes, *loops)
     together = actuator_axes(rig, whole), sensor_axes(rig, whole)
@@ -100,16 +101,16 @@ def _small(leftover: np.ndarray) -> bool:
 
 
 def linear_part(loop: SampledLoop) -> StateSpace:
-    """Table linearised, drives and sensors: from volts, floor velocity [m/s, rad/s] and excess acceleration.
+    """Linearised table, drives and sensors: from volts, floor velocity [m/s, rad/s] and excess acceleration.
 
-    Inputs "NAME_dac", "floor_C_dot", "excess_C"; outputs motor volts "NAME", "C_ddot" without the excess,
-    "C_dot" and sensor volts "NAME_volt". The first states are q, q', q_floor.
+    Inputs "NAME_dac", "floor_C_dot", "excess_C"; outputs motor volts "NAME", "C_ddot" without the excess, "C_dot" and
+    sensor volts "NAME_volt". The first states are q, q', q_floor.
     """
     eom = loop.plant.mounted_body().equations_of_motion()
     sensor_names, H = loop.plant.sensor_rows()
     tilt = loop.plant.tilt_rows() if loop.gravity else np.zeros_like(H)
     parts = {"table": _table(eom, H, tilt, sensor_names, loop.sensors.quantities)}
-    # Where drives couple, what leaves an amplifier is not yet what acts.
+    # With drive coupling, the amplifier outputs are not yet the voltages that act.
     made = eom.actuators if loop.drive_coupling is None else tuple(f"{name}_alone" for name in eom.actuators)
     for name, alone, drive in zip(eom.actuators, made, loop.drives(), strict=True):
         parts[f"drive {name}"] = drive.renamed([f"{name}_dac"], [alone])
@@ -130,8 +131,8 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tup
            quantities: tuple[str, ...]) -> StateSpace:
     """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f).
 
-    "NAME_motion" along each sensor; apparent acceleration by gravity, tilt q, is part of acceleration, and
-    "NAME_tilt" beside velocity.
+    "NAME_motion" is the motion along each sensor's axis. The apparent acceleration due to gravity, tilt q, is included
+    for accelerometers and is the separate output "NAME_tilt" for velocity sensors.
     """
     n_u, zero, one = len(eom.actuators), np.zeros((N_Q, N_Q)), np.eye(N_Q)
     acceleration_x = la.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.K_floor]))
@@ -157,7 +158,8 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tup
 
 
 def held_and_ramped(A: np.ndarray, B: np.ndarray, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Exact step of x' = A x + B e: e^(A h), and what e = 1 and e = t/h add over the step (Van Loan 1978)."""
+    """Exact step of x' = A x + B e: e^(A h), and the contributions of e = 1 and e = t/h over the step (Van Loan 1978).
+    """
     n, m = B.shape
     block = np.zeros((n + 2 * m, n + 2 * m))
     block[:n, :n], block[:n, n:n + m] = A * step_s, B * step_s
@@ -167,7 +169,7 @@ def held_and_ramped(A: np.ndarray, B: np.ndarray, step_s: float) -> tuple[np.nda
 
 
 def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
-    """Pack a loop; each of its substeps is divided by `extra_substeps` once more."""
+    """Arrays of a loop; each of its substeps is divided further by `extra_substeps`."""
     linear, controller = linear_part(loop), digital_controller(loop)
     n_u, n_s = loop.n_drives, len(loop.sensors.chains)
     volts, floor, excess = slice(0, n_u), slice(n_u, n_u + N_Q), slice(n_u + N_Q, n_u + 2 * N_Q)
@@ -184,9 +186,9 @@ def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
 
 @dataclass(frozen=True, eq=False)
 class RestState:
-    """Linear loop at rest with constant offsets of its channels and a floor at rest.
+    """Equilibrium of the linear loop with constant sensor offsets and a floor at rest.
 
-    volts : (n_u,) demanded. state : of `linear_part`. controller : of the digital controller.
+    volts : (n_u,) demanded. state : of `linear_part`. controller : state of the digital controller.
     """
 
     volts: np.ndarray
@@ -195,7 +197,7 @@ class RestState:
 
 
 def rest_state(loop: SampledLoop) -> RestState:
-    """Where the loop rests with `loop.sensors.offset_V`; limits and rounding are left out."""
+    """Equilibrium of the loop with `loop.sensors.offset_V`, without limits and quantisation."""
     linear, K = linear_part(loop), digital_controller(loop)
     n_s, n_u = len(loop.sensors.chains), loop.n_drives
     free = np.r_[:2 * N_Q, 3 * N_Q:linear.nstates]
@@ -210,7 +212,7 @@ def rest_state(loop: SampledLoop) -> RestState:
 
 
 def gain_at_rest(K: StateSpace) -> np.ndarray:
-    """(n_u, n_y) of a system at zero frequency; inf where it has a pole there."""
+    """(n_u, n_y) DC gain of a system; inf if it has a pole at zero frequency."""
     edge = np.eye(K.nstates) - K.A if K.dt else -K.A
     try:
         return K.D + K.C @ np.linalg.solve(edge, K.B)
@@ -219,15 +221,13 @@ def gain_at_rest(K: StateSpace) -> np.ndarray:
 
 
 def spectral_radius(loop: SampledLoop) -> float:
-    """Largest modulus of the poles of the linear loop over one control period: stable below 1.
-
-    Exact: the eigenvalues of `period_map`.
-    """
+    """Largest modulus of the poles of the linear loop over one control period (eigenvalues of `period_map`): stable
+    below 1."""
     return float(np.max(np.abs(la.eigvals(period_map(loop)))))
 
 
 def period_map(loop: SampledLoop) -> np.ndarray:
-    """(n, n) the linear loop from one sample to the next: table, drives, sensors, controller, voltages on their way.
+    """(n, n) map of the linear loop from one sample to the next: table, drives, sensors, controller, delayed voltages.
 
     The state begins with q and q'.
     """
@@ -235,13 +235,13 @@ def period_map(loop: SampledLoop) -> np.ndarray:
 
 
 def disturbed_period_map(loop: SampledLoop) -> tuple[np.ndarray, np.ndarray]:
-    """`period_map`, and (n, n_c + n_u) what is added to the controller's next state and to its voltages makes of it."""
+    """`period_map`, and the (n, n_c + n_u) map of additive disturbances of the controller's next state and voltages."""
     arrays = step_arrays(loop)
     n, n_u = arrays.advance.shape[0], loop.n_drives
     n_c = arrays.control.shape[0] - n_u
-    free = np.r_[:2 * N_Q, 3 * N_Q:n]  # the floor does not feel the loop
+    free = np.r_[:2 * N_Q, 3 * N_Q:n]  # the loop does not act on the floor
     whole, late = divmod(loop.delay_substeps, loop.substeps)
-    # State over a period: x, controller, voltages computed and not yet applied (newest first); then what is added.
+    # State over a period: x, controller, voltages computed and not yet applied (newest first); then the disturbances.
     pending = whole + 1
     size = len(free) + n_c + n_u * pending
     unit = np.eye(size + n_c + n_u)

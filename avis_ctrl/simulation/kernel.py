@@ -1,8 +1,8 @@
-"""The compiled inner loop of the simulation: a few matrix-vector products and one evaluation of the table a step.
+"""Compiled inner loop of the simulation: a few matrix-vector products and one evaluation of the table per step.
 
-Plain loops throughout: slice assignments and calls of BLAS would double the time of compilation and save none after it.
-The cache of compiled code looks at the date of this file only: after a change in `rigs.nonlinear` or `rigs.converter`,
-delete the .nbi and .nbc files of this package (numba's rule for functions of other files).
+Plain loops are used throughout: slice assignments and BLAS calls would double the compilation time without a faster
+run. numba's cache of compiled code checks the date of this file only: after a change in `rigs.nonlinear` or
+`rigs.converter`, delete the .nbi and .nbc files of this package.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _quantise = njit(cache=True)(quantise)
 
 
 class Records(NamedTuple):
-    """Rows at the samples: (n, 6) payload, (n, n_u) held and demanded volts, (n, n_s) volts at the converter."""
+    """One row per sample: (n, 6) payload motion, (n, n_u) held and demanded volts, (n, n_s) volts at the converter."""
 
     q: np.ndarray
     q_dot: np.ndarray
@@ -30,13 +30,14 @@ class Records(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What changes from step to step.
+    """State and buffers that change from step to step.
 
     x : state of the linear part. u, w, w_end : held volts, floor velocity at the start and end of the step.
-    N, N_before : excess acceleration now and a step ago.
-    line : (delay + 1, n_u) voltages on their way, by the step of their arrival. excess : (n_u,) of the anti-windup.
-    advance_in, observe_in, sense_in, control_in : what each matrix of the step is multiplied with; the last keeps
-        the controller's state. observed, sensed, controlled : what comes out.
+    N, N_before : excess acceleration now and one step before.
+    line : (delay + 1, n_u) circular buffer of delayed voltages, by the step at which they act. excess : (n_u,) state of
+        the anti-windup.
+    advance_in, observe_in, sense_in, control_in : vectors multiplied by the matrices of the step; control_in also
+        stores the controller's state. observed, sensed, controlled : the products.
     """
 
     x: np.ndarray
@@ -57,7 +58,7 @@ class Work(NamedTuple):
 
 
 def workspace(arrays: StepArrays, state: np.ndarray, delay: int) -> Work:
-    """A loop that starts in `state` with its controller at rest; delay in steps."""
+    """Work arrays of a loop that starts in `state` with its controller at rest; delay in steps."""
     matrices = (arrays.advance, arrays.observe, arrays.sense, arrays.control)
     n_u = arrays.observe.shape[0] - 6
     w, w_end, N, N_before = np.zeros((4, 6))
@@ -85,7 +86,7 @@ def _put(out, start, values):
 
 @njit(cache=True)
 def _arrive(work, floor, k, j, substeps, step):
-    """Floor velocity over substep j of period k, and the voltages that arrive at its start."""
+    """Floor velocity over substep j of period k, and the voltages that start to act at its beginning."""
     delay = work.line.shape[0] - 1
     for i in range(6):
         rise = (floor[k + 1, i] - floor[k, i]) / substeps
@@ -96,7 +97,7 @@ def _arrive(work, floor, k, j, substeps, step):
 
 @njit(cache=True)
 def _excess(arrays, work):
-    """N: the nonlinear table's acceleration less the linear one's."""
+    """N: acceleration of the nonlinear table minus that of the linear table."""
     x, n, n_u = work.x, work.x.shape[0], work.u.shape[0]
     _put(work.observe_in, 0, x)
     _put(work.observe_in, n, work.u)
@@ -109,7 +110,7 @@ def _excess(arrays, work):
 
 @njit(cache=True)
 def _sense(arrays, work, noise, adc, sensed_row):
-    """The converter's reading of sample noise (n_s,) and motion, as the controller's input."""
+    """Converter readings for the present motion and sample noise (n_s,), as the controller's input."""
     n, n_s = work.x.shape[0], work.sensed.shape[0]
     n_c = work.control_in.shape[0] - n_s
     _put(work.sense_in, 0, work.x)
@@ -124,7 +125,7 @@ def _sense(arrays, work, noise, adc, sensed_row):
 
 @njit(cache=True)
 def _control(arrays, work):
-    """The linear controller's next state and voltages."""
+    """Next state and output voltages of the linear controller."""
     n_c = work.control_in.shape[0] - work.sensed.shape[0]
     _multiply(work.controlled, arrays.control, work.control_in)
     for i in range(n_c):
@@ -133,9 +134,10 @@ def _control(arrays, work):
 
 @njit(cache=True)
 def _demand(work, step, drive, limit_V, windup, demanded_row):
-    """Puts the limited voltages, the controller's and `drive` (n_u,), on their way; without delay they act at once.
+    """Limit the sum of the controller's voltages and `drive` (n_u,) and delay it; without delay it acts at once.
 
-    The controller limits its own voltages; anti-windup (keep, feed) takes off what it cut off before.
+    The anti-windup (keep, feed) compares the controller's own voltages with the limits and subtracts what the limits
+    cut off before.
     """
     n_u, delay = work.u.shape[0], work.line.shape[0] - 1
     n_c = work.controlled.shape[0] - n_u
@@ -165,8 +167,7 @@ def _advance(arrays, work):
 
 @njit(cache=True)
 def _gone(x, far):
-    """Whether the table has left the range in which it can move on the floor; written so that what is not finite has
-    left it."""
+    """Whether the table has moved beyond `far` relative to the floor; non-finite values count as beyond."""
     inside = True
     for i in range(3):
         inside = inside and abs(x[i] - x[12 + i]) < far[0] and abs(x[3 + i] - x[15 + i]) < far[1]
@@ -175,12 +176,14 @@ def _gone(x, far):
 
 @njit(cache=True)
 def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, windup, far, records):
-    """Steps through the control periods; returns how many were completed when the table left its range, or all.
+    """Step through the control periods; return how many were completed before the table left its range, or all.
 
-    floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V on top of the controller's.
-    substeps : steps a period. nonlinear : the table's; acceleration : whether sensors see it, which needs N first.
+    floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V added to the controller's.
+    substeps : steps per period. nonlinear : whether N is computed. acceleration : whether sensors measure it; N is then
+        computed before the sample.
     adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. windup : (keep, feed) of the
-    controller's anti-windup. far : (m, rad) from the floor, beyond which the table has diverged.
+        anti-windup.
+    far : (m, rad) distance from the floor beyond which the table has diverged.
     """
     step = 0
     for k in range(floor.shape[0] - 1):
@@ -208,7 +211,7 @@ def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, ad
 
 def run_stepwise(code, arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, windup, far,
                  records):
-    """`run` with a controller that is called once a sample, anti-windup included: code (n_s,) -> (n_u,) volts."""
+    """`run` with a controller called once per sample, which does its own anti-windup: code (n_s,) -> (n_u,) volts."""
     n_s, n_u, step = work.sensed.shape[0], work.u.shape[0], 0
     for k in range(floor.shape[0] - 1):
         for j in range(substeps):

@@ -17,23 +17,23 @@ from avis_ctrl.simulation.discrete import linear_part, rest_state, step_arrays
 from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, SampledLoop, lever_arms
 
 Code = Callable[[np.ndarray], np.ndarray]
-# No isolated table moves so far from its floor, between its stops: beyond, the loop has diverged [m, rad].
+# Motion relative to the floor beyond which the loop has diverged; the stops of an isolated table are closer [m, rad].
 STOPS = np.array([0.02, 0.2])
 
 
 @dataclass(frozen=True, eq=False)
 class SimulationRecord:
-    """What happened, at the samples of the controller.
+    """Simulated signals at the controller's sampling instants.
 
     Attributes
     ----------
-    time : (n,) s. A loop that diverged ends early.
+    time : (n,) s. The record of a diverged loop ends early.
     q, q_dot : (n, 6) payload, m and rad, m/s and rad/s.
     floor_dot : (n, 6) floor, m/s and rad/s.
     volts, demanded : (n, n_u) held voltages, and as computed before the limit [V].
     sensed : (n, n_s) volts at the converter, noise included, before rounding and clipping.
     diverged : the payload went beyond its stops.
-    clipped_dac, clipped_adc : count of single channel samples beyond the limits.
+    clipped_dac, clipped_adc : number of samples beyond the limits, summed over the channels.
     """
 
     loop: SampledLoop
@@ -56,13 +56,14 @@ class SimulationRecord:
         return int(np.count_nonzero(converter.clipped(self.sensed))) if converter else 0
 
     def velocity(self, axis: str) -> np.ndarray:
-        """(n,) payload velocity of a coordinate [m/s], a rotation as velocity of the edge."""
+        """(n,) payload velocity along a coordinate [m/s]; a rotation as velocity of the edge."""
         k = COORDINATES.index(axis)
         return self.q_dot[:, k] * lever_arms(self.loop.rig)[k]
 
 
 def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """(samples + 1, 6) m/s and rad/s, one period of a periodic realisation; coordinates without a spectrum rest."""
+    """(samples + 1, 6) floor velocity [m/s, rad/s], one period of a realisation; zero in coordinates without spectrum.
+    """
     velocity = np.zeros((samples + 1, 6))
     for name, spectrum in loop.floor.items():
         if name not in COORDINATES:
@@ -74,9 +75,9 @@ def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) ->
 
 
 def flicker(samples: int, period_s: float, rng: np.random.Generator, channels: int) -> np.ndarray:
-    """(samples, channels) Gaussian noise of one-sided density 2 period_s / f from the first line of the record on.
+    """(samples, channels) Gaussian noise of one-sided density 2 period_s / f, from the record's lowest line upwards.
 
-    Unit density at 1 Hz relative to white noise of variance one; the mean is zero, and the record repeats.
+    At 1 Hz the density equals that of white noise with variance one. The mean is zero, and the record is periodic.
     """
     frequency = np.fft.rfftfreq(samples, period_s)
     rms = np.zeros(frequency.size)
@@ -84,7 +85,7 @@ def flicker(samples: int, period_s: float, rng: np.random.Generator, channels: i
     if samples % 2 == 0:
         rms[-1] = 0.0
     draw = rng.standard_normal((2, frequency.size, channels))
-    # Lines of variance rms^2: half of it in the real and half in the imaginary part.
+    # Each line has variance rms^2: half in the real part and half in the imaginary part.
     return np.fft.irfft(0.5 * samples * rms[:, None] * (draw[0] + 1j * draw[1]), samples, axis=0)
 
 
@@ -92,19 +93,20 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
              nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
              initial: np.ndarray | None = None, drive: np.ndarray | None = None, code: Code | None = None
              ) -> SimulationRecord:
-    """Run the loop and keep the last `duration_s`.
+    """Simulate the loop and keep the last `duration_s`.
 
     Parameters
     ----------
-    duration_s, settle_s : kept, and run before it from rest.
+    duration_s, settle_s : time that is kept, and time simulated before it, from rest.
     seed : of floor and sensor noise; the same seed gives the same record.
-    nonlinear : False for the table linearised about rest, the step then exact.
-    extra_substeps : divides each step further, to see what the step costs.
+    nonlinear : False for the table linearised about rest; the step is then exact.
+    extra_substeps : divides each step further, to assess the discretisation error.
     floor : (n + 1, 6) floor velocities in place of a realisation, n samples in all.
     initial : (12,) q and q' at the start.
-    drive : (n, n_u) volts added to what the controller demands, before the limit; n samples in all, those of
-        `settle_s` included. Zero by default.
-    code : called every sample in place of the loop's controller, from the converter's volts (n_s,) to volts (n_u,).
+    drive : (n, n_u) volts added to what the controller demands, before the limit; n samples in all, including those of
+        `settle_s`. Zero by default.
+    code : function called at every sample in place of the loop's controller, from the converter's volts (n_s,) to volts
+        (n_u,).
 
     Raises
     ------
@@ -125,7 +127,7 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     noise = rng.standard_normal((samples, n_s)) * loop.sensors.noise_rms_V + loop.sensors.offset_V
     if np.any(loop.sensors.flicker_rms_V):
         noise += flicker(samples, loop.period_s, rng, n_s) * loop.sensors.flicker_rms_V
-    # An offset has been there for long: the loop starts where it rests with it.
+    # Offsets are assumed constant since long before the start: the loop starts at its equilibrium with them.
     rest = rest_state(loop) if np.any(loop.sensors.offset_V) and code is None else None
     state = np.zeros(linear_part(loop).nstates) if rest is None else rest.state
     if initial is not None:
@@ -139,7 +141,7 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
         work.u[:] = np.clip(rest.volts, -loop.limits_V, loop.limits_V)
         work.control_in[:rest.controller.size] = rest.controller
     run = kernel.run if code is None else partial(kernel.run_stepwise, code)
-    # Code that is called has its own.
+    # `code` does its own anti-windup.
     windup = loop.anti_windup if code is None else NO_ANTI_WINDUP
     done = run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
                "acceleration" in loop.sensors.quantities, adc, loop.limits_V, windup, STOPS, records)

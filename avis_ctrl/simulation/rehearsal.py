@@ -1,4 +1,4 @@
-"""Rehearse an identification: a campaign from a table that differs from its file by amounts kept aside."""
+"""Rehearsal of an identification: a simulated campaign on a table that differs from its file by known amounts."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan, EffectPlan
 # Flat names of parameters, AVIS and Halcyonics.
 STIFF_OR_HEAVY = re.compile(r"mass|J[123]|I(xx|yy|zz)|isolator\d+\.k_[xyz]|k_[atr]|k_s\d|load\.mass")
 DAMPING = re.compile(r"isolator\d+\.c_[xyz]|d[13456]")
-# Draws of an inertia that no body can have are drawn again; nearly flat payloads need some.
+# Maximum number of draws. Physically impossible inertias are drawn again; nearly flat payloads need several draws.
 ATTEMPTS = 200
 
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """A campaign and, beside it and nowhere in it, the truth.
+    """A campaign and, separate from it, the truth.
 
-    truth : the table that moved. true_values : the parameters that were changed, by flat name.
-    factors : true over file's value of each whose value in the file is not zero.
+    truth : the simulated table. true_values : the parameters that were changed, by flat name.
+    factors : true value over the file's value, for each parameter with a nonzero value in the file.
     effects : of the table; a rig file does not contain them.
     """
 
@@ -44,7 +44,7 @@ class Rehearsal:
     effects: tuple[EffectPlan, ...] = ()
 
     def truth_toml(self) -> str:
-        """The truth as a rig file, the changed lines marked with the change."""
+        """The truth as a rig file; each changed line is marked with its factor."""
         values = {name: f"{name} x {factor:.6f}" for name, factor in self.factors.items()}
         header = ["The simulated table of a campaign: the values that an identification should find."]
         for one in self.effects:
@@ -55,9 +55,11 @@ class Rehearsal:
 
 def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None,
              hidden: Callable[[Rig], SensorChange] | None = None) -> Rehearsal:
-    """Perturb the rig as `plan.truth` says and record the campaign on it; raises as `simulate_campaign` does.
+    """Perturb the rig as specified in `plan.truth` and simulate the campaign on it; raises the errors of
+    `simulate_campaign`.
 
-    hidden : what effects outside the rig file add to the sensor signals of that table (`study.hidden_effects`).
+    hidden : from the true table to what effects outside the rig file add to the sensor signals
+        (`study.hidden_effects`).
     """
     truth = perturbed_truth(rig, plan.truth.perturb_percent, plan.truth.perturb_damping_percent, seed)
     old, new = rig.parameters(), truth.parameters()
@@ -69,15 +71,16 @@ def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | N
 
 
 def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:
-    """Stiffness, mass and inertia within +-percent, damping within +-damping_percent; independent uniform draws.
+    """Draw stiffness, mass and inertia within +-percent, damping within +-damping_percent; independent and uniform.
 
-    Products of inertia, positions, actuators and sensors are off as the rig file's [tolerances] say, normal draws
-    (`within_tolerances`), and stay as they are where it has none. The inertia of a load stays; of a spring-suspended
-    table masses too, which a scale tells, and with a load on it the plate's inertia.
+    Products of inertia, positions, actuators and sensors are drawn from normal distributions with the rig file's
+    [tolerances] (`within_tolerances`); they are unchanged without that section, or if both percentages are zero. The
+    inertia of a load is unchanged. For a spring-suspended table, masses are unchanged too, since they can be weighed,
+    and with a load also the plate's inertia.
 
     Raises
     ------
-    InputError : percentages outside 0 .. 100; no draw that is a rig (an inertia that a body can have).
+    InputError : percentages outside 0 .. 100; no draw is a physically possible rig.
     """
     for name, value in (("perturb_percent", percent), ("perturb_damping_percent", damping_percent)):
         if not (np.isfinite(value) and 0 <= value < 100):
@@ -86,7 +89,7 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
     spread = {name: (damping_percent if DAMPING.fullmatch(name) else percent) / 100 for name in known
               if DAMPING.fullmatch(name) or STIFF_OR_HEAVY.fullmatch(name)}
     if isinstance(rig, Halcyonics):
-        # Of a loaded table the plate was identified before: its inertia and the load's are seen only together.
+        # With a load, the plate was identified before: only the sum of its inertia and the load's can be observed.
         known_before = ("mass", "load.mass", *(("Ixx", "Iyy", "Izz") if rig.load else ()))
         spread = {name: width for name, width in spread.items() if name not in known_before}
     for _ in range(ATTEMPTS):
@@ -109,8 +112,8 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
 def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
     """A table drawn from normal distributions about the rig, with the [tolerances] of its file as standard deviations.
 
-    Corners and damping ratios of sensors are kept: in a rig file a compensation filter matches its geophone. Motors and
-    geophones in the isolators move with these and keep their directions.
+    Corner frequencies and damping ratios of sensors are unchanged: in a rig file a compensation filter matches its
+    geophone. Motors and geophones in the isolators move with the isolators and keep their directions.
     """
     t = rig.tolerances
     if t is None:

@@ -2,10 +2,10 @@
 
     floor --> table --> sensors --> noise, converter --> controller --> limit --> delay, hold --> drives --> table
 
-The controller knows `rig`; the table that moves is `plant`, which may differ from it. Sensors see the payload's motion
-along axes fixed in space: that they turn with it is left out, parts per million at micrometre amplitudes. Not left out,
-where `gravity` says so, is what their proof masses feel of gravity when the payload tilts: neither source models it,
-but at low frequency it is most of what a horizontal sensor shows.
+The controller is based on `rig`; the simulated table is `plant`, which may differ from it. Sensors measure the
+payload's motion along axes fixed in space: their rotation with the payload is neglected, parts per million at
+micrometre amplitudes. If `gravity` is set, the gravity that acts on their proof masses when the payload tilts is
+included: neither source models it, but at low frequency it dominates the signal of a horizontal sensor.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import conditioning
 
-# Finer steps than this per control period would be needed to place the delay: a sign of a mistyped delay.
+# Maximum number of steps per control period to represent the delay; a delay that needs more is probably mistyped.
 MAX_SUBSTEPS = 20
-# Default that stands for the rig's own value.
+# Default meaning the rig's own value.
 _AS_RIG: Any = None
 
 
@@ -42,14 +42,14 @@ class SensorBank:
     ----------
     quantity : what the sensors measure, "velocity" [m/s] or "acceleration" [m/s^2] of the payload in space, or
         "displacement" [m] of the payload relative to the chassis; one for all, or one per sensor.
-    chains : one system a sensor, to volts.
+    chains : one system per sensor, from motion to volts.
     gain_V : (n_s,) volts per unit of motion in the passband; the controller divides by it.
     noise_rms_V : (n_s,) white noise of one sample, before the converter.
     converter : None for unlimited resolution.
-    conditioning : done by the controller in each channel after division by the gain (an accelerometer's
-        integrator), one for all or one a sensor; None for nothing.
-    flicker_rms_V : (n_s,) of white noise with the density that the 1/f noise has at 1 Hz.
-    offset_V : (n_s,) constant voltage that each channel reads too much; zero by default.
+    conditioning : filter that the controller applies to each channel after division by the gain (an accelerometer's
+        integrator), one for all or one per sensor; None for none.
+    flicker_rms_V : (n_s,) r.m.s. of the white noise whose density equals that of the 1/f noise at 1 Hz.
+    offset_V : (n_s,) constant offset of each channel's reading; zero by default.
     """
 
     quantity: str | tuple[str, ...]
@@ -76,7 +76,7 @@ class SensorBank:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What each chain takes in."""
+        """Quantity that each sensor measures."""
         return (self.quantity,) * len(self.chains) if isinstance(self.quantity, str) else tuple(self.quantity)
 
     @property
@@ -87,7 +87,8 @@ class SensorBank:
 
     @property
     def white_variance_V2(self) -> np.ndarray:
-        """(n_s,) variance of one sample: noise, and rounding as if white, true where signal or noise moves by codes."""
+        """(n_s,) variance of one sample: noise, and rounding as white noise, valid if signal or noise moves by whole
+        codes."""
         return self.noise_rms_V ** 2 + (self.converter.noise_rms_V ** 2 if self.converter else 0.0)
 
     def noise_psd(self, frequency_Hz: np.ndarray, period_s: float) -> np.ndarray:
@@ -100,15 +101,15 @@ class SensorBank:
 
 
 def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
-    """The sensors of a rig as its file says, and what the controller does in each channel (`rigs.sensing`).
+    """Sensors of a rig as specified in its file, and the controller's conditioning of each channel (`rigs.sensing`).
 
-    integrator_corner_Hz : leak of the accelerometers' integrators.
+    integrator_corner_Hz : corner frequency of the accelerometers' leaky integrators.
     """
     sensors, filters = rig.sensors(), conditioning(rig, integrator_corner_Hz)
     systems = {one: None if one.is_one else one.system() for one in filters}
     made = tuple(systems[one] for one in filters)
     kinds = tuple(one.quantity for one in sensors)
-    # Alike sensors share one chain object.
+    # Identical sensors share one chain object.
     chains = {one: one.chain() for one in dict.fromkeys(replace(each, name="", position=(0.0, 0.0, 0.0),
                                                                 direction=(0.0, 0.0, 1.0)) for each in sensors)}
     return SensorBank(kinds[0] if len(set(kinds)) == 1 else kinds,
@@ -120,12 +121,13 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
 
 
 class AntiWindup(NamedTuple):
-    """What the limits cut off, passed through a first-order lag and taken off the next demands of the same drive:
+    """The part cut off by the limits passes through a first-order lag and is subtracted from the same drive's next
+    demands:
 
         u = limit(v),  v = demand - b,  b+ = keep b + feed (v - u)
 
-    Low-order anti-windup that acts on the controller's output (Turner and Postlethwaite, Int. J. Control 77, 2004): the
-    states stay those of the linear controller. feed = 0 is none.
+    Low-order anti-windup acting on the controller's output (Turner and Postlethwaite, Int. J. Control 77, 2004): the
+    states remain those of the linear controller. feed = 0 disables it.
     """
 
     keep: float = 0.0
@@ -133,7 +135,7 @@ class AntiWindup(NamedTuple):
 
     @staticmethod
     def of(corner_Hz: float, gain: float, period_s: float) -> AntiWindup:
-        """gain : of the lag at zero frequency."""
+        """gain : DC gain of the lag."""
         keep = float(np.exp(-2 * np.pi * corner_Hz * period_s))
         return AntiWindup(keep, gain * (1 - keep))
 
@@ -147,28 +149,29 @@ class SampledLoop:
 
     Attributes
     ----------
-    rig : what the controller believes: its geometry makes the logical axes.
-    K : u = K y; from measured velocities of `axes` to forces on them. Rotations count as velocity [m/s] and
-        force [N] at the edge. Continuous, or sampled at the loop's rate.
+    rig : the controller's model of the table; its geometry defines the logical axes.
+    K : u = K y; from measured velocities of `axes` to forces on them. Rotations count as velocity [m/s] and force [N]
+        at the edge. Continuous, or sampled at the loop's rate.
     axes : coordinates that K controls, in its order.
-    loops : for other coordinates, a system from velocity to force, signs and units as K's; coordinates not
-        named are not controlled.
+    loops : separate controllers of other coordinates, each a system from velocity to force with K's signs and units;
+        coordinates in neither are not controlled.
     sensors : the chains, in the order of the rig's sensors.
-    floor : spectrum of the floor's motion by coordinate [m or rad]; others are at rest.
-    plant : the table that moves; `rig` by default.
-    drive_errors : one system a drive, volts to volts (1 + W Delta of neglected dynamics), None where nominal;
-        empty when all are.
-    drive_coupling : volts of all drives to volts that act (I + what couples them), behind amplifiers and errors;
-        None where each drive acts by itself.
+    floor : spectrum of the floor's motion by coordinate [m or rad]; coordinates without one are at rest.
+    plant : the simulated table; `rig` by default.
+    drive_errors : one system per drive, volts to volts (1 + W Delta of neglected dynamics), None where nominal; empty
+        if all are nominal.
+    drive_coupling : from the volts of all drives to the volts that act (I + coupling), after amplifiers and errors;
+        None for uncoupled drives.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
-    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. By
-        default each drive has its own limit; a given limit_V, other than the rig's largest, is for all drives.
-    gravity : whether the proof masses of tilted sensors feel gravity (`Rig.tilt_rows`).
+    sample_rate_Hz, loop_delay_s, limit_V : the rig's by default; the delay is from sample to voltage. By default each
+        drive has its own limit; a given limit_V, other than the rig's largest, is for all drives.
+    gravity : whether gravity acts on the proof masses of tilted sensors (`Rig.tilt_rows`).
+    digital : sampled controller from sensor volts to drive volts, used instead of K and loops if given.
     anti_windup : of the controller; none by default.
 
     Raises
     ------
-    InputError : sizes or names that do not fit, a delay that no fine division of the sample time places.
+    InputError : sizes or names that do not fit, a delay that needs more than MAX_SUBSTEPS steps per sample period.
     """
 
     rig: Rig
@@ -231,7 +234,7 @@ class SampledLoop:
             raise InputError(f"a system of {self.n_drives} inputs and outputs", field="drive_coupling",
                              value=self.drive_coupling.D.shape)
         if "acceleration" in self.sensors.quantities and any(drive.D[0, 0] for drive in self.drives()):
-            # Acceleration would jump with the voltage, at the very instant of the next sample.
+            # Otherwise the acceleration would jump with the voltage, exactly at a sampling instant.
             raise InputError("a corner for the amplifiers: accelerometers need drives without direct feedthrough",
                              field="amplifier_corner_Hz", value=self.amplifier_corner_Hz)
 
@@ -245,7 +248,7 @@ class SampledLoop:
 
     @property
     def limits_V(self) -> np.ndarray:
-        """(n_u,) largest voltage of each drive."""
+        """(n_u,) voltage limit of each drive."""
         if self.limit_V == self.rig.drive_limit_V:
             return self.rig.drive_limits_V()
         return np.full(self.n_drives, self.limit_V)
@@ -255,7 +258,7 @@ class SampledLoop:
         return round(self.loop_delay_s * self.sample_rate_Hz * self.substeps)
 
     def drives(self) -> list[StateSpace]:
-        """Volts of the converter to volts at each actuator: amplifier, then its neglected dynamics."""
+        """One system per drive from converter volts to actuator volts: amplifier, then its neglected dynamics."""
         corner = self.amplifier_corner_Hz and 2 * np.pi * self.amplifier_corner_Hz
         amplifier = cascade([], [-corner], corner) if corner else gain(1.0)
         return [amplifier if error is None else error @ amplifier for error in self.drive_errors]
@@ -264,7 +267,7 @@ class SampledLoop:
                    drive_errors: Sequence[StateSpace | None] | None = None,
                    sensor_errors: Sequence[StateSpace | None] | None = None,
                    drive_coupling: StateSpace | None = None) -> SampledLoop:
-        """The same controller around another table; errors are volts to volts, None where nominal."""
+        """The same controller with another table; errors are systems from volts to volts, None where nominal."""
         sensors = self.sensors
         if sensor_errors is not None:
             chains = tuple(chain if error is None else error @ chain
@@ -276,5 +279,5 @@ class SampledLoop:
 
 
 def lever_arms(rig: Rig) -> np.ndarray:
-    """(6,) that turn q into displacements: 1 for translations, the edge [m] for rotations."""
+    """(6,) factors from q to displacements: 1 for translations, the edge [m] for rotations."""
     return np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in COORDINATES])

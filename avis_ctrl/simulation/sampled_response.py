@@ -1,12 +1,12 @@
-"""What linear theory says the simulated loop does, by frequency response: no state-space step is shared with it.
+"""Linear prediction of the simulated loop by frequency responses, independent of the simulation's state-space steps.
 
-The digital parts are evaluated at z = exp(j omega T), the hold and the delay exactly, the table and the chains at
-s = j omega. Sampling folds: a signal sampled at rate 1/T contains all omega + 2 pi k / T. The floor velocity is linear
+The digital parts are evaluated at z = exp(j omega T), the hold and the delay exactly, the table and the chains at s = j
+omega. Sampling aliases: a signal sampled at rate 1/T contains all omega + 2 pi k / T. The floor velocity is linear
 between samples and the voltages are constant between updates, so both are sampled signals with known images, and
 
     v*(omega) = sum over k of [ G_w(omega_k) hold_1(omega_k) w* + G_u(omega_k) hold_0(omega_k) exp(-j omega_k tau) u* ]
 
-is exact in the limit of many images; they die out with the second power of k at least.
+is exact in the limit of many images. The images decay at least as fast as 1/k^2.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 
-# An accelerometer feels the jumps of force most: its images die out with the second power only, 0.1 % after 20.
+# Accelerometers are most sensitive to the jumps of force: their images decay only as 1/k^2, to 0.1 % after 20.
 IMAGES = 20
 SMOOTH_POINTS = 40
 
@@ -36,7 +36,7 @@ class SampledResponse:
     ----------
     velocity_floor : (n, 6, 6) payload velocity over floor velocity.
     velocity_noise : (n, 6, n_s) payload velocity over noise at the converters [1/V].
-    volts_floor, volts_noise : (n, n_u, 6), (n, n_u, n_s) demanded voltages over the same.
+    volts_floor, volts_noise : (n, n_u, 6), (n, n_u, n_s) demanded voltages over floor velocity and over noise.
     """
 
     loop: SampledLoop
@@ -67,7 +67,7 @@ class SampledResponse:
 
 @dataclass(frozen=True, eq=False)
 class OpenResponse:
-    """Payload velocity and sensor volts, sampled, over the sampled floor velocity and the voltages computed.
+    """Sampled payload velocity and sensor volts over the sampled floor velocity and the computed voltages.
 
     velocity_floor (n, 6, 6), velocity_volts (n, 6, n_u), sensed_floor (n, n_s, 6), sensed_volts (n, n_s, n_u).
     """
@@ -79,9 +79,9 @@ class OpenResponse:
 
 
 def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> SampledResponse:
-    """Close the linear loop at the frequencies omega [rad/s].
+    """Closed-loop responses of the linear loop at the frequencies omega [rad/s].
 
-    images : pairs of images that are folded in, at least one.
+    images : number of pairs of images included, at least one.
     """
     omega = np.atleast_1d(np.asarray(omega, float))
     G = open_response(loop, omega, images)
@@ -94,13 +94,14 @@ def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES)
 
 
 def open_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> OpenResponse:
-    """The table with drives and sensors, without the controller, at omega (n,) [rad/s]."""
+    """Responses of table, drives and sensors without the controller, at omega (n,) [rad/s]."""
     return OpenResponse(*(centre + folded for centre, folded in zip(_image(loop, omega), _folded(loop, omega, images),
                                                                     strict=True)))
 
 
 def _folded(loop: SampledLoop, omega: np.ndarray, images: int) -> list[np.ndarray]:
-    """Sum of all images but the centre: far above every resonance, hence smooth, and interpolated from few points."""
+    """Sum of all images except the centre: far above every resonance, hence smooth and interpolated from a few points.
+    """
     points = omega if omega.size <= SMOOTH_POINTS else np.linspace(omega.min(), omega.max(), SMOOTH_POINTS)
     shifts = 2 * np.pi / loop.period_s * np.array([k for k in range(-images, images + 1) if k])
     parts = _image(loop, (shifts[:, None] + points).ravel())
@@ -109,7 +110,7 @@ def _folded(loop: SampledLoop, omega: np.ndarray, images: int) -> list[np.ndarra
 
 
 def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
-    """Terms of the folding: continuous responses at `image` = omega + 2 pi k / T, times their holds there."""
+    """Terms of the folded sum: continuous responses at `image` = omega + 2 pi k / T, times their holds there."""
     T, eom = loop.period_s, loop.plant.mounted_body().equations_of_motion()
     s = 1j * image[:, None, None]
     sinc = np.sinc(image * T / (2 * np.pi))
@@ -122,10 +123,10 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     velocity = np.linalg.solve(dynamic, pushed)
     _, H = loop.plant.sensor_rows()
     n = len(COORDINATES)
-    # Position sensors measure relative to the chassis, which moves with the floor, here held as sampled.
+    # Position sensors measure relative to the chassis, which moves with the floor, linearly between samples.
     moved = H @ velocity
     if loop.gravity:
-        # An acceleration, as the velocity that a proof mass takes it for.
+        # The apparent acceleration due to tilt, integrated to a velocity.
         moved = moved + loop.plant.tilt_rows() @ velocity / s ** 2
     against = np.array([kind == "displacement" for kind in loop.sensors.quantities])
     moved[:, against, :n] -= H[against] * (sinc ** 2)[:, None, None]
@@ -135,15 +136,15 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
 
 
 def _diagonal(systems: Sequence[StateSpace], omega: np.ndarray) -> np.ndarray:
-    """(n_omega, n) responses of scalar systems; the same object is evaluated once."""
+    """(n_omega, n) responses of scalar systems; each distinct object is evaluated once."""
     known = {id(system): system.frequency_response(omega)[:, 0, 0] for system in systems}
     return np.stack([known[id(system)] for system in systems], axis=1)
 
 
 def predict_transmissibility_6dof(loop: SampledLoop, omega: np.ndarray) -> np.ndarray:
-    """(n_omega, 6, 6) payload velocity over floor velocity, rotations as displacement of the edge.
+    """(n_omega, 6, 6) payload velocity over floor velocity of the sampled loop, rotations as displacement of the edge.
 
-    Of the sampled loop with all six degrees of freedom, for a floor that moves at omega [rad/s] alone.
+    The floor is assumed to move only at omega [rad/s].
     """
     arms = lever_arms(loop.rig)
     return arms[:, None] * sampled_response(loop, omega).velocity_floor / arms

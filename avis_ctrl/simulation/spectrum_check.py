@@ -1,13 +1,13 @@
-"""Does a simulated spectrum agree with the predicted one, within what chance allows?
+"""Test whether a simulated spectrum agrees with the predicted one within its random error.
 
 Power in third-octave bands is estimated by Welch's method (Hann window, half overlap) and compared with its exact
-expectation and variance for a Gaussian process of the predicted density: leakage, the correlation of overlapping
-segments and of neighbouring lines, and resonances narrower than a line are all in them. The estimate is then taken as
-chi-square distributed with matching mean and variance (Welch, IEEE Trans. Audio Electroacoust. AU-15 (1967);
-Percival and Walden, Spectral Analysis for Physical Applications, 1993, section 6.10).
+expectation and variance for a Gaussian process of the predicted density. These include leakage, the correlation of
+overlapping segments and of neighbouring lines, and resonances narrower than a line. The estimate is then taken as
+chi-square distributed with matching mean and variance (Welch, IEEE Trans. Audio Electroacoust. AU-15 (1967); Percival
+and Walden, Spectral Analysis for Physical Applications, 1993, section 6.10).
 
-The simulated velocity is sampled at the controller's rate, so what lies above half of it folds down: the prediction
-folds the same images (`prediction`), and the bands may be compared up to half the sample rate.
+The simulated velocity is sampled at the controller's rate, so content above half that rate aliases. The prediction
+includes the same images (`sampled_response`), so the bands may be compared up to half the sample rate.
 """
 
 from __future__ import annotations
@@ -28,22 +28,21 @@ from avis_ctrl.simulation.sampled_response import sampled_response
 
 # Points of the predicted density per line of the estimate: a resonance as narrow as a line is still resolved.
 POINTS_PER_LINE = 4
-# Lines beyond which the Hann window's side lobes (18 dB per octave) are left out, and segments beyond which
-# the correlation is.
+# Distances beyond which the Hann window's side lobes (18 dB per octave) and the correlation of segments are neglected.
 REACH_LINES, REACH_SEGMENTS = 8, 6
 
 
 @dataclass(frozen=True, eq=False)
 class SpectrumAgreement:
-    """Band powers of some axes against prediction.
+    """Band powers of some axes compared with their prediction.
 
     Attributes
     ----------
     axes : names; midband_Hz : (n_bands,).
     estimated_rms, predicted_rms : (n_axes, n_bands) velocity in each band [m/s], rotations at the edge.
     dof : (n_axes, n_bands) equivalent degrees of freedom.
-    lower, upper : (n_axes, n_bands) bounds of the ratio of powers that chance allows.
-    false_alarm : probability that any band of a true prediction falls outside.
+    lower, upper : (n_axes, n_bands) acceptance bounds of the ratio of powers.
+    false_alarm : probability that any band falls outside if the prediction is true.
     frequency_Hz, estimated_psd, predicted_psd : Welch lines (n_f,), (n_axes, n_f) for plotting.
     """
 
@@ -66,7 +65,7 @@ class SpectrumAgreement:
 
     @property
     def outside(self) -> np.ndarray:
-        """(n_axes, n_bands) bands that chance does not explain."""
+        """(n_axes, n_bands) bands whose ratio lies outside the acceptance bounds."""
         return (self.ratio < self.lower) | (self.ratio > self.upper)
 
     @property
@@ -81,13 +80,14 @@ class SpectrumAgreement:
 
 
 def welch_moments(psd: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n,) and covariance (n, REACH_LINES + 1) of Welch's estimate at lines 0..n-1; column d: with line j + d.
+    """Mean (n,) and covariance (n, REACH_LINES + 1) of Welch's estimate at lines 0..n-1; column d: of lines j and j +
+    d.
 
-    psd : the true density at 0, 1/4, 2/4 .. lines (POINTS_PER_LINE), reaching REACH_LINES beyond line n-1.
-    segments : Hann windows that overlap by half.
+    psd : the true density at 0, 1/4, 2/4 .. lines (POINTS_PER_LINE), up to REACH_LINES beyond line n-1.
+    segments : number of Hann windows, which overlap by half.
 
-    With X_m(j) the transform of segment m at line j of a Gaussian process, cov(|X_m(j)|^2, |X_n(k)|^2) =
-    |E X_m(j) conj X_n(k)|^2, where E is the integral of psd(f) W(f - j) conj W(f - k) exp(i pi f (m - n)).
+    With X_m(j) the transform of segment m at line j of a Gaussian process, cov(|X_m(j)|^2, |X_n(k)|^2) = |E X_m(j) conj
+    X_n(k)|^2, where E is the integral of psd(f) W(f - j) conj W(f - k) exp(i pi f (m - n)).
     """
     reach = REACH_LINES * POINTS_PER_LINE
     around = sliding_window_view(np.concatenate([np.zeros(reach), psd]), 2 * reach + 1)[::POINTS_PER_LINE]
@@ -103,7 +103,8 @@ def welch_moments(psd: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _hann_transform(x: np.ndarray) -> np.ndarray:
-    """Transform of the Hann window at x lines from its centre, of unit energy; real about the window's middle."""
+    """Transform of the Hann window of unit energy at x lines from its centre; real, with time zero at the window's
+    middle."""
     return np.sqrt(2 / 3) * (np.sinc(x) + 0.5 * (np.sinc(x - 1) + np.sinc(x + 1)))
 
 
@@ -116,8 +117,8 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
     ----------
     band_Hz : lowest and highest midband.
     axes : coordinates; those that K controls by default.
-    false_alarm : probability of any band of any axis outside when the prediction is true (Bonferroni).
-    segment_s : length of Welch's segments; a third octave at the lowest midband has to hold at least one line.
+    false_alarm : probability that any band of any axis falls outside if the prediction is true (Bonferroni).
+    segment_s : length of Welch's segments; a third octave at the lowest midband must contain at least one line.
 
     Raises
     ------
@@ -135,7 +136,7 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
     arms = lever_arms(loop.rig)[kept]
     lines = int(last[-1]) + 1
     fine = np.arange(1, (lines + REACH_LINES) * POINTS_PER_LINE + 1) * line_Hz / POINTS_PER_LINE
-    # The density at zero frequency is taken as zero: the estimate removes each segment's mean.
+    # The density at zero frequency is set to zero because the estimate removes each segment's mean.
     predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept] * arms ** 2
     psd = np.pad(predicted.T, ((0, 0), (1, 0)))
     estimated = np.array([signal.welch(record.velocity(axis), fs, "hann", segment, segment // 2,
@@ -161,7 +162,7 @@ def _variance_of_sum(covariance: np.ndarray, first: int, last: int) -> float:
 
 def _bands(band_Hz: tuple[float, float], line_Hz: float,
            sample_rate_Hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Midbands and the first and last line of each, every line in one band only."""
+    """Midbands and the first and last line of each band; no line belongs to two bands."""
     mid = third_octave_midbands(*band_Hz)
     lower, upper = third_octave_edges(mid)
     edges = np.ceil(np.append(lower, upper[-1]) / line_Hz).astype(int)

@@ -1,6 +1,6 @@
-"""The same measurements on every controller: bounds, transmissibility, site response.
+"""Analysis of a controller, the same for all controllers: bounds, transmissibility, site response.
 
-Each figure is computed on the closed loop of the returned controller, never taken from the synthesis that made it.
+Every figure is computed from the closed loop with the final controller and never taken from its synthesis.
 """
 
 from __future__ import annotations
@@ -24,18 +24,20 @@ from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResul
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# Bounds are proved to half a per cent (0.04 dB) above the highest value found: finer proofs only cost time.
+# Upper bounds are proved to within 0.5 % (0.04 dB) of the largest value found; tighter bounds only cost time.
 SLACK = 5e-3
 
 
 @dataclass(frozen=True)
 class AnalysisSettings:
-    """passive_slack : replaces `SLACK` for the worst-case gains of the table without control if there are many blocks:
-        its narrow peaks need many intervals. passive_stability_slack : the same for its robust stability, where mu is
+    """Settings of the analysis.
+
+    passive_slack : replaces `SLACK` for the worst-case gains of the passive table if there are many blocks: its narrow
+        peaks need many frequency intervals. passive_stability_slack : the same for its robust stability, where mu is
         flat over frequency.
-    few_points : number of frequencies at which the worst-case gain is bounded from above, in addition to those of the
-        highest gains, where no curve is drawn.
-    axis_points : frequencies of the lower bound of an axis, in a band of two or three octaves.
+    few_points : number of frequencies of the upper bound of the worst-case gain if no curve is drawn, in addition to
+        the frequencies of the highest gains.
+    axis_points : number of frequencies of the lower bound of an axis, in a band of two or three octaves.
     """
 
     passive_slack: float = 2e-2
@@ -46,18 +48,19 @@ class AnalysisSettings:
 
 SETTINGS = AnalysisSettings()
 PLOT_HZ = np.geomspace(0.1, 200.0, 300)
-# The level that a Gaussian signal of this bandwidth passes once in ten minutes: sqrt(2 ln(f T)), Rice 1944.
+# Level, relative to the r.m.s., that a Gaussian signal of this bandwidth exceeds once in ten minutes: sqrt(2 ln(f T)),
+# Rice 1944.
 PEAK_SECONDS, PEAK_BANDWIDTH_HZ = 600.0, 10.0
 PEAK_FACTOR = float(np.sqrt(2 * np.log(PEAK_SECONDS * PEAK_BANDWIDTH_HZ)))
 
 
 def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str, title: str, kind: ControllerKind,
             samples: np.ndarray, notes: tuple[str, ...] = ()) -> ControllerResult:
-    """Measure one controller (None: actuators at rest) on the design's plant.
+    """Analyse one controller (None: no control) on the design's plant.
 
     Parameters
     ----------
-    samples : (n_samples, n_w, n_z) perturbations, held over frequency, for the band of sampled transmissibility.
+    samples : (n_samples, n_w, n_z) perturbations, constant over frequency, for the range of sampled transmissibilities.
 
     Raises
     ------
@@ -97,11 +100,11 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
 
 def worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
                   ) -> float:
-    """Bound of the worst-case velocity of an axis in the band, for a floor of unit velocity in any direction.
+    """Bound on the worst-case velocity of an axis in the band, for unit floor velocity in any direction.
 
-    axis : its number among those of the design.
-    stability : robust stability of the loop with K; with it the bound is an upper one, over the whole set and between
-        frequencies; without it a lower one, reached by a plant.
+    axis : index among the axes of the design.
+    stability : robust stability of the loop with K. If given, the result is an upper bound over the whole uncertainty
+        set, valid between frequencies. Otherwise it is a lower bound, attained by a plant.
     """
     part = plant.full.restricted([*plant.floor_velocities], [*plant.velocities])
     blocks = plant.synthesis.blocks
@@ -115,7 +118,7 @@ def worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace |
 
 
 def _by_slicot(system: StateSpace) -> float | None:
-    """H-infinity norm by another code; None where it fails."""
+    """H-infinity norm by SLICOT, an independent code; None if it fails."""
     try:
         return hinf_norm_slicot(system)
     except ComputationError:
@@ -123,14 +126,14 @@ def _by_slicot(system: StateSpace) -> float | None:
 
 
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
-    """A mu or worst-case result with its perturbation in physical words."""
+    """A mu or worst-case result, with its perturbation in words."""
     words = describe(plant, blocks, found.delta) if found.delta is not None else ()
     return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, found.frequencies,
                  found.upper_curve, found.lower_curve)
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:
-    """A perturbation in physical units: parameters by value, chains by size and phase; alike ones together."""
+    """A perturbation in words: parameters by value, channels ("chains") by size and phase; equal ones are grouped."""
     part = delta[:blocks.n_w, :blocks.n_z]
     real = {p.name: p for p in plant.rig.parameters}
     told: list[tuple[str, str]] = []
@@ -148,7 +151,7 @@ def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> t
 
 
 def _by_family(told: list[tuple[str, str]]) -> tuple[str, ...]:
-    """(name, words) with names that differ in their number only written once where the words are the same for all."""
+    """Merge (name, words) pairs whose names differ only in their number, if the words are the same for all of them."""
     families: dict[str, list[tuple[str, str]]] = {}
     for name, words in told:
         families.setdefault(re.sub(r"\d+", "*", name), []).append((name, words))
@@ -181,20 +184,20 @@ def _compliance(plant: DesignPlant, full: StateSpace, omega: np.ndarray) -> np.n
 
 
 def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_Hz: Sequence[float]) -> SiteResponse:
-    """Spectra of payload velocity and of volts under the site's floor motion and the sensors' noise."""
+    """Spectra of payload velocity and drive voltages caused by the site's floor motion and the sensor noise."""
     frequency = np.geomspace(plant.floor.low_Hz, 250.0, 2000)
     omega = 2 * np.pi * frequency
     floor = plant.floor.asd(frequency, "velocity")
     outputs = [*plant.velocities, *plant.volts]
     from_floor = full.select(outputs, plant.floor_velocities).frequency_response(omega)
     from_noise = full.select(outputs, list(plant.noises)).frequency_response(omega)
-    # Directions of the floor and the sensors are independent of each other.
+    # Floor motions in different directions and the noises of the sensors are uncorrelated.
     by_floor = np.linalg.norm(from_floor, axis=2) * floor[:, None]
-    # The noise itself, where its weight is above it or ends.
+    # The weight covers the 1/f noise and is constant at low frequency: rescale to the actual noise.
     real = np.stack([weight.asked(omega) / weight.magnitude(omega) for weight in plant.noises.values()], axis=1)
     by_noise = np.linalg.norm(from_noise * real[:, None, :], axis=2) * plant.floor_density
     if not controlled:
-        # No volts and no sensor noise in the motion: exactly, not to round-off.
+        # No voltages, and no sensor noise in the motion: exactly zero, without round-off.
         by_floor[:, len(plant.axes):], by_noise[:] = 0.0, 0.0
     density = np.hypot(by_floor, by_noise)
 

@@ -1,7 +1,7 @@
-"""Gain at rest: what a constant offset of the sensors' electronics makes a controller demand of the drives.
+"""DC gain: drive voltages that a controller demands for a constant offset of the sensor electronics.
 
-Sensors of velocity and acceleration show nothing at zero frequency, so that no loop is closed there: the voltages are
-the controller's gain at zero frequency times the offsets. Position sensors are differentiated, and gain nothing there.
+Velocity sensors and accelerometers have no output at zero frequency, so the loop is open there: the voltages are the DC
+gain of the controller times the offsets. The signals of position sensors are differentiated; their DC gain is zero.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from avis_ctrl.simulation.sampled_loop import SampledLoop
 class AtRest:
     """A sampled controller at zero frequency.
 
-    gain_V_per_V : (n_u, n_y) drive volts over sensor volts. offset_V : (n_y,) largest offset of each channel.
+    gain_V_per_V : (n_u, n_y) drive volts per sensor volt. offset_V : (n_y,) largest offset of each channel.
     limits_V : (n_u,) of the drives. drives : their names.
-    gain_Ns_per_m : largest gain from the controlled axes' velocities to forces, rotations at the edge.
+    gain_Ns_per_m : largest gain from the velocities of the controlled axes to forces, rotations at the edge.
     """
 
     gain_V_per_V: np.ndarray
@@ -32,26 +32,26 @@ class AtRest:
 
     @property
     def drive_V(self) -> np.ndarray:
-        """(n_u,) largest voltage that the offsets cost: every offset with the sign that is worst for the drive."""
+        """(n_u,) largest voltage caused by the offsets, each with the worst sign for the drive."""
         return np.abs(self.gain_V_per_V) @ self.offset_V
 
     @property
     def worst(self) -> int:
-        """The drive that uses most of its range."""
+        """Index of the drive with the largest fraction of its range used."""
         return int(np.argmax(self.drive_V / self.limits_V))
 
     @property
     def percent(self) -> float:
-        """Of the range of that drive."""
+        """Percentage of that drive's range used."""
         return 100 * float(self.drive_V[self.worst] / self.limits_V[self.worst])
 
     @property
     def worst_offset_V(self) -> np.ndarray:
-        """(n_y,) the offsets that cost so much, with their signs."""
+        """(n_y,) offsets, with signs, that cause this voltage."""
         return np.where(self.gain_V_per_V[self.worst] < 0, -1.0, 1.0) * self.offset_V
 
     def words(self) -> str:
-        """What the offsets cost, in a sentence without its full stop."""
+        """The effect of the offsets as a sentence without a full stop."""
         return (f"offsets of up to {1e3 * np.max(self.offset_V, initial=0.0):.3g} mV per channel cost up to "
                 f"{self.drive_V[self.worst]:.3g} V of {self.limits_V[self.worst]:g} V (drive "
                 f"{self.drives[self.worst]}; gain at rest {np.max(np.abs(self.gain_V_per_V)):.3g} V/V, "
@@ -65,7 +65,7 @@ class AtRest:
 
 
 def at_rest(loop: SampledLoop) -> AtRest:
-    """Of the controller of a loop, with the offsets of its rig's channels; inf where it integrates."""
+    """DC behaviour of a loop's controller with the offsets of its rig's channels; inf if the controller integrates."""
     rig = loop.rig
     return AtRest(gain_at_rest(digital_controller(loop)), np.array([one.offset_V for one in rig.sensors()]),
                   loop.limits_V, rig.equations_of_motion().actuators, float(np.linalg.norm(gain_at_rest(loop.K), 2)))

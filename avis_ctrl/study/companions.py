@@ -5,14 +5,14 @@ measure independently gets a skyhook loop, called a companion loop in the code:
 
     F = -g  s/(s + w_tilt)  1/(s/w_roll + 1)  v
 
-Loops are closed one after the other around the sampled table with six degrees of freedom, hold, delay, amplifiers,
-sensor dynamics and the design's own controller included, and once more with all the others closed. Of a grid of
-gains and corners each loop takes the one with the smallest payload velocity r.m.s. in the site's band, under floor
-motion and sensor noise, among those that keep a modulus margin (the distance of the Nyquist curve from the critical
-point) and that the neglected dynamics of the drives do not make unstable, as far as they act on this loop's own
-voltages; what they do to all voltages together is left to the plants that are simulated. Critical damping with
-customary corners, the classical rule, keeps neither with 1 Hz geophones: below its corner a geophone turns the phase by
-180 degrees.
+Loops are closed one after the other around the sampled table with six degrees of freedom, including hold, delay,
+amplifiers, sensor dynamics and the design's own controller. In a second pass each loop is designed again with all other
+loops closed. A grid of gains and corners is searched for the smallest r.m.s. payload velocity in the site's band, under
+floor motion and sensor noise. Candidates must have a sufficient modulus margin (distance of the Nyquist curve from the
+critical point), and must be robust to the neglected dynamics of the drives, as far as these act on the voltages of this
+loop. The effect of the neglected dynamics on all voltages together is checked with the simulated plants. The classical
+rule, critical damping with the usual corners, meets neither condition with 1 Hz geophones: below its corner a geophone
+turns the phase by 180 degrees.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from avis_ctrl.uncertainty.weight_base import Weight
 class CompanionSettings:
     """Settings of the search for the companion loops.
 
-    modulus_margin : least |1 + L|, dimensionless; 0.5 is a sensitivity peak of 6 dB, the usual limit in textbooks.
-    gain_factors : gains tried, as multiples of critical damping of the axis taken alone; from almost no effect to twice
+    modulus_margin : minimum |1 + L|, dimensionless; 0.5 is a sensitivity peak of 6 dB, the usual limit in textbooks.
+    gain_factors : gains tried, as multiples of critical damping of the decoupled axis; from almost no effect to twice
         the classical rule.
-    tilt_corners_Hz, roll_offs_Hz : corners tried; the usual 0.1 and 100 Hz and their neighbours.
-    passes : rounds over the axes; in the second one all the other loops are closed.
+    tilt_corners_Hz, roll_offs_Hz : corners tried; the usual 0.1 and 100 Hz and values around them.
+    passes : number of passes over the axes; in the second pass all other loops are closed.
     shrink : factor on all gains while a plant of the uncertainty set is unstable, 3 dB per step.
-    shrinks : largest number of such steps, 18 dB in all, before the loops are left out.
+    shrinks : maximum number of such steps, 18 dB in total, before the loops are omitted.
     low_Hz, points : start and number of points of the frequency grid; it ends at 90 % of half the sample rate.
     """
 
@@ -62,10 +62,10 @@ class CompanionSettings:
 
 @dataclass(frozen=True)
 class Companion:
-    """One axis and its loop.
+    """The loop of one axis.
 
     gain : N s/m, edge force per edge velocity for rotations.
-    modulus_margin : least |1 + L| with all other loops closed.
+    modulus_margin : minimum |1 + L| with all other loops closed.
     """
 
     axis: str
@@ -75,17 +75,17 @@ class Companion:
     modulus_margin: float
 
     def loop(self) -> StateSpace:
-        """Seen velocity [m/s] -> force [N]."""
+        """Measured velocity [m/s] -> force [N]."""
         return Skyhook((self.axis,), (self.gain,), self.tilt_corner_Hz, self.roll_off_Hz).loop(self.axis)
 
 
 @dataclass(frozen=True)
 class Companions:
-    """The loops of the axes that a design does not keep.
+    """The loops of the axes that a design does not control.
 
-    passive : (axis, reason) of those that have no loop.
-    notes : what had to be reduced or left out, in words.
-    settings : with which the loops were designed.
+    passive : (axis, reason) of the axes without a loop.
+    notes : what had to be reduced or omitted, in words.
+    settings : settings of the search for the loops.
     """
 
     loops: tuple[Companion, ...]
@@ -94,19 +94,19 @@ class Companions:
     settings: CompanionSettings = CompanionSettings()
 
     def systems(self) -> dict[str, StateSpace]:
-        """By axis, seen velocity [m/s] -> force [N]."""
+        """Loop of each axis: measured velocity [m/s] -> force [N]."""
         return {one.axis: one.loop() for one in self.loops}
 
     def scaled(self, factor: float) -> Companions:
-        """All gains times a factor; the modulus margins are still those before."""
+        """All gains times a factor; the modulus margins are not updated."""
         return replace(self, loops=tuple(replace(one, gain=factor * one.gain) for one in self.loops))
 
     def below_margin(self) -> tuple[Companion, ...]:
-        """The loops whose modulus margin, with all the others closed, is below the one asked."""
+        """The loops whose modulus margin, with all other loops closed, is below the required one."""
         return tuple(one for one in self.loops if not one.modulus_margin >= self.settings.modulus_margin)
 
     def remarks(self) -> tuple[str, ...]:
-        """The notes, and which loops miss the modulus margin."""
+        """The notes, and the loops that miss the required modulus margin."""
         low = ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in self.below_margin())
         missed = (f"Loops of the other axes with a modulus margin below the required {self.settings.modulus_margin:g}, "
                   f"with all loops closed: {low}.")
@@ -114,7 +114,7 @@ class Companions:
 
 
 def free_axes(rig: Rig, keep: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
-    """Axes besides `keep` that can have a loop of their own, and the others with the reason."""
+    """Axes outside `keep` that can have a loop, and the remaining axes with the reason."""
     chosen, passive = list(keep), []
     for axis in COORDINATES:
         if axis in keep:
@@ -135,10 +135,10 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
 
     Parameters
     ----------
-    bare : the design's controller around the nominal rig, `loops` empty.
-    chain_error : relative error of the drives' neglected dynamics; None for none.
-    band_Hz : of the r.m.s. velocity that the loops are to lower; below it the floor's slow motion, which no geophone
-        loop can lower, would decide. What the loops add there is limited by the modulus margin.
+    bare : the design's controller around the nominal rig, with empty `loops`.
+    chain_error : relative error of the drives due to neglected dynamics; None for no error.
+    band_Hz : band of the r.m.s. velocity to be minimised. Slow floor motion below the band, which no geophone loop can
+        reduce, would dominate otherwise; the modulus margin limits its amplification.
     """
     axes, passive = free_axes(bare.rig, bare.axes)
     search = _Search(bare, _grid(bare, settings), chain_error, band_Hz, settings)
@@ -155,7 +155,7 @@ def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band
 
 
 def _with_margins(companions: Companions, bare: SampledLoop) -> Companions:
-    """The same loops, each with its modulus margin as it is with all the others closed."""
+    """The same loops, each with its modulus margin for all other loops closed."""
     omega, loops = _grid(bare, companions.settings), companions.systems()
     G = open_response(bare, omega).sensed_volts
 
@@ -170,17 +170,17 @@ def _with_margins(companions: Companions, bare: SampledLoop) -> Companions:
 
 
 def _grid(bare: SampledLoop, settings: CompanionSettings) -> np.ndarray:
-    """(n,) rad/s, the table's resonances among them."""
+    """(n,) frequencies [rad/s], including the table's resonances."""
     even = np.geomspace(2 * np.pi * settings.low_Hz, 0.9 * np.pi / bare.period_s, settings.points)
     return np.unique(np.concatenate([even, resonances(bare.rig.equations_of_motion().state_space().poles())]))
 
 
 def until_stable(companions: Companions, plants: Sequence[SampledLoop]) -> Companions:
-    """The loops with gains lowered until the linear sampled loop of every plant is stable; without loops if that fails.
+    """Lower all gains until the linear sampled loop of every plant is stable; drop the loops if that fails.
 
-    The modulus margins are those of the loops returned, with the nominal plant.
+    The modulus margins of the result are for the nominal plant.
 
-    plants : the loop of each plant, the nominal one first; its companion loops are replaced.
+    plants : the loop of each plant, the nominal plant first; its companion loops are replaced.
     """
     if not companions.loops:
         return companions
@@ -192,7 +192,7 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop]) -> Compa
             lowered = (f"The gains of the other axes' loops were lowered by {-20 * np.log10(factor):.0f} dB: with "
                        "higher gains a plant of the uncertainty set was unstable.")
             return _with_margins(replace(tried, notes=(*tried.notes, lowered)) if step else tried, bare)
-    # The loops as designed are kept if even leaving them out does not help: then they are not the cause.
+    # If the plants are unstable even without the loops, the loops are not the cause and remain as designed.
     without = [spectral_radius(replace(plant, loops={})) for plant in plants]
     if max(without) < 1:
         lowest = -20 * settings.shrinks * np.log10(settings.shrink)
@@ -204,7 +204,7 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop]) -> Compa
 
 
 class _Search:
-    """Candidates of one axis at a time, as rank-one changes of a closed sampled loop."""
+    """Search for the loop of one axis at a time; a candidate is a rank-one change of a closed sampled loop."""
 
     def __init__(self, bare: SampledLoop, omega: np.ndarray, chain_error: Weight | None, band_Hz: Sequence[float],
                  settings: CompanionSettings):
@@ -226,9 +226,9 @@ class _Search:
         self.critical = dict(zip(COORDINATES, np.maximum(2 * np.sqrt(M * stiffness) - C, 0.0), strict=True))
 
     def best(self, axis: str, others: dict[str, Companion]) -> Companion | None:
-        """The stable candidate with the required margins and least r.m.s. payload velocity; None if there is none."""
+        """The stable candidate with the required margins and the smallest r.m.s. payload velocity; None without one."""
         g, motion, through, seen, reach = self._around(axis, others)
-        # |motion + through k seen|^2 summed over axes and sources, as a quadratic form in the number k.
+        # |motion + through k seen|^2, summed over axes and sources, is a quadratic form in the number k.
         weight = self.sources[:, None, :] ** 2
         constant = np.sum(np.abs(motion) ** 2 * weight, axis=(1, 2))
         square = np.sum(np.abs(through) ** 2, axis=(1, 2)) * np.sum(np.abs(seen) ** 2 * weight, axis=(1, 2))
@@ -257,7 +257,7 @@ class _Search:
                     yield Companion(axis, factor * self.critical[axis], tilt, roll, np.nan)
 
     def _filter(self, one: Companion) -> np.ndarray:
-        """(n,) the sampled loop at unit gain: force over seen velocity."""
+        """(n,) the sampled loop with unit gain: force per measured velocity."""
         key = one.tilt_corner_Hz, one.roll_off_Hz
         if key not in self._filters:
             unit = sampled(replace(one, gain=1.0).loop(), self.bare.period_s)
@@ -265,7 +265,7 @@ class _Search:
         return self._filters[key]
 
     def _unit(self, axis: str) -> np.ndarray:
-        """(n, n_u, n_s) sensor volts to drive volts of an axis alone under a loop of gain 1: of rank one."""
+        """(n, n_u, n_s) sensor volts to drive volts with a loop of gain 1 on this axis only: rank one."""
         if axis not in self._units:
             none = gain(np.zeros((len(self.bare.axes),) * 2))
             alone = replace(self.bare, K=none, loops={axis: gain(1.0)})
@@ -273,24 +273,27 @@ class _Search:
         return self._units[axis]
 
     def _around(self, axis: str, others: dict[str, Companion]) -> tuple[np.ndarray, ...]:
-        """What one loop sees with the rest closed: g (n,), motion (n, 6, sources), the factors of its change, and g
-        with the drives' parts of it added in magnitude (n,)."""
+        """Responses at one loop with all others closed.
+
+        Returns g (n,), motion (n, 6, sources), the two factors of the change of motion, and the sum of the magnitudes
+        of the drives' contributions to g (n,).
+        """
         C = self.K + sum((one.gain * self._filter(one)[:, None, None] * self._unit(name)
                           for name, one in others.items()), np.zeros(1))
         G, n_s = self.open, self.K.shape[2]
-        closed = np.linalg.inv(np.eye(n_s) - G.sensed_volts @ C)  # sensor volts over what is added to them
+        closed = np.linalg.inv(np.eye(n_s) - G.sensed_volts @ C)  # from volts added at the sensors to sensor volts
         added = np.concatenate([G.sensed_floor, np.broadcast_to(np.eye(n_s), (self.omega.size, n_s, n_s))], axis=2)
         sensed = closed @ added
         motion = np.concatenate([G.velocity_floor, np.zeros((*G.velocity_floor.shape[:2], n_s))], axis=2)
         motion = self.arms[:, None] * (motion + G.velocity_volts @ C @ sensed)
         unit = self._unit(axis)
-        # unit = a s': a the allocation of the axis, the same at every frequency up to its phase in s
+        # unit = a s' with a the allocation of the axis; it is constant over frequency up to a phase, which goes into s
         a = unit[np.arange(unit.shape[0]), :, np.argmax(np.abs(unit).max(axis=1), axis=1)]
         a = a / np.where(np.abs(a).max(axis=1) > 0, np.linalg.norm(a, axis=1), 1.0)[:, None]
         s = np.einsum("fu,fus->fs", a.conj(), unit)
         pushed = closed @ (G.sensed_volts @ a[:, :, None])
         g = np.einsum("fs,fs->f", s, pushed[..., 0])
-        # The drives err each by itself: mu of a matrix of rank one is the sum of its diagonal's magnitudes.
+        # The errors of the drives are independent: mu of a rank-one matrix is the sum of its diagonal's magnitudes.
         reach = np.sum(np.abs(a * (s[:, None, :] @ closed @ G.sensed_volts)[:, 0]), axis=1)
         through = self.arms[:, None] * (G.velocity_volts @ (a[:, :, None] + C @ pushed))
         return g, motion, through, s[:, None, :] @ sensed, reach

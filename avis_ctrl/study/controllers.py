@@ -1,4 +1,4 @@
-"""The controllers that a study compares, each made on the same plant."""
+"""The controllers that a study compares, all designed on the same plant."""
 
 from __future__ import annotations
 
@@ -23,14 +23,17 @@ from avis_ctrl.study.plant import DesignPlant
 
 @dataclass(frozen=True)
 class ReductionSettings:
-    """frequencies_Hz : at which controllers of different order are compared. They are coarse, for what is reported is
-        computed anew for the one chosen; the resonances of the table at rest and the peak of mu join them, because both
-        are narrower than the steps. Below the band mu bounds what the offset of the electronics costs.
-    accuracy : relative accuracy of the square of mu there, small beside the default reduction cost.
-    lag_orders, lag_corners : orders and corner frequencies tried for `replace_fast_by_lags` where poles beyond half the
-        sample rate would be left, the corners as fractions of half this rate. The first that raise mu by no more than
-        the reduction cost are used: the lower the corner, the less sampling by Tustin's rule changes the controller.
-        Three lags can compensate an anti-alias filter of order three; amplifier and delay may need more.
+    """Settings of the order reduction.
+
+    frequencies_Hz : grid on which controllers of different order are compared. It is coarse, because the reported
+        figures are computed separately for the selected controller. The resonances of the passive table and the peak of
+        mu are added; both are narrower than the grid. Below the band mu bounds the drive voltage for the offset of the
+        electronics.
+    accuracy : relative accuracy of the square of mu on the grid, small compared with the default reduction cost.
+    lag_orders, lag_corners : orders and corners tried for `replace_fast_by_lags` if poles above half the sample rate
+        remain; corners as fractions of half the sample rate. The first lags that raise mu by no more than the reduction
+        cost are used: the lower their corner, the less Tustin's rule changes the controller. Three lags can compensate
+        a third-order anti-alias filter; amplifier and delay may need more.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
@@ -43,14 +46,15 @@ SETTINGS = ReductionSettings()
 
 
 def passive() -> Candidate:
-    """Actuators at rest."""
+    """No control."""
     return Candidate("passive", "passive", "passive", None)
 
 
 def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
-    """H-infinity controller of the weighted performance of the nominal plant: no D-K, no uncertainty."""
+    """H-infinity controller for the weighted performance of the nominal plant, without D-K iteration or uncertainty."""
     nominal = plant.synthesis.nominal()
-    # Near the optimum poles run away that in the limit are only a gain; a processor has no use for them.
+    # Near the optimum some controller poles tend to infinity and act as a gain. They are replaced by this gain, because
+    # a processor cannot realise them.
     made = hinfsyn(nominal.P, nominal.nmeas, nominal.ncon, backoff=design.synthesis.backoff_percent / 100,
                    sample_rate_Hz=rig.sample_rate_Hz, far_poles="gain")
     return Candidate("hinf", "H-infinity, nominal", "hinf", made.K, made.notes)
@@ -58,7 +62,7 @@ def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
 
 def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[[Any], Any] | None = None,
                rivals: Sequence[Candidate] = ()) -> tuple[Candidate, DKIteration]:
-    """D-K iteration on the whole uncertainty set, then reduction to the lowest order with nearly the same mu.
+    """D-K iteration over the whole uncertainty set, then reduction to the lowest order with nearly the same mu.
 
     rivals : controllers that the study already has. The iteration starts from the best of them, and its complex mu is
         never larger than theirs; that of the reduced controller is within reduction_cost_percent of it.
@@ -75,13 +79,13 @@ def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[
 
 def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offset_corner_Hz: float
              ) -> tuple[StateSpace, str]:
-    """The controller of lowest order whose complex mu grows by no more than the cost, and a note that says so."""
+    """The controller of lowest order whose complex mu grows by no more than the cost, and a note on the reduction."""
     P = plant.synthesis
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
     def peak_on_grid(closed: StateSpace, goal: float = 0.0) -> float:
-        """Complex mu of a closed loop; where it is below the goal, only an upper bound of it."""
+        """Complex mu of a closed loop; only an upper bound of it if below the goal."""
         M = closed.frequency_response(omega)[:, None]
         return float(np.max(upper_bound(M, blocks, SETTINGS.accuracy, goal).beta))
     K = made.best.K
@@ -93,12 +97,12 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
         return closed.is_stable() and peak_on_grid(closed, limit) <= limit
 
     def lowest_order(start: StateSpace) -> StateSpace:
-        # Below the corner to which the offset may drift no weight changes.
+        # No weight changes below the corner up to which the offset may drift.
         lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
         return reduce_controller(P.P, start, lambda one: peak_on_grid(P.closed(one), limit), limit=limit).K
-    # Tustin's rule distorts poles near and beyond the Nyquist frequency. Of poles beyond it only the gain at zero
-    # frequency is kept, if that is enough. If the reduced controller still has such poles, lags replace them.
+    # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
+    # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.
     nyquist = np.pi * rig.sample_rate_Hz
     residual = residualise_fast(K, nyquist, also_unstable=True)
     first = lowest_order(residual if harmless(residual) else K)
@@ -113,8 +117,8 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
 def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:
     """The controller with the smallest mu of all those analysed, delivered under the name of the mu controller.
 
-    This is `mu` itself, unless another one has a smaller upper bound over the whole set; a note then says which one it
-    is. The table without control (K None) and unstable loops do not take part.
+    This is `mu` itself, unless another controller has a smaller upper bound over the whole set; a note then names it.
+    The passive table (K None) and unstable loops are excluded.
     """
     stable = [one for one in others if one.K is not None and one.stable and np.isfinite(one.mu.upper)]
     best = min((mu, *stable), key=lambda one: one.mu.upper if np.isfinite(one.mu.upper) else np.inf)
@@ -126,7 +130,7 @@ def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> Control
 
 
 def reduction_grid(plant: DesignPlant, omega_peak: float) -> np.ndarray:
-    """Frequencies [rad/s] at which controllers of lower order are compared, the peaks that mu may have among them."""
+    """Frequencies [rad/s] at which controllers of lower order are compared, including possible peaks of mu."""
     even = 2 * np.pi * np.array(SETTINGS.frequencies_Hz)
     at_rest = resonances(plant.rig.system.poles())
     return merged(even, np.append(at_rest, omega_peak))

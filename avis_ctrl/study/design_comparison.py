@@ -13,7 +13,7 @@ from avis_ctrl.study.saved import STUDY
 from avis_ctrl.summary import html_table, in_short
 
 RESULT = "result.json"
-# Sections whose change makes mu a figure of another problem.
+# Sections that define the mu problem; if they differ, the values of mu cannot be compared.
 WEIGHTS = ("rig", "loaded", "keep", "loop", "uncertainty", "transmissibility", "control_effort", "compliance", "floor")
 FIGURES = (("order", "states of the controller", ""), ("mu_upper", "mu, upper bound", ""),
            ("mu_lower", "mu, lower bound", ""), ("peak_transmissibility_dB", "peak transmissibility, nominal", "dB"),
@@ -23,7 +23,8 @@ FIGURES = (("order", "states of the controller", ""), ("mu_upper", "mu, upper bo
 @dataclass(frozen=True)
 class DesignComparison:
     """titles : of both designs. requested : (key of the design file, first, second) where they differ.
-    found : (quantity with unit, first, second). note : what cannot be compared; empty if all can."""
+    found : (quantity with unit, first, second). note : what cannot be compared; empty if everything can.
+    """
 
     titles: tuple[str, str]
     requested: tuple[tuple[str, str, str], ...]
@@ -84,7 +85,7 @@ def _leaves(table: Any, before: str) -> Iterator[tuple[str, Any]]:
 
 
 def _figures(result: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Value by quantity of the delivered controller and the verdict table."""
+    """Values by quantity: those of the delivered controller and those of the verdict table."""
     try:
         mu = next(row for row in result["controllers"] if row["name"] == "mu")
         figures: dict[str, Any] = {f"{words}{f' [{unit}]' if unit else ''}": mu[key] for key, words, unit in FIGURES}

@@ -1,7 +1,7 @@
-"""Design files: TOML that names a rig, the coordinates kept, weights, uncertainty, controllers and checks.
+"""Design files in TOML: rig, controlled coordinates, weights, uncertainty, controllers and checks.
 
-Every key carries its unit in its name. Whatever is wrong is one line that names file, field, value and what
-was expected; a misspelt key is answered with the nearest one.
+Every key has its unit in its name. Errors are one line that names file, field, value and what was expected; for a
+misspelt key the message suggests the nearest one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Rival = Literal["hinf", "skyhook_classical", "skyhook", "loops"]
 
 
 class LoopSection(Section):
-    """What lies between the controller and the rig, beyond what the rig file says."""
+    """Dynamics between the controller and the rig that the rig file does not contain."""
 
     amplifier_corner_Hz: Positive = 300.0
     integrator_corner_Hz: Positive = 0.1
@@ -52,7 +52,7 @@ class LoopSection(Section):
 
 
 class ChainUncertainty(Section):
-    """Relative uncertainty of a chain: low at low frequency, 100 % at the crossover, high above."""
+    """Relative uncertainty of a chain (a sensor or drive channel): low, 100 % at the crossover, high above it."""
 
     low_percent: Percent
     crossover_Hz: Positive
@@ -70,7 +70,7 @@ class UncertaintySection(Section):
     @field_validator("identified", mode="plain")
     @classmethod
     def _file_or_content(cls, identified: Any) -> str | UncertaintyFile | None:
-        """In a design file the name of a file beside it; `read_study` puts the content in its place."""
+        """In a design file this is the name of a file beside it; `read_study` replaces it by the file's content."""
         if identified is not None and not isinstance(identified, (str, UncertaintyFile)):
             raise ValueError("expected the name of an uncertainty file")
         return identified
@@ -81,14 +81,14 @@ class UncertaintySection(Section):
 
     @property
     def identification(self) -> UncertaintyFile | None:
-        """The content of the uncertainty file. Raises InputError where it was not read yet."""
+        """The content of the uncertainty file. Raises InputError if it has not been read yet."""
         if isinstance(self.identified, str):
             raise InputError("expected the file's content: read_uncertainty(...), or a design that read_study read",
                              field="uncertainty.identified", value=self.identified)
         return self.identified
 
     def of(self, rig: Rig) -> list[UncertainParameter]:
-        """The uncertain parameters, wildcards ("isolator*.k_z") expanded over the rig's names."""
+        """The uncertain parameters; wildcards ("isolator*.k_z") are expanded over the rig's names."""
         known = list(rig.parameters())
         found: dict[str, UncertainParameter] = {}
         for section, absolute in ((self.parameters_percent, False), (self.parameters_absolute, True)):
@@ -108,7 +108,7 @@ class UncertaintySection(Section):
 
 
 class TransmissibilitySection(Section):
-    """The bound that synthesis is asked for: peak_dB everywhere, band_dB inside band_Hz."""
+    """The required bound on transmissibility: peak_dB at all frequencies, band_dB inside band_Hz."""
 
     peak_dB: Decibel
     band_dB: Decibel
@@ -125,10 +125,10 @@ class TransmissibilitySection(Section):
 
 
 class EffortSection(Section):
-    """The floor velocity that may use the whole drive up to the bandwidth; above it the drive is rolled off.
+    """Floor velocity at which the drives may use their whole range up to the bandwidth; they roll off above it.
 
-    offset_percent : of the drive's range that the offset of the electronics may use. offset_corner_Hz : up to here the
-        offset may drift.
+    offset_percent : percentage of the drive's range that the offset of the electronics may use.
+    offset_corner_Hz : frequency up to which the offset may drift.
     """
 
     floor_velocity_m_per_s: Positive
@@ -139,13 +139,13 @@ class EffortSection(Section):
 
 
 class ComplianceSection(Section):
-    """Largest displacement per force on the payload."""
+    """Largest allowed displacement per force on the payload."""
 
     limit_m_per_N: Positive
 
 
 class FloorSection(Section):
-    """Floor motion of the site: a measured shape, scaled to a velocity r.m.s. in a band."""
+    """Floor motion of the site: a measured spectrum, scaled to an r.m.s. velocity in a band."""
 
     spectrum: Spectrum = "kamioka_quiet"
     velocity_rms_m_per_s: Positive | None = None
@@ -153,10 +153,11 @@ class FloorSection(Section):
 
 
 class SynthesisSection(Section):
-    """D-K iteration and its limits: only counts, so that the result does not depend on the speed of the machine.
+    """D-K iteration and its limits. They are all counts, so the result does not depend on the speed of the machine.
 
-    max_iterations : most K-steps. target_mu : end once mu is proved below it; without it, go on while mu falls.
-    polish : minimise gamma over the scalings when D-K iteration stalls; by default yes.
+    max_iterations : maximum number of K-steps. target_mu : stop as soon as mu is proved below it; without a target,
+        iterate while mu decreases.
+    polish : minimise gamma over the scalings when the D-K iteration stalls; yes by default.
     time_limit_s : ignored; accepted because older files contain it.
     """
 
@@ -194,7 +195,7 @@ UNITS: dict[str, str] = {"mu_upper": "", "mu_gap_percent": "%", "fastest_control
 
 
 class RequirementSection(Section):
-    """A line of the verdict table: a quantity of the mu controller and its limit."""
+    """A row of the verdict table: a quantity of the mu controller and its limit."""
 
     quantity: Quantity
     at_most: float | None = None
@@ -213,10 +214,10 @@ class RequirementSection(Section):
 
 
 class Design(Section):
-    """A whole design file. loaded : with the load of the rig file's [load] section on the table. electronics : keys
-    in place of those of the rig file.
+    """A complete design file.
 
-    compare_with : controllers that the mu controller is compared with, beside the table without control.
+    loaded : add the load of the rig file's [load] section. electronics : keys that replace those of the rig file.
+    compare_with : controllers that the mu controller is compared with, besides the passive table.
     """
 
     title: str
@@ -238,15 +239,15 @@ class Design(Section):
 
     @field_serializer("electronics")
     def _only_given(self, electronics: ElectronicsSection) -> dict[str, Any]:
-        """A key that is written would replace the rig file's."""
+        """The given keys only: a default that is written would replace the rig file's value."""
         return electronics.model_dump(exclude_unset=True)
 
     def upper_limits(self, quantity: Quantity) -> list[float]:
-        """What the requirements on a quantity allow it at most."""
+        """The upper limits that the requirements set for a quantity."""
         return [one.at_most for one in self.requirement if one.quantity == quantity and one.at_most is not None]
 
     def equipped(self, rig: Rig) -> Rig:
-        """The rig with what the design file says of its electronics."""
+        """The rig with the electronics settings of the design file."""
         given = {name: getattr(self.electronics, name) for name in self.electronics.model_fields_set}
         return rig.with_electronics(replace(rig.electronics, **given)) if given else rig
 
@@ -263,7 +264,7 @@ def read_design(path: str | Path) -> Design:
 
 
 def design_from_table(table: dict, file: object = None) -> Design:
-    """Check a design given as a table."""
+    """Check a design given as nested dictionaries."""
     design = validated(Design, table, file)
     try:
         _require_band_below_crossovers(design)
@@ -274,7 +275,7 @@ def design_from_table(table: dict, file: object = None) -> Design:
 
 
 def _require_rival(design: Design) -> None:
-    """An advantage over a skyhook needs that skyhook."""
+    """A requirement on the advantage over a skyhook needs this skyhook in compare_with."""
     wanted = [one.quantity for one in design.requirement if one.quantity.startswith("advantage")]
     if wanted and "skyhook" not in design.compare_with:
         raise InputError(f'expected "skyhook" among them: the requirement {wanted[0]} compares with it',
@@ -282,7 +283,7 @@ def _require_rival(design: Design) -> None:
 
 
 def _require_band_below_crossovers(design: Design) -> None:
-    """Above its crossover a chain is 100 % uncertain, so that no controller can do anything there."""
+    """Above its crossover a chain is more than 100 % uncertain, so no controller can be effective there."""
     low = design.transmissibility.band_Hz[0]
     for name in ("actuator_chains", "sensor_chains"):
         chains: ChainUncertainty | None = getattr(design.uncertainty, name)
@@ -293,17 +294,17 @@ def _require_band_below_crossovers(design: Design) -> None:
 
 
 def read_study(path: str | Path) -> tuple[Design, Rig]:
-    """A design file and the rig it names: a shipped one, or a rig file beside it.
+    """Read a design file and its rig: a built-in rig, or a rig file relative to the design file.
 
     Raises
     ------
-    InputError : as `read_design`; a rig that is not there or wrong, an uncertain parameter that it does not have.
+    InputError : as `read_design`; a rig that is missing or invalid, an uncertain parameter that it does not have.
     """
     return study_of(read_design(path), Path(path))
 
 
 def study_of(design: Design, path: Path) -> tuple[Design, Rig]:
-    """A design with the content of its uncertainty file, and its rig; files are relative to the design file's path.
+    """A design with the content of its uncertainty file, and its rig; paths are relative to the design file.
 
     Raises InputError as `read_study`.
     """

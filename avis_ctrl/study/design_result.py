@@ -1,4 +1,4 @@
-"""What a design study finds: one frozen value from which the JSON files and the report are written."""
+"""Result of a design study: one frozen object from which the JSON files and the report are written."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """Bounds of a supremum over frequency and perturbations.
+    """Bounds on a supremum over frequency and perturbations.
 
     Attributes
     ----------
-    upper, lower : of the supremum; upper is inf where the set holds an unstable plant.
+    upper, lower : of the supremum; upper is inf if the set contains an unstable plant.
     omega : frequency [rad/s] of the lower bound.
-    guaranteed : whether the upper bound holds between the computed frequencies.
-    delta : perturbation (n_w, n_z) that reaches the lower bound, or None.
+    guaranteed : whether the upper bound is valid between the computed frequencies.
+    delta : perturbation (n_w, n_z) that attains the lower bound, or None.
     words : that perturbation in physical units.
     frequencies, upper_curve, lower_curve : for plotting (n,).
     """
@@ -73,14 +73,14 @@ class Transmissibility:
 
 @dataclass(frozen=True, eq=False)
 class SiteResponse:
-    """What the loop makes of the site's floor motion and of the sensors' noise (nominal plant).
+    """Response of the nominal loop to the site's floor motion and to the sensor noise.
 
-    velocity_rms, noise_rms : payload velocity by axis [m/s] in the design's floor band, from floor and noise, and
-        from noise alone.
-    third_octave_Hz, floor_third_octaves, payload_third_octaves : bands [Hz] and r.m.s. velocities [m/s];
-        payload (n_bands, n_axes).
+    velocity_rms, noise_rms : payload velocity by axis [m/s] in the design's floor band, from floor and noise, and from
+        noise alone.
+    third_octave_Hz, floor_third_octaves, payload_third_octaves : bands [Hz] and r.m.s. velocities [m/s]; payload
+        (n_bands, n_axes).
     rating, floor_rating : generic vibration criterion met by the worst axis and by the floor (None: not even VC-A).
-    volts_rms, volts_peak : by channel [V]; the peak is the level a Gaussian signal passes once in ten minutes.
+    volts_rms, volts_peak : by channel [V]; the peak is the level that a Gaussian signal exceeds once in ten minutes.
     """
 
     velocity_rms: dict[str, float]
@@ -96,16 +96,16 @@ class SiteResponse:
 
 @dataclass(frozen=True, eq=False)
 class ControllerResult:
-    """A controller and all that was measured on it.
+    """A controller and its analysis.
 
     gamma : H-infinity norm of the weighted performance channels of the nominal plant. gamma_slicot : the same by
-        SLICOT's AB13DD, None where that routine fails.
+        SLICOT's AB13DD; None if that routine fails.
     mu : robust performance of the weighted channels; stability : robust stability (mu of the uncertainty alone).
     worst_peak, worst_band : worst-case transmissibility over all frequencies, and over the design's band.
     compliance : (n,) largest singular value of force -> displacement [m/N] at `transmissibility.omega`, floor at rest.
     peak_transmissibility : nominal, largest singular value over all frequencies.
-    fastest_pole_Hz : of the controller, continuous.
-    rest : the controller at zero frequency, alone; None without a controller.
+    fastest_pole_Hz : of the continuous-time controller.
+    rest : DC gain of the controller alone; None without a controller.
     """
 
     name: str
@@ -129,17 +129,18 @@ class ControllerResult:
 
     @property
     def order(self) -> int:
-        """States of the controller."""
+        """Number of states of the controller."""
         return self.K.nstates if self.K is not None else 0
 
 
 @dataclass(frozen=True, eq=False)
 class SixDofCheck:
-    """The mu controller on all six degrees of freedom, sampled, the other axes under their own loops.
+    """The sampled mu controller on all six degrees of freedom, with companion loops on the other axes.
 
-    omega : (n,) rad/s; kept : (n,) largest singular value from the kept axes' floor to them, rotations at the edge;
-    others : (n,) the same from the floor's other coordinates, which the design model does not have.
-    deviation_dB : largest difference of `kept` from the design model inside the design's band.
+    omega : (n,) rad/s; kept : (n,) largest singular value from floor to payload on the kept axes, rotations at the
+        edge;
+    others : (n,) the same from the other coordinates of the floor, which the design model does not contain.
+    deviation_dB : largest difference between `kept` and the design model inside the design's band.
     """
 
     omega: np.ndarray
@@ -150,12 +151,12 @@ class SixDofCheck:
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """The sampled loop of all axes: the other axes' loops, the simulated plants, the controller as a processor runs it.
+    """The sampled loop of all axes: companion loops, simulated plants, and the controller as a processor runs it.
 
-    digital : sensor volts to demanded drive volts at the rig's rate, decoding, companion loops and allocation included;
-        delay_samples from a sample to the voltage it causes.
+    digital : sensor volts to demanded drive volts at the rig's sample rate, including decoding, companion loops and
+        allocation; delay_samples : from a sample to the voltage it causes.
     culprit : why the first unstable plant is unstable; None if every plant is stable.
-    rest : `digital` at zero frequency.
+    rest : DC gain of `digital`.
     """
 
     companions: Companions
@@ -168,10 +169,10 @@ class Simulated:
 
 @dataclass(frozen=True)
 class AxisGain:
-    """Worst-case velocity of one axis in the design's band, over the floor's velocity in any direction.
+    """Worst-case velocity of one axis in the design's band, per unit floor velocity in any direction.
 
-    mu : upper bound, proved over the whole set, of the mu controller. skyhook : lower bound of the tuned skyhook, which
-        a plant of the set reaches; nan where the design has none, inf where a plant makes it unstable.
+    mu : upper bound for the mu controller, proved over the whole set. skyhook : lower bound for the tuned skyhook,
+        attained by a plant of the set; nan if the design has no skyhook, inf if a plant makes it unstable.
     """
 
     axis: str
@@ -180,13 +181,13 @@ class AxisGain:
 
     @property
     def advantage(self) -> float:
-        """Skyhook over mu; nan, never met, without a rival: what some plant destabilises is no baseline."""
+        """Skyhook over mu; nan (never met) without a skyhook that is stable for all plants."""
         return self.skyhook / self.mu if np.isfinite(self.skyhook) else np.nan
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """A line of the verdict table."""
+    """A row of the verdict table."""
 
     name: str
     limit: float
@@ -209,9 +210,9 @@ class FailedController:
 
 @dataclass(frozen=True, eq=False)
 class DesignResult:
-    """Everything that `avis design` found.
+    """Complete result of `avis design`.
 
-    loop : the sampled loop of all axes: the other axes' loops, simulation, why it is unstable, if it is.
+    loop : the sampled loop of all axes: companion loops, simulation, and the cause if it is unstable.
     failed : controllers for comparison that could not be designed or analysed. by_axis : mu against skyhook.
     """
 
@@ -232,14 +233,14 @@ class DesignResult:
 
     @property
     def simulation(self) -> SimulationCheck | None:
-        """The closed loop of the nonlinear rig, plant by plant; None if none was simulated."""
+        """Simulations of the closed loop with the nonlinear rig, plant by plant; None if nothing was simulated."""
         return self.loop.check if self.loop is not None else None
 
     @property
     def stable(self) -> bool:
-        """Whether the sampled loop of all axes is stable for every plant simulated."""
+        """Whether the sampled loop of all axes is stable for every simulated plant."""
         return self.simulation is None or all(plant.stable for plant in self.simulation.plants)
 
     def controller(self, name: str) -> ControllerResult:
-        """By name."""
+        """The controller of a given name."""
         return next(c for c in self.controllers if c.name == name)

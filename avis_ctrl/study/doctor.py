@@ -1,4 +1,4 @@
-"""What works on this machine: each check does what it names, on a problem with a known answer."""
+"""Checks of the installation; each solves a problem with a known solution."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIBRARIES = ("numpy", "scipy", "control", "slycot", "cvxpy", "clarabel", "matplo
 
 @dataclass(frozen=True)
 class Check:
-    """A line of `avis doctor`."""
+    """A row of `avis doctor`."""
 
     name: str
     found: str
@@ -28,7 +28,7 @@ class Check:
 
 
 def examine() -> list[Check]:
-    """All checks; a failure is a line, never an exception."""
+    """Run all checks; a failure is a row, never an exception."""
     checks = [Check("python", platform.python_version(), True)]
     checks += [_attempt(name, partial(metadata.version, name)) for name in LIBRARIES]
     checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
@@ -42,7 +42,7 @@ def examine() -> list[Check]:
 def _attempt(name: str, check: Callable[[], str]) -> Check:
     try:
         return Check(name, check(), True)
-    except Exception as error:  # whatever fails is the finding
+    except Exception as error:  # any failure is a result of the check
         return Check(name, f"{type(error).__name__}: {error}".splitlines()[0][:100], False)
 
 
@@ -60,7 +60,7 @@ def _threads() -> str:
 
 
 def _slicot() -> str:
-    """A resonance of damping zeta peaks at 1/(2 zeta sqrt(1 - zeta^2))."""
+    """The resonance peak for a damping ratio zeta is 1/(2 zeta sqrt(1 - zeta^2))."""
     from avis_ctrl.lti.statespace import tf
     from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 
@@ -79,9 +79,9 @@ def _clarabel() -> str:
 
 
 def _mu() -> str:
-    """mu of a rank-one matrix with scalar blocks is the sum of its diagonal's magnitudes; compiles the kernels.
+    """mu of a rank-one matrix with scalar blocks is the sum of the magnitudes of its diagonal; compiles the kernels.
 
-    Of complex blocks in the first place, of real ones, for which the diagonal is positive, in the second.
+    The first test has complex blocks, the second one real blocks and a positive diagonal.
     """
     from avis_ctrl.robust.mu import mu
     from avis_ctrl.uncertainty.blocks import ComplexScalar, RealScalar
@@ -92,7 +92,7 @@ def _mu() -> str:
 
 
 def _simulation() -> str:
-    """A table at rest on a still floor stays there; compiles the kernel."""
+    """A table at rest on a motionless floor remains at rest; compiles the kernel."""
     from avis_ctrl.rigs.rig_file import load_rig
     from avis_ctrl.simulation.loop import simulate
     from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
@@ -107,7 +107,7 @@ def _simulation() -> str:
 
 
 def _gcc() -> str:
-    """Without gcc everything works but what needs the exported C code compiled."""
+    """gcc is needed only to compile the exported C code."""
     path = shutil.which("gcc")
     if path is None:
         return "not installed: exported C code is neither compiled, timed nor replayed"
@@ -125,7 +125,7 @@ def _typst() -> str:
 
 
 def _synthesis() -> str:
-    """min ||W S|| = |W(z)| for a plant zero z in the right half plane (Skogestad and Postlethwaite, section 5.7)."""
+    """min ||W S|| = |W(z)| for a right-half-plane zero z of the plant (Skogestad and Postlethwaite, section 5.7)."""
     from avis_ctrl.lti import connect, summing_junction, tf
     from avis_ctrl.robust.hinfsyn import hinfsyn
 

@@ -1,4 +1,4 @@
-"""Folders that commands write, and JSON. How files are written: `avis_ctrl.files`."""
+"""Output folders of the commands, and JSON. Atomic file output is in `avis_ctrl.files`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from avis_ctrl.files import FULL, not_written, write_whole
 
 
 def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
-    """Create the output folder and make sure, before hours of computing, that it can be written.
+    """Create the output folder and check that it is writable, before hours of computation.
 
-    Raises InputError where it is a file, read-only, below something that is, or holds a folder in place of a file;
-    ComputationError where the disk is full.
+    Raises InputError if it is a file, read-only, below such a path, or contains a folder in place of a file;
+    ComputationError if the disk is full.
     """
     path = Path(folder)
     try:
@@ -40,7 +40,7 @@ def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence
 
 @contextlib.contextmanager
 def output_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Iterator[Path]:
-    """`open_folder`; what it created goes again where an error leaves it empty. Raises as it does."""
+    """`open_folder` as a context manager; an error removes new folders that are still empty. Raises as it does."""
     path = Path(folder)
     made = [one for one in (path, *path.parents) if not one.exists()]
     try:
@@ -53,7 +53,7 @@ def output_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequen
 
 
 def require_other(out: Path, *inputs: Path | str | None) -> None:
-    """Raises InputError where a file to write is one that is read: a measurement is never replaced."""
+    """Raise InputError if the output file is one of the input files: a measurement is never overwritten."""
     for one in inputs:
         with contextlib.suppress(OSError):
             if one is not None and out.samefile(one):
@@ -61,12 +61,12 @@ def require_other(out: Path, *inputs: Path | str | None) -> None:
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
-    """`as_json` in a file, whole or not at all."""
+    """Write `as_json` to a file atomically."""
     write_whole(path, as_json(value))
 
 
 def as_json(value: dict[str, Any]) -> bytes:
-    """JSON, floats as they are, infinities and nan as null (JSON has neither)."""
+    """JSON with floats in full precision, infinities and nan as null (JSON has neither)."""
     return json.dumps(_plain(value), indent=1, allow_nan=False).encode()
 
 

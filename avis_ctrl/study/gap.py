@@ -1,4 +1,4 @@
-"""From a campaign and a rig to the effect that the model misses: gates, analysis, design, provenance."""
+"""Search for the effects that the model of a rig lacks: gates (checks of the records), analysis, design, provenance."""
 
 from __future__ import annotations
 
@@ -36,21 +36,22 @@ from avis_ctrl.study.rig_channels import in_words_of
 from avis_ctrl.study.workers import each
 
 Progress = Callable[[str], None]
-# Gates that say stop on what `gap` itself recognises and names, or mends.
+# Gates whose stops are ignored: `gap` itself recognises and names these faults, or corrects them.
 NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
               "spikes", "missing samples")
-# Samples of a record below which neither the gates nor a held-out third of it tell anything.
+# Minimum number of samples of a record; with fewer, neither the gates nor a held-out third give any information.
 FEWEST = 300
 
 
 @dataclass(frozen=True)
 class GapOptions:
-    """What a user may choose.
+    """User options.
 
-    band_Hz : of the comparison; the excited one where None. design : synthesise controllers on both models, by
-    design_file or by default z and phi_x. gates : look at the signals before anything else. despite_gates : go on where
-    a gate says stop. amplifier_corner_Hz : lag that the amplifiers are known to have; see `amplifier_corner`.
-    own_effects : of the user's own file, beside the library.
+    band_Hz : of the comparison; the excited band if None. gates : check the records first. despite_gates : continue if
+        a gate reports a stop.
+    amplifier_corner_Hz : known corner of the amplifiers' lag; see `amplifier_corner`.
+    design : synthesise controllers on both models, according to design_file, or by default for z and phi_x.
+    own_effects : effects from the user's own file, in addition to the library.
     """
 
     seed: int = 1
@@ -63,7 +64,7 @@ class GapOptions:
     own_effects: OwnEffects | None = None
 
     def __post_init__(self) -> None:
-        """Raises InputError for a band that is none, or a corner that is not positive."""
+        """Raises InputError for an invalid band, or a corner that is not positive."""
         if self.band_Hz is not None and not 0 <= self.band_Hz[0] < self.band_Hz[1] < np.inf:
             raise InputError("expected 0 <= LOW < HIGH", field="band_Hz", value=self.band_Hz)
         corner = self.amplifier_corner_Hz
@@ -73,7 +74,7 @@ class GapOptions:
 
 @dataclass(frozen=True, eq=False)
 class GapFinding:
-    """Everything that `avis gap` found; design is None where no controller was asked for, design_note says why."""
+    """Complete result of `avis gap`. design is None if not requested, or if it failed (reason in design_note)."""
 
     gap: Gap
     measured: Campaign
@@ -83,7 +84,7 @@ class GapFinding:
     design_note: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """gap.json of the contract; beside it what noise leaves, the sentences of the report, mu and provenance."""
+        """Content of gap.json: the contract's keys, error by noise alone, sentences of the report, mu, provenance."""
         return {**self.gap.to_json(), "noise_nrmse": self.gap.noise_nrmse, "sentences": list(self.gap.sentences),
                 "design": self.design.to_json() if self.design else None, "design_note": self.design_note or None,
                 "provenance": dict(self.provenance)}
@@ -91,20 +92,20 @@ class GapFinding:
 
 def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptions | None = None,
              progress: Progress = lambda text: None) -> GapFinding:
-    """Find where a rig and a campaign disagree, and name what is missing.
+    """Find where a rig and a campaign disagree, and name the missing effects.
 
     Raises
     ------
-    InputError : frequency responses instead of records, channels that are not the rig's, a gate that says stop,
-        records that drive nothing or tell no noise, an effect of the user's own that fails.
-    ComputationError : a fit that does not come to an end.
+    InputError : frequency responses instead of records, channels of another rig, a gate that reports a stop, records
+        without excitation or without information on the noise, an effect of the user that fails.
+    ComputationError : a fit that does not converge.
     """
     options, began = options or GapOptions(), time.monotonic()
     if not isinstance(measured, Campaign):
         raise InputError("expected records in time: frequency responses do not distinguish faults of a signal from "
                          "those of the table", field="measurement")
     named = in_words_of(rig, measured)
-    assert isinstance(named, Campaign)  # as it was
+    assert isinstance(named, Campaign)  # in_words_of keeps the type
     measured = named
     _require_records(measured, rig)
     if options.band_Hz is not None:
@@ -127,7 +128,7 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
-    """What the gates take for granted. Raises InputError."""
+    """Preconditions of the gates. Raises InputError."""
     if measured.records[0].header.u_unit != "V":
         raise InputError("expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit)
     if abs(measured.sample_rate_Hz / rig.sample_rate_Hz - 1) > 1e-6:
@@ -157,8 +158,10 @@ def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEf
 
 
 def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(y_baseline, y_updated), each (samples, n_y), of every record of another campaign, from u and floor: clipped at
-    the converter's range, y_updated also where a converter was found to clip earlier."""
+    """Predict (y_baseline, y_updated), each (samples, n_y), of every record of another campaign from u and floor.
+
+    The signals are clipped at the converter's range, y_updated also where a converter was found to clip earlier.
+    """
     gap, both = found.gap, []
     effects = [one.to_json() for one in (*gap.effects, *gap.traces)]
     for model, known in ((gap.baseline, []), (gap.updated, effects)):
@@ -173,7 +176,7 @@ def gap_provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: f
     further = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
                                       "own_effects_sha256": own.sha256}
     if options.design_file is not None:
-        with contextlib.suppress(OSError):  # nothing was made of it then, which design_note says
+        with contextlib.suppress(OSError):  # the file was not used then; design_note has the reason
             further["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
     return provenance(rig, repr(options) + data, options.seed, seconds, ("numpy", "scipy", "numba", "h5py"),
                       measurement=measured.source, **further, measurement_sha256=data, settings=tuning_values())

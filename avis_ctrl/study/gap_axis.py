@@ -1,4 +1,4 @@
-"""Files of `avis gap-axis`: gap.json, reports and the model, and what that predicts of other records."""
+"""Files of `avis gap-axis`: gap.json, reports, the model, and its predictions of other records."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ MODEL_FILE = "axis_model.json"
 
 def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, Any],
                    reports: Callable[[AxisGap, str, dict[str, Any]], Sequence[bytes]]) -> list[str]:
-    """gap.json, gap.html and gap.pdf, which `reports` makes of gap, source and provenance, and, of a drive or an
-    oscillator, axis_model.json; their names."""
+    """Write gap.json, gap.html, gap.pdf and, for a drive or an oscillator, axis_model.json; returns their names.
+
+    reports : makes the two reports from gap, source and provenance.
+    """
     made = {"avis_ctrl": avis_ctrl.__version__, "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "measurement": source, "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str
                                                                               ).encode()).hexdigest(),
@@ -45,7 +47,7 @@ def _json(plain: Any) -> bytes:
 
 
 def is_axis_gap(folder: Path) -> bool:
-    """Whether a folder holds the output of `avis gap-axis`."""
+    """Whether a folder contains the output of `avis gap-axis`."""
     try:
         return json.loads((folder / "gap.json").read_text(encoding="utf-8")).get("format") == "avis-gap-axis"
     except (OSError, ValueError, AttributeError):
@@ -53,10 +55,10 @@ def is_axis_gap(folder: Path) -> bool:
 
 
 def write_axis_predictions(folder: Path, paths: Sequence[Path], out: Path) -> list[tuple[str, float, float]]:
-    """/records/NAME/y_baseline and y_updated; name and relative r.m.s. error of each, the start of the record apart.
+    """Write /records/NAME/y_baseline and y_updated; returns the name and both relative r.m.s. errors of each record.
 
-    The force of a drive is predicted from its motion, the motion of an oscillator from its input and the measured state
-    at the begin.
+    The force of a drive is predicted from its motion. The motion of an oscillator is predicted from its input and its
+    measured initial state. The errors exclude the start and the end of the records.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""The influence of a named effect on the controller: the previous one on the updated model, and a new one.
+"""Influence of named effects on the controller: the previous controller on the updated model, and a new controller.
 
-Every figure is computed on a closed loop in state space, as `avis design` computes it: mu and worst-case gains are
-bounds over all frequencies and the design's whole uncertainty, stability is by the eigenvalues. They hold for the
-realisation of the updated model (`gap.realise`), whose distance from the fitted response is given beside them.
+As in `avis design`, every figure is computed from a closed loop in state space: mu and worst-case gains are bounds over
+all frequencies and the whole uncertainty of the design; stability follows from the eigenvalues. The figures are valid
+for the realisation of the updated model (`gap.realise`). Its difference from the fitted response is reported as well.
 """
 
 from __future__ import annotations
@@ -44,13 +44,14 @@ PARAMETERS_PERCENT = {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.c_z": 30.0
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """A controller on a plant.
+    """Figures of a controller on a plant.
 
-    stable : nominally, all poles of the closed loop in the left half plane; where not, the figures are infinite.
-    stable_in_six : the same on all six coordinates, the others without control (`gap_plant.six_dof_is_stable`).
-    mu_upper, mu_lower : robust performance of the design's weights. peak_dB, band_dB : largest nominal transmissibility
-    over all frequencies and over the design's band. worst_peak_dB, worst_band_dB : upper bounds of the same over the
-    design's uncertainty.
+    stable : nominal stability: all poles of the closed loop are in the left half plane; if not, the figures are
+        infinite.
+    stable_in_six : the same with all six coordinates, the others without control (`gap_plant.six_dof_is_stable`).
+    mu_upper, mu_lower : robust performance with the design's weights. peak_dB, band_dB : largest nominal
+        transmissibility over all frequencies and over the design's band. worst_peak_dB, worst_band_dB : upper bounds of
+        the same over the design's uncertainty.
     """
 
     stable: bool
@@ -66,21 +67,21 @@ class LoopFigures:
 
 @dataclass(frozen=True, eq=False)
 class DesignEffect:
-    """What the effects do to a design.
+    """Influence of the effects on a design.
 
     Attributes
     ----------
-    before : the previous controller on the baseline. after : the same controller on the updated model; None where no
-        effect of the model was named. new : a controller designed on the updated model, on it; None where none was
+    before : the previous controller on the baseline. after : the same controller on the updated model; None if no named
+        effect changes the model. new : a controller designed for the updated model, on this model; None if none was
         found.
     K_before, K_new : the controllers.
-    realised : the updated model in state space, with its distance from the fitted response.
-    in_files, not_in_files : labels of effects that rig.toml and design.toml hold, and of those that only this holds.
+    realised : the updated model in state space, with its difference from the fitted response.
+    in_files, not_in_files : labels of the effects that rig.toml and design.toml contain, and of those they do not.
     files : contents of rig.toml and design.toml by name: `avis design` runs on them.
-    sentences : the outcome first. seconds : wall clock.
-    uncertainty : of the fit, as blocks of every loop, and what has none; None where no fit told its covariance.
-    not_checked : labels of named effects against which no controller was checked, and why: the loops do not contain
-        them, so that no figure here says whether they matter.
+    sentences : the outcome first. seconds : wall-clock time.
+    uncertainty : of the fit, as blocks of every loop, and what has no block; None without a covariance of the fit.
+    not_checked : labels of named effects against which no controller was checked, and the reasons. The loops do not
+        contain these effects, so no figure here shows whether they matter.
     """
 
     before: LoopFigures
@@ -98,7 +99,7 @@ class DesignEffect:
     uncertainty: FitUncertainty | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Figures of the three loops, infinite where a loop is unstable, and what is said of them."""
+        """Figures of the three loops, infinite for an unstable loop, and the sentences."""
         loops = {"before": self.before, "after": self.after, "new": self.new}
         return {**{name: asdict(loop) if loop else None for name, loop in loops.items()},
                 "in_files": list(self.in_files), "not_in_files": list(self.not_in_files),
@@ -108,21 +109,21 @@ class DesignEffect:
 
 def design_effect(gap: Gap, design: Path | Design | None = None,
                   progress: Progress = lambda text: None) -> DesignEffect:
-    """Design on the baseline, evaluate on the updated model, design anew.
+    """Design on the baseline, evaluate on the updated model, design again.
 
     Parameters
     ----------
-    design : a design or its file, whose rig gives way to the gap's models; by default z and phi_x of the AVIS as
-        designs/avis_z_phix.toml has them.
+    design : a design or its file; the gap's models replace its rig. By default z and phi_x of the AVIS as in
+        designs/avis_z_phix.toml.
 
     Raises
     ------
-    InputError : a design that does not fit the rig, or whose uncertainty is an identification's (it belongs to one
-        set of parameters only); no default for this rig.
+    InputError : a design that does not fit the rig, or whose uncertainty is that of an identification (it is valid for
+        one set of parameters only); no default for this rig.
     ComputationError : no controller for the baseline.
     """
     with threadpool_limits(1):
-        # The second-order terms of large rotations are nothing at rest.
+        # The second-order terms of large rotations vanish at rest.
         before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
         signals = [f"{one.name}@{one.location}" for one in getattr(gap, "effects", ()) if not one.label]
         asked, covariance = design_for(gap.baseline.rig, design), getattr(gap, "covariance", None)
@@ -130,7 +131,7 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
         if covariance is not None:
             progress("uncertainty: the fit's covariance as a few blocks")
             own = [gap.updated.names.index(name) for name in after.names]
-            # The default's ranges stand in for a measurement.
+            # The ranges of the default design replace a measurement, which the fit provides here.
             judged = without_ranges(asked) if design is None else asked
             wiring = wiring_of(build_plant(judged, before.effective.rig), before)
             uncertainty = fit_uncertainty(judged, after, covariance[np.ix_(own, own)], wiring)
@@ -138,7 +139,7 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
 
 
 def without_ranges(design: Design) -> Design:
-    """The same without ranges of parameters."""
+    """A copy of the design without parameter ranges."""
     return design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
         update={"parameters_percent": {}, "parameters_absolute": {}})})
 
@@ -146,9 +147,12 @@ def without_ranges(design: Design) -> Design:
 def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
                     progress: Progress = lambda text: None, signals: Sequence[str] = (),
                     uncertainty: FitUncertainty | None = None) -> DesignEffect:
-    """`design_effect` of two models; signals : named effects that add to the signals and are in no model.
-    uncertainty : of the fit, for whose design the loops are made; the files hold `design`, for they have no place for
-    the blocks of a fit."""
+    """`design_effect` for two given models.
+
+    signals : named effects that act on the signals and are in no model.
+    uncertainty : of the fit; the loops use its design. The files contain `design`, because they cannot describe the
+        blocks of a fit.
+    """
     began, fit, in_files_design = time.monotonic(), uncertainty.blocks if uncertainty else (), design
     design = uncertainty.design if uncertainty else design
     progress("controller for the baseline: mu synthesis")
@@ -188,7 +192,7 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
 
 
 def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
-    """What `design_effect` designs on a rig. Raises InputError as it does, before anything is computed."""
+    """The design that `design_effect` uses on a rig. Raises InputError as it does, before any computation."""
     if design is None:
         if not isinstance(rig, AvisTable):
             raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")
@@ -205,7 +209,7 @@ def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
 
 def _worst_moment(design: Design, model: TableModel, wiring: Wiring, K: StateSpace,
                   fit: Sequence[Uncertain] = ()) -> tuple[LoopFigures, float]:
-    """The controller on the model; where something drifts, at that end of the campaign which has the larger mu."""
+    """Figures of the controller on the model. If the model drifts: at the end of the campaign with the larger mu."""
     drifts = any(one.effect.name == "stiffness_drift" for one in model.effects)
     found = []
     for when in (-0.5, 0.5) if drifts else (0.0,):
@@ -215,7 +219,7 @@ def _worst_moment(design: Design, model: TableModel, wiring: Wiring, K: StateSpa
 
 
 def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace, when: float = 0.0) -> LoopFigures:
-    """Measure a controller on a plant of a model."""
+    """Figures of a controller on a plant of a model."""
     in_six = six_dof_is_stable(design, model, plant, K, when)
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi)
     if not plant.full.closed(K).is_stable():
@@ -236,7 +240,7 @@ def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace
 
 def start_files(design: Design, model: TableModel, when: float = 0.0
                 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """rig.toml and design.toml of a model by name, labels of the effects that they hold, and of those they do not."""
+    """rig.toml and design.toml of a model by name, labels of the effects that they contain, and of the others."""
     found = carried(design, model, when)
     held = ", ".join(found.inside) or "none"
     header = f"{found.rig.name}, updated by avis gap\neffects in this folder's rig.toml and design.toml: {held}"
@@ -248,7 +252,7 @@ def start_files(design: Design, model: TableModel, when: float = 0.0
 
 
 def _unchecked(not_checked: dict[str, str]) -> list[str]:
-    """That no controller was checked with these effects; empty if there are none."""
+    """A sentence on the effects with which no controller was checked; empty if there are none."""
     if not not_checked:
         return []
     each = "; ".join(f"{label}: {why}" for label, why in not_checked.items())
@@ -258,7 +262,7 @@ def _unchecked(not_checked: dict[str, str]) -> list[str]:
 
 def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None,
              held: str = "all") -> list[str]:
-    """mu of the three, in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
+    """mu of the three loops in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
     if after is None:
         return [f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
                 "changes the model, so nothing else was computed."]
@@ -309,7 +313,7 @@ def _verdict(before: float, after: float, held: str) -> str:
 
 
 def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[str]:
-    """That the files' uncertainty is not that of the loops; empty where it is."""
+    """A sentence if the uncertainty of the files is not that of the loops; empty otherwise."""
     if uncertainty is None or (not uncertainty.blocks and uncertainty.design is design):
         return []
     ranges = ", ".join(f"{name} {size:g} %" for name, size in design.uncertainty.parameters_percent.items())
@@ -319,7 +323,7 @@ def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[st
 
 def _told(realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, inside: Sequence[str],
           outside: Sequence[str]) -> list[str]:
-    """How far to trust the figures and where the effects are."""
+    """Sentences on the accuracy of the figures and on where the effects are described."""
     if not model.effects:
         return []
     error = f"at most {100 * realised.error:.2g} %" if realised.error > 1e-6 else "rounding only"

@@ -1,4 +1,4 @@
-"""Files of `avis gap`: what was found, both models, their rig files, and predictions of other campaigns."""
+"""Files of `avis gap`: the result, both models, their rig files, and predictions of other campaigns."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ from avis_ctrl.study.gap_names import (
 )
 from avis_ctrl.study.identification_output import identified_rig
 
-# Named effects that act on signals alone and that u and floor do not tell.
+# Named effects that act on the signals only and cannot be predicted from u and floor.
 UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known",
                  "ground_motion": "floor motion that is not measured cannot be predicted"}
 
 
 def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | None = None,
               told: Mapping[str, Any] | None = None) -> list[Path]:
-    """All files or none; gap.json last, so that its presence says that the others are complete.
+    """Write all files or none; gap.json is last, so its presence shows that the others are complete.
 
-    told : content of gap.json, by default the gap's own without provenance.
+    told : content of gap.json; by default the gap's own without provenance.
 
-    Raises ComputationError if the disk cannot hold the files.
+    Raises ComputationError if the disk cannot store the files.
     """
     texts: dict[str, str | bytes | None] = {
         BASELINE_RIG: _toml(gap.baseline, "the rig's own structure, its parameters re-identified", None),
@@ -64,7 +64,7 @@ def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | No
 
 
 def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
-    """The rig file of a model, and in words what it cannot hold."""
+    """The rig file of a model, with comments on the effects that it cannot describe."""
     rig, left = rig_with_effects(model)
     names, known = model.base.names, rig.parameters()
     comments = {}
@@ -89,13 +89,13 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
 
 
 def _rig_alone(model: TableModel) -> TableModel:
-    """With the parameters free that have no tolerance, which tells them apart from each other."""
+    """The model with only those parameters free that have no tolerance: a tolerance would make them separable."""
     free = tuple(name for name in default_parameters(model.rig) if name in model.base.names)
     return replace(model, base=replace(model.base, names=free))
 
 
 def _as_reported(model: TableModel, one: ActiveEffect) -> list[str]:
-    """Parameters of an effect as gap.json and the report have them."""
+    """Parameters of an effect as in gap.json and in the report."""
     n = len(one.names)
     found = one.effect.reported(model, one.place, one.by_name, np.zeros((n, n)))
     return [f"{name} = {value.value:.6g}{'' if value.unit in ('', '1') else ' ' + value.unit}"
@@ -103,7 +103,7 @@ def _as_reported(model: TableModel, one: ActiveEffect) -> list[str]:
 
 
 def rig_with_effects(model: TableModel) -> tuple[Rig, list[ActiveEffect]]:
-    """The rig of a model with those of its effects that a rig file has a place for, and the others."""
+    """The rig of a model including those effects that a rig file can describe, and the other effects."""
     rig, left = identified_rig(model.effective), []
     for one in model.effects:
         changes = one.effect.rig_changes(model, one.place, one.by_name)
@@ -116,7 +116,7 @@ def rig_with_effects(model: TableModel) -> tuple[Rig, list[ActiveEffect]]:
 
 
 def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
-    """The rig with an effect that is one of its file's own numbers; None for any other."""
+    """The rig with an effect that changes a number of its file; None for any other effect."""
     if not isinstance(rig, AvisTable):
         return None
     values = one.by_name
@@ -135,7 +135,7 @@ def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
 def read_gap(folder: Path) -> dict[str, Any]:
     """gap.json of a folder.
 
-    Raises InputError where the folder holds no result of avis gap, or half of one.
+    Raises InputError if the folder contains no result of avis gap, or an incomplete one.
     """
     path = folder / GAP_FILE
     found = read_json(path, "avis-gap", "the folder of avis gap")
@@ -148,21 +148,21 @@ def read_gap(folder: Path) -> dict[str, Any]:
 
 
 def gap_rig(folder: Path) -> Rig:
-    """The rig of a gap's re-identified model. Raises InputError as `read_model`."""
+    """The rig of the re-identified (baseline) model. Raises InputError as `read_model`."""
     return read_model(folder / BASELINE_FILE)[0].rig
 
 
 def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
                           progress: Callable[[str], None] = lambda text: None) -> None:
-    """/records/NN/y_baseline and y_updated of a campaign, simulated from its u and floor alone, in the unit of its y.
+    """Write /records/NN/y_baseline and y_updated, simulated from the u and floor of a campaign, in the unit of its y.
 
-    Records start at rest. y is clipped at the converter's range and not rounded; y_updated also where a converter was
-    found to clip earlier. What cannot be predicted stands in the attribute `not_predicted`.
+    Records start at rest. y is clipped at the converter's range and not rounded; y_updated is also clipped where a
+    converter was found to clip earlier. The attribute `not_predicted` states what cannot be predicted.
 
     Raises
     ------
-    InputError : a folder or campaign that does not fit, a place that cannot be written.
-    ComputationError : an effect with which the motion diverges; a disk that cannot hold the file.
+    InputError : a folder or campaign that does not fit, a path that cannot be written.
+    ComputationError : an effect with which the motion diverges; a disk that cannot store the file.
     """
     found = read_gap(folder)
     effects = [*found["effects"], *found["traces"]]
@@ -172,7 +172,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "rig": models["y_baseline"][0].rig.name,
                            "not_predicted": "; ".join(_not_predicted(effects, campaign))})
-        # Model by model: records of one length share the model's response.
+        # Model by model: records of equal length use the same response of the model.
         for name, (model, clock) in models.items():
             low, high = converter_limits(model, campaign, effects if name == "y_updated" else [])
             for source in campaign.records:
@@ -191,7 +191,7 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
 
 
 def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) -> np.ndarray:
-    """(samples, n_y) in the model's order."""
+    """(samples, n_y), sensors in the model's order."""
     if len(record.u) > line_response.SETTINGS.most_samples and not model.effects:
         limit = model.rig.limits_of(record.header.u_names)
         return predict(model.base, replace(record, u=np.clip(record.u, -limit, limit)), large_motion=False)
@@ -217,9 +217,9 @@ def _not_predicted(effects: Sequence[Mapping[str, Any]], campaign: Campaign) -> 
 
 def converter_limits(model: TableModel, campaign: Campaign, effects: Sequence[Mapping[str, Any]]
                      ) -> tuple[np.ndarray, np.ndarray]:
-    """(n_y,) each, in the campaign's order: range of the converter, and where it was found to clip.
+    """Lower and upper limits (n_y,), in the campaign's order: range of the converter, or where it was found to clip.
 
-    effects : named ones and traces, as gap.json has them.
+    effects : named effects and traces (very small effects), as in gap.json.
     """
     n = len(campaign.y_names)
     known = campaign.y_unit == "V" and model.rig.acquisition is not None

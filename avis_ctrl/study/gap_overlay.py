@@ -1,4 +1,4 @@
-"""Measured frequency responses beside those of the re-identified and of the updated model, for figures."""
+"""Measured frequency responses with those of the re-identified and of the updated model, for figures."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
-# What a method begins with that measures beside a model.
+# Start of the name of a method that adds a measured residual to the response of a model.
 BESIDE = "response of the model plus its residual: "
 
 
 @dataclass(frozen=True, eq=False)
 class GapOverlay(MeasuredOverlay):
-    """With the re-identified and the updated model.
+    """A measured response with those of the re-identified and of the updated model.
 
     Attributes
     ----------
-    baseline, updated : (n, n_y, n_u) complex. Effects that depend on amplitude or time have no frequency
-        response: with them, `updated` is measured as `measured` is, from what the model simulates of the same records.
-    records : that the measured response is from.
-    simulated : effects for which `updated` was measured from a simulation. left_out : effects that `updated` lacks.
+    baseline, updated : (n, n_y, n_u) complex. Effects that depend on amplitude or time have no frequency response. With
+        such effects `updated` is estimated like `measured`, from records that the model simulates.
+    records : used for the measured response.
+    simulated : effects for which `updated` was estimated from a simulation. left_out : effects that `updated` lacks.
     """
 
     baseline: np.ndarray
@@ -47,10 +47,12 @@ class GapOverlay(MeasuredOverlay):
     simulated: tuple[str, ...] = ()
 
 
-@lru_cache(maxsize=1)  # asked for by each format of the report
+@lru_cache(maxsize=1)  # called for each format of the report
 def gap_overlay(campaign: Campaign, baseline: TableModel, updated: TableModel) -> GapOverlay | str:
-    """The overlay of the records of the level that most of them have (of all where these are too few), or a sentence
-    why there is none."""
+    """Overlay of the records of the most common level, or of all records if these are too few.
+
+    Returns a sentence with the reason if no response can be measured.
+    """
     refused = "no record drives the actuators"
     clock = clock_of(campaign)
     with threadpool_limits(1):
@@ -63,7 +65,7 @@ def gap_overlay(campaign: Campaign, baseline: TableModel, updated: TableModel) -
 
 
 def selections(campaign: Campaign) -> list[Campaign]:
-    """The driven records of the level that most of them have, the higher one where several have as many; then all."""
+    """The driven records of the most common level and excitation (highest level in a tie), then all driven records."""
     driven = sorted((r for r in campaign.records if driven_inputs(r)), key=lambda r: -r.header.level_V)
     if not driven:
         return []
@@ -100,7 +102,7 @@ def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock
 
 def _with_nonlinear(records: Campaign, beside: Campaign | None, updated: TableModel, measured: FrequencyResponse,
                     linear: np.ndarray, clock: tuple[float, float]) -> np.ndarray:
-    """(n, n_y, n_u) that the method of `measured` finds in the records as the whole model simulates them."""
+    """(n, n_y, n_u) response estimated by the method of `measured` from records that the complete model simulates."""
     made = _simulated(records, updated, clock)
     rows = [measured.outputs.index(name) for name in updated.sensors.names]
     if beside is not None:
@@ -113,7 +115,7 @@ def _with_nonlinear(records: Campaign, beside: Campaign | None, updated: TableMo
 
 
 def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
-    """(n, n_y, n_u) from the inputs of a measured response."""
+    """(n, n_y, n_u) response of a model to the inputs of a measured response."""
     columns = [model.inputs.index(name) for name in like.inputs]
     U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, columns],
                         (len(like.omega), len(model.inputs), len(columns)))
@@ -121,7 +123,7 @@ def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
 
 
 def _best_linear(records: Campaign) -> FrequencyResponse | None:
-    """The best linear approximation on few enough lines for a figure; None where the records allow none."""
+    """Best linear approximation, thinned for a figure; None if the records do not allow it."""
     try:
         return thinned(best_linear_approximation(records, band_Hz=excited_band(records)))
     except AvisError:
@@ -129,8 +131,7 @@ def _best_linear(records: Campaign) -> FrequencyResponse | None:
 
 
 def _regressed_on_grid(beside: Campaign) -> FrequencyResponse:
-    """What a model leaves of the records, regressed on the inputs: of the records themselves the windows would round
-    off the resonances."""
+    """Regression of a model's residual on the inputs; regression of the records would flatten the resonances."""
     band_Hz, step = excited_band(beside), 1 / min(one.header.duration_s for one in beside.records)
     low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
     if not 0 < low < high:
@@ -141,7 +142,7 @@ def _regressed_on_grid(beside: Campaign) -> FrequencyResponse:
 
 
 def _simulated(records: Campaign, model: TableModel, clock: tuple[float, float]) -> Campaign:
-    """The records with what the model reads in them in the place of y, from rest at their start."""
+    """The records with y replaced by a simulation of the model, from rest at their start."""
     made = []
     for record in cast(tuple[Record, ...], records.records):
         h = record.header
@@ -154,13 +155,13 @@ def _simulated(records: Campaign, model: TableModel, clock: tuple[float, float])
 
 
 def _less(records: Campaign, others: Campaign) -> Campaign:
-    """The records with the others' y taken off."""
+    """The records with the y of the others subtracted."""
     pairs = zip(cast(tuple[Record, ...], records.records), cast(tuple[Record, ...], others.records), strict=True)
     return replace(records, records=tuple(replace(one, y=one.y - other.y) for one, other in pairs))
 
 
 def _regressed(left: Campaign, band_Hz: tuple[float, float], grid: np.ndarray) -> FrequencyResponse:
-    """Windows grow until the inputs can be told apart in each."""
+    """Local polynomial regression. The windows grow until the inputs can be separated in each of them."""
     for half_width in HALF_WIDTHS[:-1]:
         try:
             return local_polynomial(left, band_Hz=band_Hz, frequency_Hz=grid, half_width=half_width)

@@ -1,10 +1,10 @@
-"""The generalized plant of a design on a model with effects, and what of it the files of `avis design` can carry.
+"""Generalized plant of a design on a model with effects, and the part of it that files of `avis design` can describe.
 
-    floor -> (chassis) -> rig, its uncertain parameters -> + effects -> what the sensors see -> decoding as before
+    floor -> (chassis) -> rig, its uncertain parameters -> + effects -> motion at the sensors -> decoding as before
 
-Uncertainty stays where the design has it. What the effects multiply (the branch of a mount, the recoil of the chassis)
-is taken with nominal values. Allocation, decoding and sensitivities are those of the first plant: the controller does
-not know that a motor or sensor is another, or elsewhere, than its rig file says.
+The uncertainty enters as in the design. Quantities that the effects multiply (the branch of a mount, the recoil of the
+chassis) have their nominal values. Allocation, decoding and sensitivities are those of the first plant: the controller
+does not know that a motor or sensor differs from its rig file, or is elsewhere.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.generalized_plant import Part
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
-# Effects whose linear content a rig or design file holds, and where.
+# Effects whose linear part a rig or design file can describe, and where.
 CARRIED: Mapping[str, str] = {
     "com_offset": "the rig's centre of mass", "product_of_inertia": "the rig's inertia",
     "actuator_gain": "the motor's force constant in the rig file",
@@ -41,13 +41,13 @@ CARRIED: Mapping[str, str] = {
     "contact_friction": "the rig's stiffness far below the slip, and the range of that stiffness covers it too"}
 
 
-# Error of a plant's delay at the bandwidth of the drives that asks for a higher order than the design's (at most 6).
+# Error of the approximated delay, at the bandwidth of the drives, above which its order is raised (to 6 at most).
 DELAY_ERROR = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """What the files of `avis design` hold of a model: rig and design, labels of what is in them and of what is not."""
+    """A model as files of `avis design`: rig, design, and labels of the effects inside and outside these files."""
 
     rig: Rig
     design: Design
@@ -56,7 +56,7 @@ class Carried:
 
 
 def wiring_of(plant: DesignPlant, model: TableModel) -> Wiring:
-    """Volts by force and velocity by volts of the controller of a plant: decoding over the model's sensitivities."""
+    """Allocation and decoding of a plant's controller; the decoding is divided by the model's sensitivities."""
     sensors = model.sensors
     decoding = plant.decoding[:, [plant.sensors.index(name) for name in sensors.names]] / sensors.sensitivity
     return Wiring(plant.actuators, plant.allocation, tuple(sensors.names), decoding)
@@ -64,17 +64,17 @@ def wiring_of(plant: DesignPlant, model: TableModel) -> Wiring:
 
 def plant_of(design: Design, model: TableModel, wiring: Wiring | None = None, when: float = 0.0,
              fit: Sequence[Uncertain] = ()) -> tuple[DesignPlant, Design, Rig]:
-    """Plant of a design on a model with its effects; with it the design and rig whose loop it has.
+    """Plant of a design on a model with its effects, and the design and rig that correspond to its loop.
 
     Parameters
     ----------
     wiring : of the controller (`wiring_of`); by default that for the model's own rig.
-    when : -0.5 .. 0.5 through the campaign, for what drifts.
-    fit : uncertain beside what the design says (`gap_uncertainty`).
+    when : time in the campaign, -0.5 .. 0.5, for drifts.
+    fit : uncertain elements in addition to those of the design (`gap_uncertainty`).
 
     Raises
     ------
-    InputError : as `build_plant`; values of an effect that no system has.
+    InputError : as `build_plant`; impossible values of an effect.
     """
     rig, asked = _loop(model.effective.rig, design, model)
     if wiring is not None:
@@ -87,18 +87,18 @@ def plant_of(design: Design, model: TableModel, wiring: Wiring | None = None, wh
     systems["rig"] = Part("rig", "rig", _rig_part(plant, model, wrapped))
     for axis in plant.axes:
         name = f"sensor chain {axis}"
-        systems.pop(f"motion of {name}", None)  # the new parts read each sensor by itself
+        systems.pop(f"motion of {name}", None)  # the new parts decode each sensor separately
         systems[name] = Part(name, "sensor", _sensor_chain(plant, axis))
     return _rebuilt(plant, tuple(systems.values()), wrapped), asked, rig
 
 
 def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
-    """Delay, amplifiers and drive limit of the model; amplifiers that it does not know stay as the design assumes.
+    """Rig and design with the model's delay, amplifiers and drive limit; unknown amplifiers remain as in the design.
 
-    The delay's order rises where the design's would be wrong within its bandwidth.
+    The order of the delay is raised if the design's order is too low within its bandwidth.
     """
     delay, corner = loop_lag(model)
-    # The lowest counts: the design's limit is one for all drives.
+    # The lowest limit is used: the design has one limit for all drives.
     limits = [float(np.min(voltage_limits(one.by_name))) for one in model.effects
               if one.effect.name == "actuator_saturation"]
     rig = rig.with_loop_delay(delay).with_drives_limited(min(limits, default=np.inf))
@@ -108,13 +108,13 @@ def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
 
 
 def delay_order(design: Design, rig: Rig) -> tuple[int, float]:
-    """Order of the design's delay, at least its own, and the error that is left at the bandwidth of its drives."""
+    """Order of the design's delay, at least its own, and the remaining error at the bandwidth of its drives."""
     omega = 2 * np.pi * design.control_effort.bandwidth_Hz
     return sufficient_order(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, omega, DELAY_ERROR, 6, design.loop.pade_order)
 
 
 def _rebuilt(plant: DesignPlant, parts: tuple[Part, ...], rig: StateSpace) -> DesignPlant:
-    """The connection with other parts; signals and blocks as they were."""
+    """The interconnection with other parts; signals and blocks are unchanged."""
     old = plant.full
     P = connect({part.name: part.system for part in parts}, list(old.P.inputs), list(old.P.outputs))
     full = replace(old, P=P, parts=parts)
@@ -123,7 +123,7 @@ def _rebuilt(plant: DesignPlant, parts: tuple[Part, ...], rig: StateSpace) -> De
 
 
 def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> StateSpace:
-    """Motion, and what decoding makes of the sensors' deviations and of gravity."""
+    """The rig's motion, and the decoded deviations of the sensors and decoded effect of gravity."""
     old = next(part.system for part in plant.full.parts if part.name == "rig")
     sensors, n = list(model.sensors.names), len(plant.axes)
     lever = np.array([1 / model.rig.edge_m if axis.endswith("_edge") else 1.0 for axis in plant.axes])
@@ -144,8 +144,11 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
 
 
 def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
-    """s^2/(s^2 + a s + b) on what is sensed and 1/(s^2 + a s + b) on gravity's rate, in two states; then the anti-alias
-    filter."""
+    """Sensor chain of an axis for the sensed velocity and the rate of gravity.
+
+    s^2/(s^2 + a s + b) on the velocity and 1/(s^2 + a s + b) on the rate of gravity, in two states; then the anti-alias
+    filter.
+    """
     poles = sorted(plant.sensor_chain.poles(), key=abs)
     _, a, b = np.real(np.poly(poles[:2]))
     A, B = np.array([[-a, 1.0], [-b, 0.0]]), np.array([[-a, 0.0], [-b, 1.0]])
@@ -157,10 +160,10 @@ def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
 
 
 def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace, when: float = 0.0) -> bool:
-    """Whether the loop is stable on all six coordinates, the others without control: eigenvalues of a realisation.
+    """Whether the loop is stable with all six coordinates, the others without control: eigenvalues of a realisation.
 
-    The path is not that of the plant: volts to volts with hold, delay and every sensor's own chain. What the locked
-    coordinates of a design hide (an offset centre of mass, gravity, a tilted sensor) is in it.
+    The loop is not modelled as in the plant: it runs from volts to volts with hold, delay and the chain of each sensor.
+    It includes what the locked coordinates of a design hide (an offset centre of mass, gravity, a tilted sensor).
     """
     table = realise(model, when=when).system
     volts = table.inputs[:len(model.actuators)]
@@ -180,9 +183,9 @@ def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: 
 
 
 def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
-    """Rig and design from which `avis design` starts on a model, as far as the files have a place for its effects.
+    """Rig and design for `avis design` on a model, as far as the files can describe its effects.
 
-    Sensitivities and force constants in the file are known to the controller: `avis design` calibrates them away.
+    The controller knows the sensitivities and force constants of the file: `avis design` calibrates them away.
     """
     rig, asked = _loop(model.effective.rig, design, model)
     changes: dict[str, float] = {}
@@ -222,7 +225,7 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
 
 
 def _with_sensitivity(rig: Any, model: TableModel, factors: Mapping[str, float]) -> Any:
-    """Sensitivities of the model's sensors, their effects included."""
+    """The rig with the sensitivities of the model's sensors, including effects."""
     if isinstance(rig, Halcyonics) or model.sensors.unit != "V":
         return rig
     return rig.with_sensor_gains({name: float(value) * factors[name] for name, value

@@ -1,15 +1,17 @@
-"""What the covariance of a fit leaves uncertain of a table, as a few real blocks of a plant, and what these leave out.
+"""Parameter uncertainty of a fit as a few real blocks of a plant, with bounds on the part that has no block.
 
     theta = theta_0 + S z,  z standard normal in r numbers;   row a of N = [M, C, K, -T]:  n_a = n_a0 + z' Q_a
 
-For the equation of each coordinate a, z is turned so that its first number changes the response most, by that equation
-alone, its second most of what is left, and so on. Multiples of the equations, added to one, change nothing. The fewest
-of all these become blocks |delta| <= 1, one copy each: no product of changes enters, and no scaling is a matrix. What
-is left out is less than a share of the dynamics that the design takes for unknown anyway. It is not in the plant; its
-size is stated.
+The equation of motion of each coordinate a is treated separately. z is rotated so that its first component changes the
+response most, through this equation alone; the second component changes the residual most, and so on. Changes of an
+equation by multiples of the nominal equations do not change the response. The smallest sufficient set of components,
+over all equations, becomes blocks |delta| <= 1. No block is repeated: products of changes are neglected, and all
+scalings are scalars. The residual is below a fraction of the neglected dynamics of the design. It is not in the plant,
+but its size is reported.
 
-Coverage: the numbers of all equations, each within k standard deviations with probability p^(1/(r n)), hold together
-with probability p or more, however correlated (Sidak 1967), where the errors of the fit are normal.
+Coverage: each component of each of the n equations is within k standard deviations with probability p^(1/(r n)). All
+components together are within their limits with probability p or more, for any correlation (Sidak 1967), if the errors
+of the fit are normal.
 """
 
 from __future__ import annotations
@@ -38,15 +40,16 @@ from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 @dataclass(frozen=True)
 class FitUncertaintySettings:
-    """When a combination of parameters needs a block.
+    """Criteria for a block of a combination of parameters.
 
-    left_out : share of the drives' neglected dynamics that all combinations without a block may add up to: a loop that
-        bears those bears a tenth more of them, and mu hardly rises.
-    without_dynamics : share of the response instead, for a design that declares no neglected dynamics.
-    band_Hz, points : where the response is judged: the range of transmissibility, dense against the modes' width.
-    alike : combinations of drives that move the table by less than this share of the strongest one stand for no sensor:
-        drives side by side would push against each other by many times their force, to make up for a tilt.
-    draws : tables from the covariance on which products of changes are looked at.
+    left_out : the combinations without a block may add up to this fraction of the drives' neglected dynamics. A loop
+        that tolerates the neglected dynamics tolerates a tenth more, with hardly any increase of mu.
+    without_dynamics : the same as a fraction of the response, for a design without neglected dynamics.
+    band_Hz, points : frequency grid of the comparison: the range of transmissibility, fine compared with the modes'
+        width.
+    alike : relative cut-off below which combinations of drives are not used to represent changes of sensors. Adjacent
+        drives would otherwise oppose each other with many times their force to represent a tilt.
+    draws : number of tables drawn from the covariance to estimate products of changes.
     """
 
     left_out: float = 0.1
@@ -58,7 +61,7 @@ class FitUncertaintySettings:
 
     @property
     def omega(self) -> np.ndarray:
-        """(n,) rad/s."""
+        """(n,) frequencies [rad/s]."""
         return 2 * np.pi * np.geomspace(*self.band_Hz, self.points)
 
 
@@ -67,17 +70,18 @@ SETTINGS = FitUncertaintySettings()
 
 @dataclass(frozen=True, eq=False)
 class FitUncertainty:
-    """Blocks of a fit, and what they leave out, all relative to the response at omega (n,) [rad/s].
+    """Blocks of a fit, and bounds on what they omit, all relative to the response at omega (n,) [rad/s].
 
     Attributes
     ----------
-    design : whose ranges are beside them. blocks : for `plant_of`. effect : (q,) largest change of the response
-        by each at delta = 1.
-    n_parameters : of the covariance that no range of the design holds. confidence : p of all numbers together.
-    rest, rest_floor : (n,) bound on what has no block, of the response to drives and to the floor.
-    elsewhere : (n,) bound on what the plant's equations do not hold of the response from drives to what the controller
-        sees, on all six coordinates: by the dynamics of sensors, by effects, through coordinates that are locked.
-    products : largest change by products of changes, of tables drawn from the covariance.
+    design : its ranges are used in addition to the blocks. blocks : for `plant_of`. effect : (q,) largest change of the
+        response by each block at delta = 1.
+    n_parameters : number of parameters in the covariance without a range in the design. confidence : p of all
+        components together.
+    rest, rest_floor : (n,) bound on the part without a block, for the response to the drives and to the floor.
+    elsewhere : (n,) bound on changes that the plant's equations do not contain, for the response from the drives to the
+        measurements of the controller with all six coordinates: sensor dynamics, effects, locked coordinates.
+    products : largest change by products of changes, over tables drawn from the covariance.
     dynamics : (n,) neglected dynamics of the design's drives.
     """
 
@@ -94,7 +98,7 @@ class FitUncertainty:
     dynamics: np.ndarray
 
     def to_json(self) -> dict[str, Any]:
-        """Figures, shares of the response."""
+        """Figures, as fractions of the response."""
         return {"confidence": self.confidence, "parameters": self.n_parameters,
                 "blocks": {one.name: float(size) for one, size in zip(self.blocks, self.effect, strict=True)},
                 "left_out_drives": float(np.max(self.rest)), "left_out_floor": float(np.max(self.rest_floor)),
@@ -102,7 +106,7 @@ class FitUncertainty:
                 "products": self.products, "not_in_equations": float(np.max(self.elsewhere))}
 
     def sentences(self) -> tuple[str, str]:
-        """What is uncertain, and what of it has no block."""
+        """What is uncertain, and which part of it has no block."""
         own = self.to_json()
         sizes = ", ".join(f"{name} {_percent(size)}" for name, size in own["blocks"].items())
         blocks = f"{len(self.blocks)} real blocks that change the response by at most {sizes}" if sizes else \
@@ -124,12 +128,12 @@ def _percent(share: float) -> str:
 
 def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, wiring: Wiring,
                     settings: FitUncertaintySettings = SETTINGS) -> FitUncertainty:
-    """The uncertainty of a fit, beside the ranges that a design has itself.
+    """The uncertainty of a fit, in addition to the ranges of a design.
 
     Parameters
     ----------
     model : at the estimate. covariance : (n_p, n_p) of `model.names`, in their units.
-    wiring : of the controller, by whose axes the response is judged.
+    wiring : of the controller; the response is evaluated on its axes.
     """
     rig, omega, confidence = model.effective.rig, settings.omega, design.uncertainty.confidence_percent / 100
     ranged = {one.name for one in design.uncertainty.of(rig)}
@@ -145,7 +149,8 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
     A[[actuators.index(name) for name in wiring.actuators]] = wiring.allocation
     seen, inside = _seen(model, names, wiring, omega), np.zeros((len(names), len(omega), *base[0].shape), complex)
     inside[held] = relative_changes(base, [slope for _, slope in felt], omega, A)[0]
-    # The records determine only the product of force constant and sensitivity, and the loop depends on no more.
+    # The records determine only the product of force constant and sensitivity, and the loop depends only on this
+    # product.
     drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
     alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
                      settings.alike)
@@ -166,7 +171,7 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
 def _by_equation(base: KeptMatrices, Q: np.ndarray, keep: Sequence[str], A: np.ndarray, omega: np.ndarray,
                  allowed: np.ndarray, confidence: float
                  ) -> tuple[tuple[UncertainEquation, ...], np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks, their effects, and bounds (n,) on what they leave; Q (r, k, 3 k + n_u) changes of N by each z."""
+    """Blocks, their effects, and bounds (n,) on the residual; Q (r, k, 3 k + n_u) changes of N by each z."""
     n, k, found = len(Q), len(keep), []
     for a, name in enumerate(keep):
         own = np.zeros_like(Q)
@@ -176,7 +181,7 @@ def _by_equation(base: KeptMatrices, Q: np.ndarray, keep: Sequence[str], A: np.n
         V = _rotation(weighted)
         driven, floor, row = (np.tensordot(V, one, 1) for one in (driven, floor, Q[:, a]))
         found += [(name, row[j], driven[j], floor[j]) for j in range(n)]
-    # Each number of each equation by itself.
+    # Each component of each equation separately.
     box = _quantile(n * k, confidence)
     sizes = [box * np.stack([np.linalg.norm(one, 2, axis=(1, 2)) for one in (driven, floor)])
              for _, _, driven, floor in found]
@@ -209,19 +214,21 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 
 def _real(parts: np.ndarray) -> np.ndarray:
-    """(m, N) real numbers of complex responses (m, ...)."""
+    """Complex responses (m, ...) as real vectors (m, N)."""
     flat = parts.reshape(len(parts), int(np.prod(parts.shape[1:])))
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
 def _nearest(basis: np.ndarray, parts: np.ndarray, weakest: float) -> np.ndarray:
-    """(n, m) smallest real combinations of m responses (m, ...) nearest to n others (n, ...), those of the m left out
-    that are less than a share of the strongest."""
+    """(n, m) real minimum-norm least-squares coefficients of n responses (n, ...) in terms of m responses (m, ...).
+
+    weakest : relative cut-off of the singular values.
+    """
     return np.linalg.lstsq(_real(basis).T, _real(parts).T, rcond=weakest)[0].T
 
 
 def _rotation(parts: np.ndarray) -> np.ndarray:
-    """V (r, r), orthonormal: V parts has its largest response first, and the largest of what is left next."""
+    """Orthonormal V (r, r): the first component of V parts is the largest, the second largest in the residual, ..."""
     return np.linalg.eigh((J := _real(parts)) @ J.T)[1].T[::-1]
 
 
@@ -230,17 +237,17 @@ def _turned(parts: np.ndarray) -> np.ndarray:
 
 
 def _quantile(n: int, confidence: float) -> float:
-    """k with P(|x| <= k)^n = p of standard normal x."""
+    """k with P(|x| <= k)^n = p for standard normal x."""
     return float(norm.ppf((1 + confidence ** (1 / max(n, 1))) / 2))
 
 
 def _box(parts: np.ndarray, confidence: float) -> np.ndarray:
-    """(n,) bound on the gain of sum_i z_i parts_i (r, n, k, k) over a box of that probability."""
+    """(n,) bound on the gain of sum_i z_i parts_i (r, n, k, k) over a box of this probability."""
     return _quantile(len(parts), confidence) * np.sum(np.linalg.norm(parts, 2, axis=(2, 3)), axis=0)
 
 
 def _allowed(design: Design, omega: np.ndarray, settings: FitUncertaintySettings) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) neglected dynamics of the drives, and what may be left out; of a design without them, shares of one."""
+    """(n,) neglected dynamics of the drives, and the allowed residual; for a design without them relative to 1."""
     chains = design.uncertainty.actuator_chains
     if chains is None:
         return np.ones(len(omega)), np.full(len(omega), settings.without_dynamics)
@@ -250,8 +257,10 @@ def _allowed(design: Design, omega: np.ndarray, settings: FitUncertaintySettings
 
 
 def _seen(model: TableModel, names: Sequence[str], wiring: Wiring, omega: np.ndarray) -> np.ndarray:
-    """(n_p, n, k, k) relative change of the response from forces asked to velocities seen, on six coordinates, by some
-    parameters of a model per their units; zero by those of effects that depend on amplitude."""
+    """(n_p, n, k, k) relative sensitivity of the response from commanded forces to measured velocities.
+
+    With six coordinates, per unit of each parameter; zero for parameters of effects that depend on amplitude.
+    """
     model = model.linear
     sensors = list(model.sensors.names)
     A = np.zeros((len(omega), len(model.inputs), wiring.allocation.shape[1]), complex)
@@ -269,7 +278,7 @@ def _seen(model: TableModel, names: Sequence[str], wiring: Wiring, omega: np.nda
 
 def _products(rig: Rig, names: Sequence[str], S: np.ndarray, slopes: Sequence[KeptMatrices], base: KeptMatrices,
               keep: Sequence[str], A: np.ndarray, omega: np.ndarray, settings: FitUncertaintySettings) -> float:
-    """Largest relative change of tables drawn from the covariance beyond that in proportion to their parameters."""
+    """Largest relative change that is not linear in the parameters, over tables drawn from the covariance."""
     known, beyond = rig.parameters(), []
     if not names:
         return 0.0

@@ -19,7 +19,10 @@ from avis_ctrl.simulation.rehearsal import Rehearsal, rehearse
 
 
 def rehearse_with_effects(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
-    """The campaign of a plan on the perturbed table, with its effects; raises as `rehearse` and `hidden_effects`."""
+    """The campaign of a plan, simulated with its effects on the perturbed table.
+
+    Raises as `rehearse` and `hidden_effects`.
+    """
     if not plan.effect:
         return rehearse(rig, plan, seed, progress)
     corner = open_loop(rig, plan).amplifier_corner_Hz
@@ -27,9 +30,9 @@ def rehearse_with_effects(rig: Rig, plan: CampaignPlan, seed: int = 1, progress:
 
 
 def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz: float | None = None) -> SensorChange:
-    """What the effects of a plan add to the sensor signals of a table.
+    """Change of the sensor signals of a table by the effects of a plan.
 
-    The difference of two simulations of the linearised table by `gap.simulation`, with and without the effects.
+    It is the difference of two simulations of the linearised table by `gap.simulation`, with and without the effects.
 
     Raises
     ------
@@ -47,7 +50,7 @@ def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz:
 
 
 def _active(model: TableModel, plan: EffectPlan, field: str) -> ActiveEffect:
-    """The effect of a plan; parameters that the plan leaves out keep the first starting value of a search."""
+    """The effect of a plan; parameters that the plan omits have the first starting value of a search."""
     effect, place = effect_at(model, plan.name, plan.place or None, field)
     begun = active(effect, model, place)
     known = {one.name: one for one in begun.parameters}

@@ -1,4 +1,4 @@
-"""From measurements to an identified rig: gates, three ways of identification, identifiability, validation."""
+"""Identification of a rig from measurements: gates (checks of the records), fits, identifiability, validation."""
 
 from __future__ import annotations
 
@@ -52,14 +52,15 @@ TOLERANT = ("the standard deviations include noise, the tolerances of the rig fi
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """What a user may choose.
+    """User options.
 
-    parameters : names or wildcards of what is free; the rig's usual ones by default.
+    parameters : names or wildcards of the free parameters; by default the rig's usual ones.
     priors : (mean, standard deviation) by parameter.
-    hold_out : records that no fit sees; chosen where None. band_Hz : of the fit; the excited one where None.
+    hold_out : records that are not used in any fit; chosen automatically if None. band_Hz : of the fit; the excited
+        band if None.
     amplifier_corner_Hz : first-order lag of the amplifiers, which no rig file states; see `amplifier_corner`.
-    starts : of the maximum likelihood fit. kalman : run the extended Kalman filter beside it.
-    despite_gates : go on where a gate says stop.
+    starts : number of starting points of the maximum likelihood fit. kalman : also run the extended Kalman filter.
+    despite_gates : continue if a gate reports a stop.
     """
 
     parameters: tuple[str, ...] = ()
@@ -75,11 +76,11 @@ class IdentifyOptions:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Everything that `avis identify` found.
+    """Complete result of `avis identify`.
 
-    rig : with the identified values; start : as it came. split is None for frequency responses without records.
-    advice : which added records would determine what is missing, with predicted standard deviations.
-    kalman : the extended Kalman filter's answer, where it was asked for; kalman_note why there is none.
+    rig : with the identified values; start : the starting rig. split : None for frequency responses without records.
+    advice : further records that would determine what is missing, with predicted standard deviations.
+    kalman : result of the extended Kalman filter, if requested; kalman_note : why there is none.
     """
 
     start: Rig
@@ -99,7 +100,7 @@ class Identification:
 
     @property
     def model(self) -> ResponseModel:
-        """With the identified parameters free."""
+        """The model with the identified parameters free."""
         return self.campaign_fit.model
 
     @property
@@ -109,7 +110,7 @@ class Identification:
 
     @property
     def information(self) -> Information:
-        """Of the identified parameters, whatever the tolerances are."""
+        """Information on the identified parameters, marginal over the tolerances."""
         return self.campaign_fit.information
 
 
@@ -119,8 +120,8 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
 
     Raises
     ------
-    InputError : records that are not of this rig, a gate that says stop, options that do not fit.
-    ComputationError : a fit that does not come to an end.
+    InputError : records of another rig, a gate that reports a stop, options that do not fit.
+    ComputationError : a fit that does not converge.
     """
     options, began = options or IdentifyOptions(), time.monotonic()
     measured = in_words_of(rig, measured)
@@ -158,7 +159,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
 
 
 def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> None:
-    """What can be refused before anything slow begins."""
+    """Checks that are possible before any slow computation."""
     if options.band_Hz is not None and not 0 <= options.band_Hz[0] < options.band_Hz[1]:
         raise InputError("expected the lower limit first, then the upper one", field="band_Hz", value=options.band_Hz)
     if isinstance(measured, Campaign):
@@ -172,9 +173,10 @@ def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> 
 
 
 def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
-    """The amplifiers' corner [Hz] as stated; on tables with accelerometers what rehearsals and designs assume.
+    """The stated corner of the amplifiers [Hz]; if None, a default for tables with accelerometers.
 
-    Without a lag an accelerometer would see a force that jumps at the very moment of its sample.
+    The default is that of simulated campaigns and designs. Without a lag an accelerometer would measure a force that
+    jumps exactly at the sampling instant.
     """
     if stated_Hz is None and any(one.quantity == "acceleration" for one in rig.sensors()):
         return ACCELEROMETER_AMPLIFIER_HZ
@@ -182,15 +184,15 @@ def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
 
 
 def amplifier_words(corner_Hz: float, stated_Hz: float | None) -> str:
-    """The corner, and whether it was stated."""
+    """The corner in words, and whether it was stated."""
     return f"amplifiers with a first-order lag of {corner_Hz:g} Hz" + (
         "" if stated_Hz else ", the default for tables with accelerometers; --amplifier-corner sets another corner")
 
 
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
-    """The rig as its file describes it, with the channels of the measurement.
+    """The rig as in its file, with the channels of the measurement.
 
-    Raises InputError where the channels, units or parameters are not the rig's.
+    Raises InputError if channels, units or parameters are not those of the rig.
     """
     if isinstance(measured, Campaign):
         unit, sensors, actuators, sampled = measured.y_unit, measured.y_names, measured.u_names, True
@@ -210,7 +212,7 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
 
 def _gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,
            progress: Progress) -> tuple[Finding, ...]:
-    """What is found in the records before any fit; nothing for frequency responses."""
+    """Findings in the records before any fit; none for frequency responses."""
     if not isinstance(measured, Campaign):
         return ()
     kinds = ", ".join(sorted({record.header.excitation for record in measured.records}))
@@ -219,7 +221,7 @@ def _gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options
 
 
 def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
-    """Split, what is fitted, what is held out, and the band."""
+    """Split, data to fit, held-out data, and the band."""
     if isinstance(measured, FrequencyResponse):
         band = options.band_Hz or (float(measured.frequency_Hz[0]), float(measured.frequency_Hz[-1]))
         return None, *_divided_lines(measured.between(*band)), band
@@ -229,7 +231,7 @@ def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
 
 
 def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, FrequencyResponse]:
-    """Fitted and held-out lines: every fourth stretch is held out, with nothing beside it that shares its data."""
+    """Fitted and held-out lines: every fourth stretch is held out, and adjacent lines with shared data are omitted."""
     gap = int(np.ceil(measured.shared)) if measured.shared > 1 else 0
     stretch = max(3, 3 * gap)
     place = np.arange(len(measured.frequency_Hz))
@@ -243,7 +245,7 @@ def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, Freq
 
 def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,
             progress: Progress) -> tuple[str, ...]:
-    """What another record like the fitted ones would bring, or one of another kind."""
+    """Benefit of a further record like the fitted ones, or of another kind."""
     model = found.structure
     if found.information.rank == len(model.names) or not isinstance(fitted, Campaign):
         return ()
@@ -266,7 +268,7 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
         return None, "the extended Kalman filter was not requested"
     if not isinstance(fitted, Campaign):
         return None, "the extended Kalman filter needs records; these are frequency responses"
-    # It takes a measured floor for noise; a shaken one would be a disturbance far above what it allows for.
+    # The filter treats a measured floor as noise; a shaken floor would be a disturbance far above its assumptions.
     driven = tuple(record.header.name for record in fitted.records if driven_inputs(record))
     if not driven:
         return None, "the extended Kalman filter needs records that drive the actuators"

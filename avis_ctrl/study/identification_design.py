@@ -1,4 +1,4 @@
-"""From an identification to what `avis design` starts from: uncertainty.json and a design.toml beside rig.toml."""
+"""Design files of an identification: uncertainty.json and design.toml, for use with rig.toml by `avis design`."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_
 if TYPE_CHECKING:
     from avis_ctrl.study.identification import Identification
 
-# Below this nothing is claimed of drives: what drifts between a campaign and its use is not in the measurement.
+# Minimum uncertainty of the drives: changes between a campaign and the use of its model are not in the measurement.
 LEAST_PERCENT = 1.0
-# Designs of z and phi_x by the kind of rig, as designs/*.toml has them; the rig and the uncertainty are filled in.
+# Designs for z and phi_x by kind of rig, as in designs/*.toml; rig and uncertainty are filled in.
 _COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
 _AVIS: dict[str, Any] = _COMMON | {
     "loop": {"amplifier_corner_Hz": 300.0},
@@ -59,25 +59,26 @@ _HALCYONICS: dict[str, Any] = _COMMON | {
 
 
 def design_files(found: Identification, template: Path | Design | None = None) -> dict[str, str]:
-    """Contents of uncertainty.json and design.toml by name; with rig.toml in one folder, `avis design` runs on them.
+    """Contents of uncertainty.json and design.toml by name; with rig.toml in the same folder, `avis design` reads them.
 
     Parameters
     ----------
-    template : design whose rig and uncertainty are replaced; by default z and phi_x as designs/*.toml have them, and
-        design.toml says in its first lines for which table those were chosen.
+    template : design whose rig and uncertainty are replaced; by default z and phi_x as in designs/*.toml. In this case
+        the first lines of design.toml state for which table the weights were chosen.
 
     Raises
     ------
-    InputError : a template that is wrong; coordinates that the measured channels cannot push or tell apart.
-    ComputationError : records that do not tell the actuators apart, so that no spread can be measured.
+    InputError : an invalid template; coordinates that the measured channels cannot drive or distinguish.
+    ComputationError : records in which the actuators cannot be separated, so that no spread can be measured.
     """
     return design_start(found, template)[0]
 
 
 def design_start(found: Identification, template: Path | Design | None = None) -> tuple[dict[str, str], InDesign]:
-    """As `design_files`, and beside it what a design makes of the measured uncertainty, for the report.
+    """`design_files`, and the uncertainty of the design that follows from the measurement, for the report.
 
-    The filter covers what was measured; a design adds what it declares of its drives where nothing was.
+    The filter covers what was measured; a design adds its declared uncertainty of the drives where nothing was
+    measured.
     """
     design = _template(found, template)
     spread = measured_spread(found, tuple(design.keep))
@@ -90,9 +91,10 @@ def design_start(found: Identification, template: Path | Design | None = None) -
 
 
 def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
-    """What the measurement leaves between its response and the identified model's, in some coordinates.
+    """Difference between the measured response and that of the identified model, in some coordinates.
 
-    Over the band that the actuators drive: a floor that is shaken below it says nothing of their response.
+    It is restricted to the band that the actuators excite: floor motion below it gives no information on their
+    response.
     """
     measured, band, model = found.measured, found.campaign_fit.band_Hz, _as_written(found.model)
     if isinstance(measured, FrequencyResponse):
@@ -104,16 +106,16 @@ def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
 
 
 def _as_written(model: ResponseModel) -> ResponseModel:
-    """As a rig file has it, in which the filter of a geophone matches its suspension: the spread covers the rest."""
+    """The model as a rig file has it: the filter of a geophone matches its suspension; the spread covers the rest."""
     return replace(model, sensors=replace(model.sensors, suspensions=model.sensors.assumed))
 
 
 def identification_design(content: UncertaintyFile, template: Design, rig: Rig) -> str:
     """The text of a design file for an identified rig, from a design with uncertainty set by hand.
 
-    Ranges of parameters that were identified give way to the identification. Of the actuators' chains the frequency
-    of 100 % and the value above it stay, for there nothing was measured; their value at low frequency
-    becomes the median of the measured spread, rounded up, or 1 % where that is less.
+    The identification replaces the ranges of identified parameters. The actuator chains keep their frequency of 100 %
+    and the value above it, because nothing was measured there. Their value at low frequency becomes the median of the
+    measured spread, rounded up, but at least 1 % and at most the value of the template.
     """
     asked = template.uncertainty
     uncertainty: dict[str, Any] = {
@@ -124,7 +126,7 @@ def identification_design(content: UncertaintyFile, template: Design, rig: Rig) 
     if asked.sensor_chains is not None:
         uncertainty["sensor_chains"] = asked.sensor_chains.model_dump()
     uncertainty |= {"identified": UNCERTAINTY_FILE, "confidence_percent": asked.confidence_percent}
-    # The electronics are those of the rig that was measured.
+    # The identified rig already has the electronics of the measurement.
     table = template.model_dump(exclude_none=True) | {"rig": RIG_FILE, "uncertainty": uncertainty, "electronics": {}}
     if isinstance(rig, Halcyonics) and rig.load is not None:
         table["loaded"] = True
@@ -138,7 +140,7 @@ def design_toml(design: Design) -> str:
 
 
 def _sections(title: str, table: dict[str, Any]) -> list[list[str]]:
-    """Lines of a section and of those inside it; a section without keys of its own is left out."""
+    """Lines of a section and of its subsections; a section without keys is omitted."""
     inner = {key: value for key, value in table.items() if isinstance(value, dict)}
     many = {key: value for key, value in table.items() if value and isinstance(value, list)
             and isinstance(value[0], dict)}
@@ -156,7 +158,8 @@ def _key(key: str) -> str:
 
 
 def _value(value: Any) -> str:
-    # JSON writes numbers, booleans, strings and lists as TOML does, but for one character, which TOML wants escaped.
+    # JSON and TOML write numbers, booleans, strings and lists alike, except for one character that TOML requires
+    # escaped.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -183,13 +186,13 @@ def default_keep(rig: Rig) -> list[str]:
 
 
 def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float] | None = None) -> Design:
-    """A design for the coordinates of `default_keep`, as designs/*.toml have it for this kind of rig, beside rig.toml.
+    """A design for the coordinates of `default_keep`, as in designs/*.toml for this kind of rig; its rig is rig.toml.
 
-    parameters_percent : ranges of the rig's parameters; by default none, for an identification brings them.
+    parameters_percent : ranges of the rig's parameters; by default none, because an identification provides them.
     """
     shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
-    # A quarter of the sample rate: what is faster, the hold distorts.
+    # A quarter of the sample rate: the hold distorts faster poles.
     asked = [one | {"at_most": rig.sample_rate_Hz / 4} if one["quantity"] == "fastest_controller_pole_Hz" else one
              for one in shape["requirement"]]
     return design_from_table(shape | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig),
@@ -197,7 +200,7 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
 
 
 def assumed_weights(rig: Rig) -> str:
-    """Comment lines above a `default_design`: for which table its weights were chosen, and how this one compares."""
+    """Comment lines above a `default_design`: the table for which its weights were chosen, compared with this one."""
     shipped = load_rig("avis" if isinstance(rig, AvisTable) else "halcyonics_loaded")
     lines = ["No weights were specified for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
              "[control_effort] and [[requirement]] are those of the shipped design for the first of these two tables:"]
@@ -211,7 +214,7 @@ def assumed_weights(rig: Rig) -> str:
 
 
 def _not_identified(ranges: dict[str, float], content: UncertaintyFile, known: Collection[str]) -> dict[str, float]:
-    """Ranges of parameters that this rig has and that were not identified."""
+    """Ranges of the parameters that this rig has and that were not identified."""
     return {pattern: value for pattern, value in ranges.items()
             if not any(fnmatchcase(name, pattern) for name in content.names)
             and any(fnmatchcase(name, pattern) for name in known)}

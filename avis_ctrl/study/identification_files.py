@@ -1,4 +1,4 @@
-"""Names of the files that `avis identify` writes; apart, so that they are known before anything slow is loaded."""
+"""Names of the files of `avis identify`, in a module of their own that imports nothing slow."""
 
 RIG_FILE, RESULT_FILE = "rig.toml", "result.json"
 UNCERTAINTY_FILE, DESIGN_FILE = "uncertainty.json", "design.toml"

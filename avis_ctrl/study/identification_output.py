@@ -30,9 +30,9 @@ PIECE = 1 << 17
 
 
 def identified_rig(model: ResponseModel) -> Rig:
-    """The rig of a fit, sensitivities of its sensors and loop delay included.
+    """The rig of a fit, including sensor sensitivities and loop delay.
 
-    Raises InputError where the rig's file has no place for what was found.
+    Raises InputError if a rig file cannot describe the result.
     """
     rig = model.rig
     sensitive = [name for name in model.names if name.startswith("sensor.")]
@@ -46,8 +46,10 @@ def identified_rig(model: ResponseModel) -> Rig:
 
 
 def require_readable(found: Identification) -> None:
-    """Raises InputError where the identified values make no rig that a rig file may hold, such as an inertia that no
-    body has: what the fit took as known was wrong then."""
+    """Raise InputError if the identified values are not a valid rig, such as an inertia that no body has.
+
+    A value that the fit took as known is wrong in this case.
+    """
     try:
         rig_from(tomllib.loads(identified_toml(found)), getattr(found.rig, "load", None) is not None)
     except InputError as error:
@@ -56,7 +58,7 @@ def require_readable(found: Identification) -> None:
 
 
 def identified_toml(found: Identification) -> str:
-    """The rig file of an identification: each identified value with its standard deviation beside it."""
+    """The rig file of an identification, with the standard deviation beside each identified value."""
     information = found.information
     known, start = found.rig.parameters(), found.start.parameters()
     comments = {}
@@ -74,7 +76,7 @@ def identified_toml(found: Identification) -> str:
 
 
 def result_dict(found: Identification) -> dict[str, Any]:
-    """What programs read: numbers without a report."""
+    """Content of result.json: the numerical results."""
     fit, information = found.campaign_fit.fit, found.information
     start = found.start.parameters()
     rows = {}
@@ -105,7 +107,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
 
 def write_identification(found: Identification, folder: Path, html: bytes | None = None, pdf: bytes | None = None,
                          more: dict[str, str] | None = None) -> list[Path]:
-    """All files or none; result.json last, so that its presence says that the others are complete."""
+    """Write all files or none; result.json is last, so its presence shows that the others are complete."""
     texts = {RIG_FILE: identified_toml(found).encode(), **{name: text.encode() for name, text in (more or {}).items()},
              "report.html": html, "report.pdf": pdf, RESULT_FILE: as_json(result_dict(found))}
     return write_together(folder, {name: content for name, content in texts.items() if content is not None},
@@ -113,9 +115,9 @@ def write_identification(found: Identification, folder: Path, html: bytes | None
 
 
 def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
-    """Rig in an identification's folder, the corner of its amplifiers, and which axes turn with the payload.
+    """Rig of an identification's folder, corner of its amplifiers, and how motor and sensor axes turn with the payload.
 
-    Raises InputError where the folder holds no identification, or half of one.
+    Raises InputError if the folder contains no identification, or an incomplete one.
     """
     result, path = _result(folder), folder / RESULT_FILE
     turning = result.get("turning", AS_SIMULATED._asdict())
@@ -128,7 +130,7 @@ def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
 
 
 def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
-    """The model with its geophones' suspensions as an identification found them. Raises InputError as above."""
+    """The model with the geophone suspensions of an identification. Raises InputError as `read_identified`."""
     known = _result(folder).get("suspensions", {})
     try:
         own = tuple((float(known[name][0]), float(known[name][1])) if name in known else old
@@ -145,13 +147,14 @@ def _result(folder: Path) -> dict[str, Any]:
 
 def write_predictions(folder: Path, campaign: Campaign, out: Path,
                       progress: Callable[[str], None] = lambda text: None) -> None:
-    """/records/NN/y of a campaign, simulated from its u and floor alone, in the unit of its y, with the second-order
-    terms of the table's rotations.
+    """Write /records/NN/y, simulated from the u and floor of a campaign, in the unit of its y.
+
+    The simulation includes the second-order terms of the table's rotations.
 
     Raises
     ------
-    InputError : a folder or campaign that does not fit, a place that cannot be written.
-    ComputationError : the disk cannot hold the file.
+    InputError : a folder or campaign that does not fit, a path that cannot be written.
+    ComputationError : the disk cannot store the file.
     """
     rig, corner, turning = read_identified(folder)
     model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),
@@ -172,7 +175,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
             group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
             predictor = Predictor(model, large_motion=True)
             for start, stop in ranges(h.samples, PIECE):
-                # With the sample that follows: the floor's line to it belongs to this piece.
+                # Includes the next sample: the floor is interpolated linearly to it within this piece.
                 u, floor = model_inputs(model, record.load(start, min(stop + 1, h.samples)))
                 y = predictor.read(u[:stop - start], floor)
                 data[start:stop] = y if limits is None else np.clip(y, *limits)

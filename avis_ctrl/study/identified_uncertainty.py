@@ -1,4 +1,4 @@
-"""What a design makes of an identification: bounded directions of parameters, and a filter over the spread."""
+"""Uncertainty of a design from an identification: bounded parameter directions, and a filter that covers the spread."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread, covering_s
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
-# Names of the uncertainty's blocks.
+# Names of the uncertainty blocks.
 RESPONSE, DIRECTION = "identified response", "identified direction {}"
-# Where directions are judged: the range of transmissibility, whatever was measured.
+# Frequencies at which directions are compared: the range of transmissibility, independent of the measured band.
 JUDGED_HZ = np.geomspace(0.1, 100.0, 200)
 
 
 @dataclass(frozen=True, eq=False)
 class InDesign:
-    """What a design makes of an identification.
+    """Uncertainty of a design from an identification.
 
-    directions : bounded, for the rig's LFT. found : with their effects and what they leave.
-    spread : measured, with its confidence. weight : covers spread, what the directions leave, and what is declared.
-    The spread counts as `FrfSpread.usable` has it: 100 % are assumed at lines that noise drowns.
+    directions : bounded, for the rig's LFT. found : the directions with their effects and the residual.
+    spread : measured, with its confidence. weight : covers the spread, the residual of the directions, and the declared
+        uncertainty of the drives.
+    The spread is used as in `FrfSpread.usable`: 100 % is assumed at lines where noise hides the response.
     """
 
     directions: tuple[UncertainDirection, ...]
@@ -39,7 +40,7 @@ class InDesign:
 
     @property
     def assumption(self) -> str:
-        """What is assumed at lines that the measurement's noise drowns; empty where there are none."""
+        """What is assumed at lines where noise hides the response; empty if there are none."""
         drowned, f = self.spread.drowned(self.confidence), self.spread.frequency_Hz
         if not np.any(drowned):
             return ""
@@ -55,16 +56,16 @@ class InDesign:
 
 def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidence: float = 0.95,
               declared: NeglectedDynamics | None = None, factor: float = 1.0) -> InDesign:
-    """The bounded directions and the covering filter of an identification, for a design's coordinates.
+    """The bounded directions and the covering filter of an identification, for the coordinates of a design.
 
     Parameters
     ----------
-    declared, factor : the design's own relative uncertainty of its drives, and by how much it is multiplied to hold
-        for the coordinates together.
+    declared, factor : the design's own relative uncertainty of its drives, and a factor that makes it valid for all
+        coordinates together.
 
     Raises
     ------
-    InputError : another rig than the identified one, coordinates or a confidence that the file does not have.
+    InputError : a rig other than the identified one, coordinates or a confidence that the file does not contain.
     """
     content.check_rig(rig)
     spread = next((one for one in content.spread if sorted(one.keep) == sorted(keep)), None)
@@ -74,13 +75,13 @@ def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidenc
                          "that keeps the coordinates wanted here", field="keep", value=list(keep))
     values, own = spread.values(), [name in rig.parameters() for name in content.names]
     names = [name for name, here in zip(content.names, own, strict=True) if here]
-    # Sensors and delay are no parameters of the rig's equations: the measured spread covers their errors.
+    # Sensors and delay are not parameters of the rig's equations: the measured spread covers their errors.
     found = directions_that_matter(rig, names, content.factor()[own], keep, 2 * np.pi * JUDGED_HZ, confidence)
     directions = tuple(UncertainDirection(DIRECTION.format(k), tuple(
         (name, float(change)) for name, change in zip(names, row, strict=True) if change))
         for k, row in enumerate(found.changes, 1))
     omega = 2 * np.pi * values.frequency_Hz
     left = np.interp(np.log(omega), np.log(found.omega), found.rest)
-    # A spread of exactly zero has no logarithm; a part in a thousand million is none.
+    # A spread of exactly zero has no logarithm; 1e-9 is negligible.
     data = np.maximum(values.usable(confidence) + left, 1e-9)
     return InDesign(directions, found, values, confidence, covering_spread(omega, data, declared, factor))

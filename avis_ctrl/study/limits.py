@@ -1,4 +1,4 @@
-"""Which weight or uncertainty forbids more: mu at its peak with one of them left out at a time."""
+"""The limiting weights and uncertainties: mu at its peak with one of them removed at a time."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 WORTH_NAMING = 0.02
-# A mu within this share of the table's without control is that of a controller that does nothing.
+# A controller whose mu is within this fraction of the passive table's mu is regarded as doing nothing.
 IDLE = 0.01
-# From here up the uncertainty of an identified response is named as what to measure better.
+# Uncertainty of an identified response above which a better measurement is recommended.
 LARGE_SPREAD = 0.3
 
 
 def without_each(plant: DesignPlant, K: StateSpace, omega: float) -> list[tuple[str, float]]:
-    """(what is left out, upper bound of mu without it) at one frequency, the largest relief first.
+    """(what is removed, upper bound of mu without it) at one frequency, smallest mu first.
 
-    Uncertainty blocks one by one, weighted outputs by kind: transmissibility, control effort, compliance.
+    Uncertainty blocks are removed one by one, weighted outputs by kind: transmissibility, control effort, compliance.
     """
     P = plant.synthesis
     M = P.closed(K).frequency_response(np.array([omega]))[0]
@@ -50,9 +50,10 @@ def _mu(M: np.ndarray, blocks: BlockStructure) -> float:
 
 
 def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult]) -> str:
-    """What was reached by a design whose mu stays above 1, what stands in the way, and what to try.
+    """Sentences on a design with mu above 1: what was reached, what limits it, and what to try.
 
-    It is no proof that nothing better exists: the synthesis may have ended early, and says so here.
+    This does not prove that nothing better exists: the synthesis may have stopped early, which the sentences then
+    state.
     """
     if mu.K is None:
         return ""
@@ -78,13 +79,13 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
 
 
 def no_better_than_none(mu: ControllerResult, others: Sequence[ControllerResult]) -> bool:
-    """Whether the mu controller misses its target and lowers mu by less than 1 % of that of the table at rest."""
+    """Whether the mu controller misses its target and reduces mu by less than 1 % relative to the passive table."""
     at_rest = min((c.mu.upper for c in others if c.K is None), default=np.inf)
     return bool(mu.mu.upper >= 1 and np.isfinite(at_rest) and mu.mu.upper > (1 - IDLE) * at_rest)
 
 
 def _spread_there(plant: DesignPlant, omega: float) -> str:
-    """How large the uncertainty of an identified response is, and what would make it smaller; empty where small."""
+    """The size of the uncertainty of an identified response, and how to reduce it; empty if it is small."""
     if plant.identified is None:
         return ""
     weight = plant.identified.weight

@@ -1,7 +1,7 @@
-"""One loop an axis, tuned on mu: what decentralised control reaches on the same plant and weights.
+"""One loop per axis, tuned on mu: what decentralised control achieves on the same plant with the same weights.
 
-A skyhook has a form that was not chosen for these weights. The advantage of a controller that sees all axes is honest
-only against loops that each see their own axis alone and are otherwise as free.
+The structure of a skyhook was not chosen for these weights. The advantage of a multivariable controller is only
+meaningful in comparison with loops that each use the velocity of their own axis and are otherwise unrestricted.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ LOOPS_TITLE = "one loop per axis, tuned on mu"
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """states : of the loops per axis. A skyhook has two, its corners; one more lets the damping pole be complex."""
+    """states : mean number per axis. A skyhook has two, one per corner; a third one permits a complex pair of poles."""
 
     states: int = 3
 
 
 def tuned_loops(plant: DesignPlant, rig: Rig, design: Design, K: StateSpace, settings: LoopSettings = LoopSettings()
                 ) -> Candidate:
-    """Loops found by descent on the peak of mu from the diagonal part of the controller K, or from the classical
-    skyhook: the force on an axis depends on the seen velocity of that axis alone.
+    """Decentralised loops tuned on mu: the force on an axis depends on the measured velocity of that axis only.
 
-    The states go to the axes that need them, `settings.states` to each on average.
+    They are found by descent on the peak of mu, from the diagonal part of the controller K or from the classical
+    skyhook. The states are allotted to the axes that need them, `settings.states` per axis on average.
 
     Raises
     ------
-    ComputationError : no start stabilises the nominal plant, or a table without a bounded gain.
+    ComputationError : no starting point stabilises the nominal plant, or the gain of the table is unbounded.
     """
     P, skyhook = plant.synthesis, classical_loops(plant, rig, design).controller()
     task = Task(P.P, P.all_blocks.complexified(), decentralised=True, limit=gain_limit(plant, rig.sample_rate_Hz))
     order = settings.states * len(plant.axes)
     try:
         *_, found = fixed_order(task, K, order, [skyhook])
-    except ComputationError:  # the axes of K need one another
+    except ComputationError:  # the diagonal part of K does not suffice
         *_, found = fixed_order(task, skyhook, order)
     K = found.K.renamed(K.inputs, K.outputs)
     states = ", ".join(f"{axis} {np.count_nonzero(row)}" for axis, row in zip(plant.axes, K.C, strict=True))

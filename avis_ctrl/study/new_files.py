@@ -1,4 +1,4 @@
-"""First versions of a rig file and of a design file, from a few answers, with a comment for whatever was assumed."""
+"""First versions of a rig file and a design file from a few answers, with a comment on every assumption."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from avis_ctrl.study.identification_design import default_design, design_toml
 
 @dataclass(frozen=True)
 class NewRig:
-    """A box on equal mounts near its lower corners, with a vertical and a horizontal drive and geophone at each.
+    """A box on equal mounts near its lower corners, with a vertical and a horizontal drive and geophone at each mount.
 
     Attributes
     ----------
     name : of the rig. mass_kg : of the payload. size_m : length, width, height along x, y, z.
-    mounts : 3 (two near one side, one in the middle of the other) or 4, their centroid below the centre of mass.
+    mounts : 3 (two near one side, one at the middle of the opposite side) or 4, their centroid below the centre of
+        mass.
     vertical_Hz, horizontal_Hz : natural frequencies of the payload on its mounts, without rotation. The vertical mode
-        has none; horizontal modes rock, because the mounts stand below the centre of mass.
-    damping : ratio, of all mounts. constant_N_per_V, limit_V : of a drive.
+        has no rotation; horizontal modes include rocking, because the mounts are below the centre of mass.
+    damping : damping ratio of all mounts. constant_N_per_V, limit_V : of a drive.
     geophone : RESP file of the sensor; None for a 4.5 Hz geophone of 28.8 V s/m.
     sample_rate_Hz : of the controller.
     """
@@ -49,12 +50,12 @@ class NewRig:
 
 
 def rig_text(new: NewRig) -> str:
-    """The rig file.
+    """The text of the rig file.
 
     Raises
     ------
-    InputError : not 3 or 4 mounts, a size, mass or frequency that is not positive, a name that is empty, a RESP file
-        that cannot be read or contradicts itself.
+    InputError : not 3 or 4 mounts, a size, mass or frequency that is not positive, an invalid name, a RESP file that
+        cannot be read or contradicts itself.
     """
     if new.mounts not in (3, 4):
         raise InputError("expected 3 or 4; add further mounts to the file afterwards", field="mounts", value=new.mounts)
@@ -100,7 +101,7 @@ def rig_text(new: NewRig) -> str:
 
 
 def rig_of(text: str) -> Rig:
-    """The table of a rig file's text. Warns of unusual values; raises InputError for values that no table has."""
+    """The table of a rig file's text. Warns of unusual values; raises InputError for impossible values."""
     content = tomllib.loads(text)
     if unusual := plausible(content, rig_from):
         warnings.warn(UnusualRig(unusual), stacklevel=2)
@@ -112,8 +113,10 @@ def _row(values: object) -> str:
 
 
 def _places(new: NewRig) -> list[tuple[float, float, float]]:
-    """Mounts under the lower corners, a tenth of the length inside; of three, the pair is nearer to the middle, so that
-    a vertical motion does not tilt the payload."""
+    """Mounts under the lower corners, a tenth of the length inside.
+
+    If there are three mounts, the pair is nearer to the middle, so that a vertical motion does not tilt the payload.
+    """
     x, y, z = 0.4 * new.size_m[0], 0.4 * new.size_m[1], -0.5 * new.size_m[2]
     if new.mounts == 3:
         return [(-x, -y / 2, z), (x, -y / 2, z), (0.0, y, z)]
@@ -121,7 +124,7 @@ def _places(new: NewRig) -> list[tuple[float, float, float]]:
 
 
 def _horizontal(new: NewRig) -> list[tuple[str, tuple[int, int, int]]]:
-    """Of each mount the horizontal direction of its drive and sensor: both directions, and the rotation about z."""
+    """Horizontal direction of the drive and sensor at each mount; together they cover x, y and the rotation about z."""
     along_x, along_y = ("x", (1, 0, 0)), ("y", (0, 1, 0))
     return [along_y, along_y, along_x] if new.mounts == 3 else [along_y, along_x, along_y, along_x]
 
@@ -141,9 +144,12 @@ def _geophone(path: Path | None) -> str:
 
 @dataclass(frozen=True)
 class NewDesign:
-    """keep : coordinates under one controller; empty for those that a default design has. band_Hz : in which the
-    transmissibility stays below band_dB [dB]; peak_dB : anywhere else. The spreads are in per cent of the rig file's
-    values: mass, stiffness and damping of every mount."""
+    """Answers for a new design.
+
+    keep : coordinates under one controller; empty for those of the default design. band_Hz : band in which the
+        transmissibility stays below band_dB [dB]; peak_dB : limit at all other frequencies. The ranges of mass, and of
+        stiffness and damping of every mount, are in per cent of the rig file's values.
+    """
 
     title: str
     keep: tuple[str, ...] = ()
@@ -156,11 +162,11 @@ class NewDesign:
 
 
 def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
-    """The design, checked.
+    """The design, validated.
 
     Raises
     ------
-    InputError : a coordinate that the drives or sensors do not reach, a band or spread that a design file refuses.
+    InputError : a coordinate that the drives cannot move or the sensors cannot measure; an invalid band or range.
     """
     known = rig.parameters()
     spreads = {"mass": new.mass_percent, "isolator*.k_*": new.stiffness_percent, "isolator*.c_*": new.damping_percent}
@@ -178,7 +184,7 @@ def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
     return design_from_table(shape)
 
 
-# What stands above a section of a new design file.
+# Comments above the sections of a new design file.
 _REMARKS = {
     "[loop]": "Assumed: corner of the current amplifiers.",
     "[uncertainty.parameters_percent]": "Half-width of each parameter's range; the bounds hold for all such plants.\n"
@@ -194,7 +200,7 @@ _REMARKS = {
 
 
 def design_text(design: Design) -> str:
-    """The design file, with a remark above each section."""
+    """The text of the design file, with a comment above each section."""
     lines, told = ["# A first design file: change what is marked \"Assumed\" to suit your table. docs/design_file.md "
                    "explains every key."], set()
     for line in design_toml(design).splitlines():

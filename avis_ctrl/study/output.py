@@ -23,7 +23,7 @@ FOLDERS = ("controllers",)
 
 
 def controller_dict(result: ControllerResult) -> dict[str, Any]:
-    """The contract's avis-controller form."""
+    """A controller in the avis-controller format of the contract."""
     K = result.K
     if K is None:
         raise InputError("a passive rig has no controller", field="controller", value=result.name)
@@ -31,14 +31,14 @@ def controller_dict(result: ControllerResult) -> dict[str, Any]:
 
 
 def controller_form(name: str, K: StateSpace) -> dict[str, Any]:
-    """The contract's avis-controller form of a controller of the logical axes."""
+    """A controller of the logical axes in the avis-controller format of the contract."""
     return {"format": "avis-controller", "version": 1, "name": name, "A": K.A, "B": K.B, "C": K.C, "D": K.D,
             "dt": K.dt, "inputs": K.inputs, "outputs": K.outputs, "input_units": ["m/s"] * K.ninputs,
             "output_units": ["N"] * K.noutputs}
 
 
 def result_dict(result: DesignResult) -> dict[str, Any]:
-    """The contract's avis-design form, with provenance."""
+    """The result in the avis-design format of the contract, with provenance."""
     return {
         "format": "avis-design", "version": 1, "plant": "plant.json",
         "verdict": first_sentence(result), "stable": result.stable,
@@ -59,7 +59,7 @@ def result_dict(result: DesignResult) -> dict[str, Any]:
 
 
 def _worst_case(result: DesignResult, bound: Bound) -> dict[str, Any] | None:
-    """A perturbation block by block, so that it can be rebuilt: numbers as [real, imaginary]."""
+    """A perturbation block by block, for its reconstruction: numbers as [real, imaginary]."""
     if bound.delta is None:
         return None
     blocks = result.plant.synthesis.blocks
@@ -79,7 +79,7 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
-    """A controller that could not be analysed: the reason is in its note."""
+    """Row of a controller that could not be analysed; the note has the reason."""
     figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "peak_transmissibility_dB",
                "worst_case_peak_transmissibility_dB", "at_rest")
     return {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False, **dict.fromkeys(figures),
@@ -87,7 +87,7 @@ def _failed_row(c: FailedController) -> dict[str, Any]:
 
 
 def _all_axes(loop: Simulated | None) -> dict[str, Any]:
-    """Loops of the axes that the design does not control, and why the whole loop is unstable, if it is."""
+    """Loops of the axes that the design does not control, and the cause if the complete loop is unstable."""
     if loop is None:
         return {}
     culprit = None if loop.culprit is None else {**asdict(loop.culprit), "words": loop.culprit.words()}
@@ -99,7 +99,7 @@ def _all_axes(loop: Simulated | None) -> dict[str, Any]:
 
 
 def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, Any]:
-    """What a processor runs, all axes included: x+ = A x + B y, u = C x + D y from sensor volts to drive volts."""
+    """The controller of a processor, all axes: x+ = A x + B y, u = C x + D y from sensor volts to drive volts."""
     K, rig = loop.digital, result.rig
     sensors, drives = rig.sensor_rows()[0], rig.equations_of_motion().actuators
     return {"format": "avis-sampled-controller", "version": 1, "name": "mu", "sample_rate_Hz": rig.sample_rate_Hz,
@@ -109,13 +109,13 @@ def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, 
 
 
 def write_study(result: DesignResult, folder: Path, html: bytes | None = None, pdf: bytes | None = None) -> list[Path]:
-    """All files of a study or none; result.json last, so that its presence says that the others are complete."""
+    """Write all files of a study or none; result.json is last, so its presence shows that the others are complete."""
     contents = {f"controllers/{c.name}.json": as_json(controller_dict(c)) for c in result.controllers
                 if c.K is not None}
     if result.loop is not None:
         contents["sampled_controller.json"] = as_json(sampled_controller_dict(result, result.loop))
     contents["plant.json"] = as_json(result.plant.synthesis.as_dict())
-    with contextlib.suppress(InputError):  # a rig of the user's own class has no file form, and no export
+    with contextlib.suppress(InputError):  # a rig of a user-defined class has no file format and cannot be exported
         contents[STUDY] = as_json(study_dict(result.design, result.rig))
     contents |= {name: content for name, content in (("report.html", html), ("report.pdf", pdf)) if content is not None}
     contents["result.json"] = as_json(result_dict(result))

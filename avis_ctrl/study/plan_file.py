@@ -1,7 +1,6 @@
-"""Plans of simulated measurement campaigns: TOML files, and a sensible plan for a rig that has none.
+"""Plans of simulated measurement campaigns: TOML files, and a default plan for a rig.
 
-Every key carries its unit in its name; whatever is wrong is one line that names file, field, value and what was
-expected.
+Every key has its unit in its name. Errors are one line that names file, field, value and what was expected.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
 __all__ = ["CampaignPlan", "default_plan", "plan_from_table", "plan_toml", "read_plan"]
 
-# Where the rig's file does not say how much its floor moves: what the AVIS file says, and a floor shaken by
-# hundred times as much, which the drives' noise does not hide [m/s].
+# Floor motion if the rig file does not state it: the value of the AVIS file; and motion of a shaken floor, a hundred
+# times as much, which exceeds the effect of the drives' noise [m/s].
 AMBIENT_M_PER_S, SHAKEN_M_PER_S = 2e-6, 2e-4
 
 
@@ -33,7 +32,7 @@ def read_plan(path: str | Path) -> CampaignPlan:
 
 
 def plan_from_table(table: dict, file: object = None) -> CampaignPlan:
-    """Check a plan given as a table."""
+    """Check a plan given as nested dictionaries."""
     return validated(CampaignPlan, table, file)
 
 
@@ -41,9 +40,9 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
                  duration_s: float = 60.0) -> CampaignPlan:
     """Multisines at three levels, noise, rest and a shaken floor.
 
-    scheme : "zippered" makes 4 multisine records, in which each drive has its own lines, dealt on from one record to
-        the next; "orthogonal" makes as many records as there are drives at each of the three levels, from which all
-        entries of the frequency response come at every line.
+    scheme : "zippered" gives 4 multisine records, in which each drive has its own lines; the lines are permuted from
+        record to record. "orthogonal" gives as many records as drives at each of the three levels; they determine all
+        entries of the frequency response at every line.
     perturbed : stiffness, mass and inertia within 5 %, damping within 20 %.
     """
     ambient = {} if rig.ambient is not None else {"velocity_rms_m_per_s": AMBIENT_M_PER_S}
@@ -58,7 +57,7 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
 
 
 def plan_toml(plan: CampaignPlan) -> str:
-    """The plan as a file that `read_plan` reads back; keys that are absent by default stay so."""
+    """The plan as a file that `read_plan` reads back; keys that are absent by default remain absent."""
     content = plan.model_dump(exclude_none=True)
     records, effects = content.pop("record"), content.pop("effect")
     sections = [("", {key: value for key, value in content.items() if not isinstance(value, dict)})]
@@ -72,5 +71,6 @@ def plan_toml(plan: CampaignPlan) -> str:
 def _toml(value: Any) -> str:
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{_toml(key)} = {_toml(one)}" for key, one in value.items()) + " }"
-    # JSON writes numbers, booleans, strings and lists as TOML does, but for one character, which TOML wants escaped.
+    # JSON and TOML write numbers, booleans, strings and lists alike, except for one character that TOML requires
+    # escaped.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,10 +1,11 @@
-"""From a design and a rig to the generalized plant, and to the physical channels it is judged by.
+"""Generalized plant of a design and a rig, with the physical channels that evaluate it.
 
     floor velocity, forces ->  rig (uncertain parameters)  -> payload velocity -> sensor chains -> seen velocity (y)
     force commands (u) -> delay -> amplifier -> allocation -> volts -> neglected dynamics of each chain -> rig
 
-The same diagram carries the weighted channels that synthesis works on and the physical ones (transmissibility,
-compliance, volts, noise) that analysis reports, so that both speak of one plant.
+The seen velocity is the measured one; a chain is one sensor or drive channel. One diagram contains the weighted
+channels for synthesis and the physical channels (transmissibility, compliance, volts, noise) for analysis, so both use
+the same plant.
 """
 
 from __future__ import annotations
@@ -40,33 +41,33 @@ from avis_ctrl.uncertainty.weights import (
     TransmissibilityBound,
 )
 
-# Of the weight on the drives in `DesignPlant.weights`; followed by the axis where the drives' limits differ.
+# Name of the weight on the drives in `DesignPlant.weights`; followed by the axis if the drives' limits differ.
 EFFORT = "control effort"
 NOISE = "1/f noise"
 
 
 @dataclass(frozen=True, eq=False)
 class DesignPlant:
-    """Everything that synthesis and analysis need of the plant.
+    """The plant for synthesis and analysis.
 
     Attributes
     ----------
     full : generalized plant with weighted and physical channels.
     synthesis : the same, weighted channels only.
     rig : the uncertain rig inside.
-    axes : kept coordinates, rotations named as edge displacements ("phi_x_edge").
+    axes : kept coordinates (those that the design controls), rotations named as edge displacements ("phi_x_edge").
     actuators : channels that the kept axes use.
     allocation : (n_actuators, n_axes) volts per newton on each axis (edge force for rotations).
-    decoding : (n_axes, n_sensors) axis velocity (edge velocity) from the sensors' velocities.
+    decoding : (n_axes, n_sensors) axis velocity (edge velocity) per velocity along each sensor.
     sensor_chain : velocity -> seen velocity of one axis, unit passband gain.
-    sensor_noise : unit white noise density -> noise of one sensor as velocity [m/s/sqrt(Hz)]; where the sensors are of
-        several kinds, of the first.
+    sensor_noise : white noise of unit density -> noise of one sensor as velocity [m/s/sqrt(Hz)]; for the first kind of
+        sensor if there are several.
     noises : inputs of the sensors' noise, with the weight of the 1/f noise of each. relative : axes whose velocity is
         measured relative to the chassis.
     floor_density : mean velocity density of the floor [m/s/sqrt(Hz)]: the unit of the noise inputs.
-    floor : spectrum of the floor's motion, each kept axis alike.
+    floor : spectrum of the floor motion, the same for each kept axis.
     weights : the weighting filters by name, with their meaning, for the report.
-    identified : what comes from an identification, where the design names one.
+    identified : uncertainty from an identification, if the design names one.
     """
 
     full: GeneralizedPlant
@@ -95,7 +96,7 @@ class DesignPlant:
         return [f"{axis}_dot" for axis in self.axes]
 
     def effort_weight(self, axis: str) -> Weight:
-        """The weight on the control effort of an axis; one for all where their drives have the same limit."""
+        """The weight on the control effort of an axis; a common one if the drives have the same limit."""
         return self.weights.get(EFFORT) or self.weights[f"{EFFORT} {axis}"]
 
     @property
@@ -105,10 +106,10 @@ class DesignPlant:
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """How a controller that exists is connected.
+    """Connection of an existing controller.
 
-    allocation : (n_u, n_axes) volts per newton of the actuators named. decoding : (n_axes, n_y) axis velocity by the
-    velocity along the sensors named; sensors that are not named are not read.
+    allocation : (n_u, n_axes) volts per newton of the named actuators. decoding : (n_axes, n_y) axis velocity per
+        velocity along the named sensors; other sensors are not used.
     """
 
     actuators: tuple[str, ...]
@@ -121,13 +122,13 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
                 gravity: bool = True) -> DesignPlant:
     """The generalized plant of a design.
 
-    wiring : of a controller that knows another rig; by default that for this one. fit : uncertain beside what the
-        design says. gravity : whether tilt of the kept axes is felt by the sensors of horizontal motion.
+    wiring : of a controller made for another rig; by default that for this rig. fit : uncertain elements in addition to
+        those of the design. gravity : whether the sensors of horizontal motion measure the tilt of the kept axes.
 
     Raises
     ------
-    InputError : parameters or axes that the rig does not have, axes that its actuators cannot push or its
-        sensors cannot tell apart; an identification of another rig or other coordinates.
+    InputError : parameters or axes that the rig does not have, axes that its actuators cannot drive or its sensors
+        cannot separate; an identification of another rig or other coordinates.
     """
     identified = _identified(design, rig)
     directions = identified.directions if identified else ()
@@ -148,7 +149,7 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     if wiring is not None:
         decoding = np.zeros_like(decoding)
         decoding[:, [decoder.sensors.index(name) for name in wiring.sensors]] = wiring.decoding
-    # Motion that each sensor measures per unit of the kept axes, rotations at the edge, and apparent acceleration.
+    # Motion and apparent acceleration along each sensor per unit of the kept axes, rotations at the edge.
     kept = [COORDINATES.index(name) for name in design.keep]
     rows, tilt = decoder.matrix[:, kept] / lever, rig.tilt_rows()[:, kept] / lever * gravity
 
@@ -183,7 +184,7 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
 
 
 def _identified(design: Design, rig: Rig) -> InDesign | None:
-    """The identification's directions and filter; what the design declares of its drives goes into the filter."""
+    """The identification's directions and filter; the filter includes what the design declares of its drives."""
     content = design.uncertainty.identification
     if content is None:
         return None
@@ -195,10 +196,10 @@ def _identified(design: Design, rig: Rig) -> InDesign | None:
 
 
 def channels_gain(rig: Rig, keep: Sequence[str]) -> float:
-    """Largest error of the axes' forces together for an error of 1 in the channels, each by itself: |T| |A|.
+    """Largest joint error of the axes' forces for independent errors of at most 1 in the channels: |T| |A|.
 
-    With T A = I, any errors E = diag(e_k), |e_k| <= 1, give |T E A| <= |T| |A|; 1 where every channel serves the axes
-    alike.
+    With T A = I, any errors E = diag(e_k), |e_k| <= 1, give |T E A| <= |T| |A|; this is 1 if every channel serves the
+    axes alike.
     """
     lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
     found = actuator_axes(rig, keep)
@@ -208,7 +209,7 @@ def channels_gain(rig: Rig, keep: Sequence[str]) -> float:
 
 
 def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
-    """The design's floor motion: the measured shape at the site's r.m.s. velocity."""
+    """The design's floor motion: the measured spectrum, scaled to the site's r.m.s. velocity."""
     rms = design.floor.velocity_rms_m_per_s
     if rms is None:
         if rig.ambient is None:
@@ -241,7 +242,7 @@ def _rig_part(diagram: Diagram, uncertain: UncertainRig, actuators: tuple[str, .
 
 def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], actuators: tuple[str, ...],
                    allocation: np.ndarray, weights: dict[str, Weight], identified: InDesign | None) -> None:
-    """Delay with the hold of the converter, amplifier, allocation, neglected dynamics."""
+    """Delay including the converter's hold, amplifier, allocation, neglected dynamics."""
     corner = 2 * np.pi * design.loop.amplifier_corner_Hz
     # A zero-order hold delays by half a sample on average.
     delay_s = rig.loop_delay_s + 0.5 / rig.sample_rate_Hz
@@ -250,7 +251,7 @@ def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, 
         diagram.add(f"delay and amplifier {axis}", lag.renamed([f"command_{axis}"], [f"drive_{axis}"]), "actuator")
         diagram.means(f"command_{axis}", "force commanded by the controller", "N")
         diagram.means(f"drive_{axis}", "commanded force after delay and amplifier", "N")
-    # What the amplifiers hold: the volts that are limited, after delay and lag (both of unit gain).
+    # Voltages at the amplifiers, to which the limits apply, after delay and lag (both of unit gain).
     diagram.add("allocation", gain(allocation, [f"drive_{a}" for a in axes], [f"{n}_command" for n in actuators]),
                 "allocation")
     for name in actuators:
@@ -264,9 +265,9 @@ def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, 
 
 def _response_error(diagram: Diagram, identified: InDesign, axes: tuple[str, ...], actuators: tuple[str, ...],
                     allocation: np.ndarray, weights: dict[str, Weight]) -> None:
-    """(I + W Delta) on the axes' forces, Delta full: what the identified model leaves of the measured response.
+    """(I + W Delta) on the axes' forces, Delta full: difference of the measured from the identified response.
 
-    Per channel it would not do: an error of one axis by the force of another need not be an error of channels.
+    Errors per channel do not suffice: an error on one axis by the force of another need not be a channel error.
     """
     weights[RESPONSE] = identified.weight
     tags = [f"{RESPONSE}[{k}]" if len(axes) > 1 else RESPONSE for k in range(len(axes))]
@@ -288,7 +289,7 @@ def _neglected(chains: ChainUncertainty) -> NeglectedDynamics:
 
 def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple[str, ...], before: str, after: str,
             title: str, weights: dict[str, Weight]) -> None:
-    """(1 + W delta) in each channel: neglected dynamics as an input multiplicative uncertainty."""
+    """(1 + W delta) in each channel: neglected dynamics as multiplicative input uncertainty."""
     for name in names:
         read, made, label = before.format(name), after.format(name), title.format(name)
         if uncertainty is None:
@@ -302,11 +303,12 @@ def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple
 
 
 def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes: int, reference: float) -> float:
-    """By what the control effort's weight is larger at rest, so that mu below 1 bounds what the offset costs.
+    """Factor of the control effort's weight at zero frequency with which mu below 1 bounds the voltage for the offset.
 
-    A unit of noise accompanies 1 m/s of floor velocity (`_sensor_side`) and may use the drive as a floor velocity of
-    floor_velocity_m_per_s does; the offset may use offset_percent of it. Offsets of n sensors, each of either sign, lie
-    within sqrt(n) times the ellipsoid of independent ones, and the voltages of m axes add to sqrt(m) times their norm.
+    One unit of noise accompanies 1 m/s of floor velocity (`_sensor_side`) and may use as much of the drive as a floor
+    velocity of floor_velocity_m_per_s; the offset may use offset_percent of this. Offsets of n sensors, each of either
+    sign, lie within sqrt(n) times the ellipsoid of independent offsets. The voltages of m axes add up to at most
+    sqrt(m) times their norm.
     """
     spread = np.sqrt(np.count_nonzero(group.share) * axes)
     allowed = effort.offset_percent / 100 * effort.floor_velocity_m_per_s
@@ -316,17 +318,17 @@ def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes:
 def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decoding: np.ndarray,
                  rows: tuple[np.ndarray, np.ndarray], flicker: Sequence[FlickerNoise], reference: float,
                  uncertain: bool) -> list[_Noise]:
-    """Sensor chains of the logical axes (alike, so that decoding and chain commute) and their noise.
+    """Sensor chains of the logical axes and their noise. The chains are equal, so decoding and chain commute.
 
-    rows : (n_s, n_axes) each, from the axes' motion to that along each sensor, and to its apparent
-        acceleration by gravity.
+    rows : (n_s, n_axes) each, from the axes' motion to the motion along each sensor, and to its apparent acceleration
+        by gravity.
 
-    One unit of noise is what accompanies 1 m/s of floor velocity: sensor density over floor density.
+    One unit of noise accompanies 1 m/s of floor velocity: sensor density over floor density.
     """
     groups = [_Noise.of(axes, group, weight, decoding, reference, k)
               for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))]
     inertial = seen.decoder.inertial
-    # The decoding applied to motion in space and to motion relative to the chassis.
+    # Decoded motion in space, and decoded motion relative to the chassis.
     by_velocity, by_relative = (decoding[:, one] @ rows[0][one] for one in (inertial, ~inertial))
     by_tilt = decoding @ rows[1]
     for k, axis in enumerate(axes):
@@ -356,7 +358,7 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
 
 def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.ndarray, np.ndarray], of: str,
               chain: StateSpace, label: str, made: str) -> None:
-    """The common chain of an axis' channels, applied to the motion that they decode, and to gravity: (n_axes,) each."""
+    """The common sensor chain of an axis, applied to its decoded motion and to gravity; rows (n_axes,) each."""
     read, (row, tilt) = f"{axes[k]}_{of}", rows
     if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
         felt = [a for a in range(len(axes)) if abs(row[a]) > 1e-9]
@@ -365,7 +367,7 @@ def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.nd
         diagram.means(read, "motion decoded for this axis, before the sensor chain", "m/s" if of == "dot" else "m")
     system = chain.renamed([read], [made])
     if felt := [a for a in range(len(axes)) if abs(tilt[a]) > 1e-9 * GRAVITY]:
-        # The chain measures velocity: the rate of the apparent acceleration, integrated twice.
+        # The input of the chain is velocity: the rate of the apparent acceleration is integrated twice.
         diagram.add(f"gravity in {label}", gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"]),
                     "sum")
         diagram.means(f"{made}_tilt", "rate of what gravity adds to the measured acceleration", "m/s^3")
@@ -376,7 +378,7 @@ def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.nd
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """Noise of one kind of sensors in the axes decoded from them, correlated as the decoding mixes it."""
+    """Noise of one kind of sensor on the axes decoded from it; the decoding correlates the axes."""
 
     shape: StateSpace
     weight: FlickerNoise
@@ -389,7 +391,7 @@ class _Noise:
            number: int) -> _Noise:
         own = decoding * group.share
         served = [k for k in range(len(axes)) if np.any(np.abs(own[k]) > 1e-9)]
-        # own = L Q: a square root of own own' also where fewer sensors of this kind than axes make it singular.
+        # own = L Q: L is a square root of own own', even if this is singular (fewer sensors of this kind than axes).
         root = np.asarray(np.linalg.qr(own[served].T, mode="r"))
         mix = (root * np.where(np.diag(root) < 0, -1.0, 1.0)[:, None]).T / reference
         shape = group.shape @ weight.system(*group.shape.inputs, *group.shape.inputs)
@@ -410,7 +412,7 @@ class _Noise:
 
 def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[str, ...], sensors: tuple[str, ...],
                    rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
-    """What the neglected dynamics of each sensor chain add to the decoded velocities: decoding (W Delta) rows."""
+    """Errors of the decoded velocities by the neglected dynamics of each sensor chain: decoding (W Delta) rows."""
     used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
     weight = _neglected(uncertainty)
     weights["sensor chain *"] = weight
@@ -435,7 +437,7 @@ def _performance(diagram: Diagram, design: Design, axes: tuple[str, ...], alloca
     load = np.abs(allocation) * (limits_V.max() / limits_V)[:, None]
     for k, axis in enumerate(axes):
         diagram.add(f"W_T {axis}", weights["transmissibility"].system(f"{axis}_dot", f"e_{axis}"), "weight")
-        # Volts on the channel that this axis brings to its limit first.
+        # Voltage of the channel that reaches its limit first for a force on this axis.
         first = int(np.argmax(load[:, k]))
         weight = ControlEffort(float(limits_V[first]), effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
                                effort.reduction, 1, offset, effort.offset_corner_Hz)

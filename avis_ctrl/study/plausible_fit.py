@@ -1,4 +1,4 @@
-"""Whether the identified masses and moments of inertia are near those of the rig file, which are known roughly."""
+"""Comparison of identified masses and moments of inertia with the rig file, whose values are roughly correct."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from avis_ctrl.identification.response import INERTIAL, ResponseModel
 
 @dataclass(frozen=True)
 class FitPlausibility:
-    """When an identified mass or moment of inertia is called far from the rig file's.
+    """Criteria for identified masses and moments of inertia that are far from the rig file's.
 
-    far : ratio of the two, or its inverse, from which they are far apart; drawings and scales are right to a few per
-        cent.
-    alike : the identified values have a factor to the file's in common if the largest of these factors is less than
-        this many times the smallest.
-    known : relative standard deviation above which a parameter is not judged.
+    far : ratio of the two values, or its inverse, from which they are far apart; drawings and scales are accurate to a
+        few per cent.
+    alike : the identified values differ from the file's by a common factor if the largest ratio is less than this many
+        times the smallest.
+    known : relative standard deviation above which a parameter is not considered.
     """
 
     far: float = 1.5
@@ -28,7 +28,7 @@ class FitPlausibility:
 
 def far_from_file(start: ResponseModel, information: Information, settings: FitPlausibility = FitPlausibility()
                   ) -> tuple[str, ...]:
-    """A sentence with the likely cause if a mass or moment of inertia is far from the rig file's, else nothing."""
+    """A sentence with the likely cause if a mass or moment of inertia is far from the rig file's; otherwise empty."""
     before = dict(zip(start.names, start.values, strict=True))
     found = [(name, float(value / before[name]), float(value), unit)
              for name, value, unit, sigma in zip(

@@ -1,9 +1,9 @@
-"""Whether records can come from a rig at all, checked before any fit: levels and resonances against the rig's model.
+"""Plausibility of records before any fit: levels and resonances in comparison with the rig's model.
 
 The model's response to the recorded voltages is compared with the recorded outputs, per sensor and third octave, as the
-logarithm of the r.m.s. ratio (in decades). If they differ by more than any table differs from its file, single unit
-errors are undone in turn: in a gain (of all channels, one sensor, one drive), in the unit of y, and in each kind of
-parameter of the rig. The one that makes the records agree is named.
+logarithm of the r.m.s. ratio (in decades). If the difference is larger than between any table and its rig file, single
+unit errors are corrected in turn: in a gain (of all channels, one sensor, one drive), in the unit of y, and in each
+kind of parameter of the rig. The error whose correction makes records and model agree is named.
 """
 
 from __future__ import annotations
@@ -26,19 +26,21 @@ from avis_ctrl.rigs.plausible_ranges import RANGES
 
 @dataclass(frozen=True)
 class RecordPlausibility:
-    """When records count as given in a wrong unit; distances are mean decades of r.m.s., see `distance`.
+    """Criteria for records in a wrong unit; distances are mean decades of r.m.s., see `distance`.
 
-    far : below this distance records pass (tables with any parameter off by 30 % and hidden effects stay below half).
-    fits, share : an error is named if undoing it leaves at most `fits`, and at most `share` of the distance before.
-    cap : largest number of decades that one band contributes.
-    gain_decades : errors of a gain that are tried. rig_factors : errors of a rig's parameters that are tried.
+    far : records below this distance pass (tables with any parameter off by 30 % and hidden effects stay below half of
+        it).
+    fits, share : an error is named if its correction reduces the distance to at most `fits`, and to at most the
+        fraction `share` of the previous distance.
+    cap : maximum number of decades that one band contributes.
+    gain_decades : gain errors that are tried. rig_factors : errors of the rig's parameters that are tried.
     coherent : multiple coherence from which the power of a band counts as response to the drives.
-    records, samples, lines : largest numbers used, for speed. octaves : width of a band.
-    hopeless : distance at which records are refused although no single error explains them: a factor of ten or more.
-    rare : penalty added to the distance for an error other than three decades. scope : penalty for an error that is
-        not a common gain; half of it for one of a single channel, so that the simplest of similar ones is named.
-    like_g : decades within which a factor is taken for 9.81, the acceleration of gravity.
-    rate : ratio of the sample rates of records and rig from which one of them is taken for an error.
+    records, samples, lines : maximum numbers used, for speed. octaves : width of a band.
+    hopeless : distance above which records are refused even if no single error explains them: a factor of about 30.
+    rare : penalty added to the distance for an error other than three decades. scope : penalty for an error other than
+        a common gain; half of it for a single channel, so that the simplest of similar errors is named.
+    like_g : a factor within this many decades of 9.81 is taken for the acceleration of gravity.
+    rate : ratio of the sample rates of records and rig above which one of them is considered wrong.
     """
 
     far: float = 0.30
@@ -61,7 +63,7 @@ class RecordPlausibility:
 
 SETTINGS = RecordPlausibility()
 Response = Callable[[np.ndarray], np.ndarray]
-# Fields of rig files by the names of parameters; others are named as they are.
+# Fields of rig files by parameter name; other parameters are named by themselves.
 FIELDS = {"mass": "payload.mass_kg", "J": "payload.inertia_kgm2", "Ixx": "payload.inertia_kgm2",
           "Iyy": "payload.inertia_kgm2", "Izz": "payload.inertia_kgm2", "isolator.k": "isolator.stiffness_N_per_m",
           "isolator.c": "isolator.damping_Ns_per_m", "actuator": "actuators.constant_N_per_V",
@@ -69,17 +71,18 @@ FIELDS = {"mass": "payload.mass_kg", "J": "payload.inertia_kgm2", "Ixx": "payloa
           "k_t": "suspension.k_t_N_per_m", "k_r": "suspension.k_r_Nm_per_rad", "d1": "suspension.d1_Ns_per_m",
           "d3": "suspension.d3_Ns_per_m", "d4": "suspension.d4_Nms_per_rad", "d5": "suspension.d5_Nms_per_rad",
           "d6": "suspension.d6_Nms_per_rad"}
-# A gain of all channels enters together: no slip of one of them can be told from one of another.
+# Units of the rig parameters that are tried. Factors of a channel's gain are not among them, because an error of one of
+# them cannot be distinguished from an error of another.
 UNITS = ("kg", "kg m^2", "N/m", "N s/m", "N m/rad", "N m s/rad")
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What was recorded, at some lines of some records.
+    """The recorded data, at some lines of some records.
 
-    peak_u : (n_u,) largest voltage of each drive. peak_y : largest of all sensors. omega : (n,) rad/s.
+    peak_u : (n_u,) largest voltage of each drive. peak_y : largest value of all sensors. omega : (n,) rad/s.
     U : (K, n, n_u) spectra of segments.
-    power : (bands, n_y) of y over the segments, nan where it is not an answer to the drives. bands : (bands, n) masks.
+    power : (bands, n_y) of y over the segments, nan if it is not a response to the drives. bands : (bands, n) masks.
     """
 
     peak_u: np.ndarray
@@ -90,13 +93,13 @@ class Seen:
     bands: np.ndarray
 
     def predicted(self, G: np.ndarray, volts: np.ndarray | None = None) -> np.ndarray:
-        """(bands, n_y) power of the model's response; volts (n_u,) factors on the drives."""
+        """(bands, n_y) power of the model's response; volts : (n_u,) factors on the drives."""
         U = self.U if volts is None else self.U * volts
         Y = np.einsum("fij,kfj->kfi", G, U)
         return self.bands @ np.sum(np.abs(Y) ** 2, axis=0)
 
     def decades(self, G: np.ndarray, volts: np.ndarray | None = None) -> np.ndarray:
-        """(bands, n_y) recorded over predicted, decades of r.m.s., nan where there is no response."""
+        """(bands, n_y) recorded over predicted r.m.s. in decades; nan where there is no response."""
         predicted = self.predicted(G, volts)
         ok = np.isfinite(self.power) & (predicted > 0)
         found = np.full(self.power.shape, np.nan)
@@ -116,7 +119,7 @@ def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
 
 def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
                 ) -> tuple[Finding, ...]:
-    """`check_records`; if the user continues `despite` the gates, its message is only a line of progress."""
+    """`check_records`; with `despite`, its error is only reported as a line of progress."""
     try:
         return check_records(measured, model)
     except InputError as error:
@@ -129,9 +132,9 @@ def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progres
 
 def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS
                   ) -> tuple[Finding, ...]:
-    """Refuse records that a single unit error explains, or that no table like the rig could have produced.
+    """Refuse records that a single unit error explains, or that no table similar to the rig could have produced.
 
-    Returns warnings, which are no reason to stop: sensors that are off by one factor in all bands.
+    Returns warnings on sensors that are off by one factor in all bands; these do not stop the analysis.
 
     Raises
     ------
@@ -173,7 +176,7 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
 
 def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
             ) -> tuple[Finding, ...]:
-    """Sensors of a kind that read one and the same multiple of what is predicted, in all bands."""
+    """Warnings on sensors of one kind that measure the same multiple of the prediction in all bands."""
     off: list[tuple[str, float, str]] = []
     kinds = {one.name: one.quantity for one in model.rig.sensors()}
     for name, column in zip(measured.y_names, decades.T, strict=True):
@@ -208,7 +211,7 @@ def _said(decades: np.ndarray) -> str:
 
 
 def _worst_channel(decades: np.ndarray, settings: RecordPlausibility) -> float:
-    """The distance of the worst single channel, scaled to compare with the mean over all: an error is three decades."""
+    """A value just above `far` if any channel is off by more than 1.5 decades (unit errors are three), else 0."""
     each = [np.nanmedian(np.abs(column)) for column in decades.T if np.isfinite(column).any()]
     return settings.far * 1.01 if max(each, default=0.0) > 1.5 else 0.0
 
@@ -250,7 +253,7 @@ Candidate = tuple[float, str, object, str]
 
 def _candidates(seen: Seen, G: np.ndarray, now: np.ndarray, measured: Campaign, model: ResponseModel,
                 response: Callable[[ResponseModel], np.ndarray], settings: RecordPlausibility) -> Iterator[Candidate]:
-    """(distance left, field, value, what is asked) of each slip undone; the plainest first."""
+    """(remaining distance, field, value, question) for each corrected error, the simplest first."""
     for c in settings.gain_decades:
         yield distance(now - c) + _rare(c, settings), *_common_gain(10.0 ** c, seen, measured, model)
     for k, name in enumerate(measured.y_names):
@@ -281,7 +284,7 @@ def _candidates(seen: Seen, G: np.ndarray, now: np.ndarray, measured: Campaign, 
 
 def _of_rig(seen: Seen, model: ResponseModel, response: Callable[[ResponseModel], np.ndarray],
             settings: RecordPlausibility) -> Iterator[Candidate]:
-    """Each kind of parameter of the rig, all of that kind together."""
+    """Errors of each kind of rig parameter; all parameters of a kind have the same factor."""
     known = model.rig.parameters()
     kinds: dict[str, list[str]] = {}
     for name, parameter in known.items():
@@ -305,7 +308,7 @@ def _rare(decades: float, settings: RecordPlausibility) -> float:
 
 
 def _kind(name: str) -> str:
-    """isolator3.k_x and isolator1.k_z are one kind, J1 .. J23 another, d1 and d3 two."""
+    """Kind of a parameter: isolator3.k_x and isolator1.k_z are one kind, J1 .. J23 another, d1 and d3 two kinds."""
     if re.fullmatch(r"d\d", name):
         return name
     if re.fullmatch(r"I[xyz]{2}|J\d+", name):
@@ -316,8 +319,10 @@ def _kind(name: str) -> str:
 
 
 def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseModel) -> tuple[str, object, str]:
-    """A factor common to all channels: force constants, sensitivities, units of u and y. A value beyond a limit is
-    named first, then one that the factor would make usual."""
+    """Question on a factor common to all channels: force constants, sensitivities, units of u and y.
+
+    A value beyond a limit is named first, then a value that the factor would bring into the usual range.
+    """
     rig, unit = model.rig, measured.y_unit
     limits, full = rig.limits_of(measured.u_names), rig.acquisition.adc_range_V if rig.acquisition else np.inf
     k = int(np.argmax(seen.peak_u / limits))
@@ -355,7 +360,7 @@ def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseM
 
 
 def _gained(within, value: float, factor: float) -> float:
-    """How much further from the middle of the usual range a factor moves a value; negative if it comes nearer."""
+    """Change of a value's distance from the middle of the usual range by a factor; negative if it decreases."""
     return within.off_centre(value * factor) - within.off_centre(value)
 
 

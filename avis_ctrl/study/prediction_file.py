@@ -1,4 +1,4 @@
-"""How far predictions are from what a campaign measured."""
+"""Errors of predictions relative to a measured campaign."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from avis_ctrl.measurement.campaign import Campaign, Record
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Errors of one record by the predicted quantity (y, y_baseline, y_updated): r.m.s. of the error over that of the
-    measured y, both about their means, root mean square over the channels.
+    """Relative errors of one record by predicted quantity (y, y_baseline, y_updated).
 
-    noise : the same of what differs between the periods of a periodic record after the first, which no prediction from
-    u can hold; None where the record has no two such periods, or its floor was measured.
+    They are the r.m.s. error over the r.m.s. of the measured y, both about their means, and the root mean square over
+    the channels.
+
+    noise : the same for the differences between the periods of a periodic record after the first one, which no
+        prediction from u can contain; None if the record has fewer than two such periods, or its floor was measured.
     """
 
     record: str
@@ -27,7 +29,7 @@ class PredictionErrors:
 
 
 def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[PredictionErrors]:
-    """Of every record of a campaign that measured something, from a file of predictions of it."""
+    """Errors of every record of a campaign with nonzero signals on all channels, from a file of its predictions."""
     with h5py.File(predicted, "r") as file:
         for source in campaign.records:
             record = source.load()
@@ -45,16 +47,16 @@ def _relative(error: np.ndarray, size: np.ndarray) -> float:
 
 def _noise(record: Record, size: np.ndarray) -> float | None:
     period, count = record.header.period_samples, record.header.periods - 1
-    if not period or count < 2 or record.floor is not None:  # the response to a floor is predicted too
+    if not period or count < 2 or record.floor is not None:  # the response to a measured floor is predicted
         return None
     y = record.y[period:(count + 1) * period].reshape(count, period, -1)
     spread = (y - y.mean(axis=0)).reshape(-1, y.shape[2])
-    # The mean takes one period's share of the noise with it.
+    # Subtracting the mean removes 1/count of the noise power.
     return _relative(spread, size) * float(np.sqrt(count / (count - 1)))
 
 
 def compared(errors: Sequence[PredictionErrors]) -> str:
-    """What the errors of two models say of them; empty where there is one model, or the updated one is better."""
+    """A remark on the errors of two models; empty for one model, or if the updated model is better."""
     pairs = np.array([(one.relative["y_baseline"], one.relative["y_updated"]) for one in errors
                       if {"y_baseline", "y_updated"} <= set(one.relative)])
     if not len(pairs):

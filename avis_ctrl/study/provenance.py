@@ -1,4 +1,4 @@
-"""What made a result: versions, hash of the inputs, seed, date, time of computing."""
+"""Provenance of a result: versions, hash of the inputs, seed, date, computing time."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def provenance(rig: Rig | None, inputs: str, seed: int | None, seconds: float, l
 
     Parameters
     ----------
-    rig : its parameters count among the hashed inputs; None where these name it. inputs : everything else that the
-        result depends on, as text.
-    seconds : of computing. libraries : distributions whose versions may change the last digits. own : further entries
-        of this kind of result, which stand first.
+    rig : its parameters are part of the hashed inputs; None if `inputs` identifies it. inputs : everything else that
+        the result depends on, as text.
+    seconds : computing time. libraries : distributions whose versions may change the last digits. own : further entries
+        for this kind of result, listed first.
     """
     values = [] if rig is None else sorted((name, one.value) for name, one in rig.parameters().items())
     text = repr(values) + inputs

@@ -1,4 +1,4 @@
-"""Random members of a design's plant set."""
+"""Random plants of a design's uncertainty set."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def random_perturbations(plant: DesignPlant, count: int, seed: int) -> np.ndarra
 
 
 def of_rank_one(blocks: BlockStructure, delta: np.ndarray) -> np.ndarray:
-    """Full blocks replaced by their largest dyad: as stable all-pass systems only those are realised."""
+    """Replace full blocks by their largest dyad: only rank-one blocks are realised as stable all-pass systems."""
     values = blocks.values(delta)
     for k, (value, block) in enumerate(zip(values, blocks.blocks, strict=True)):
         if block.kind == "full" and min(block.rows, block.cols) > 1:

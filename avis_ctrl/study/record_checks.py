@@ -1,4 +1,4 @@
-"""Checks of a campaign's records before any fit: first their units and levels against the rig, then the gates."""
+"""Checks of a campaign's records before any fit: units and levels against the rig, then the gates (signal tests)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from avis_ctrl.study.plausible_records import records_fit
 
 
 def expectation(model: ResponseModel) -> Expectation:
-    """What the gates may hold the records against."""
+    """What the gates compare the records with."""
     rig, acquisition = model.rig, model.rig.acquisition
     volts = model.sensors.unit == "V" and acquisition is not None
 
@@ -33,12 +33,12 @@ def check_campaign(measured: Campaign, model: ResponseModel, despite_gates: bool
                    named_later: Collection[str] = ()) -> tuple[Finding, ...]:
     """Findings of all checks; warnings and stops are reported to `progress`.
 
-    despite_gates : continue where a check says stop. named_later : gates whose findings the caller's own analysis
-    names; they neither stop it nor are they reported here.
+    despite_gates : continue if a check reports a stop. named_later : gates whose findings the caller's own analysis
+        names; they neither stop it nor are they reported here.
 
     Raises
     ------
-    InputError : units or levels that no such table produces; a gate that says stop.
+    InputError : units or levels that no such table produces; a gate that reports a stop.
     """
     findings = (*records_fit(measured, model, despite_gates, progress), *examine(measured, expectation(model)))
     grave = [one for one in findings if one.severity in ("warning", "stop") and one.gate not in named_later]

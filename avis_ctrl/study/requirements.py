@@ -1,4 +1,4 @@
-"""The verdict table: each requirement of the design against what was measured on the mu controller."""
+"""The verdict table: each requirement of the design with the result of the mu controller."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def decibel(value: float) -> float:
 
 
 def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
-    """Lower bound of the skyhook's worst case over the upper bound of mu's [dB]; nan, never met, without a rival.
+    """Lower bound of the skyhook's worst case over the upper bound of the mu controller's worst case [dB].
 
-    A skyhook that some plant of the set destabilises is no baseline: its infinite gain would flatter any controller.
+    nan (never met) for a skyhook that a plant of the set destabilises: its infinite gain would flatter any controller.
     """
     if not np.isfinite(skyhook.worst_peak.upper):
         return np.nan
@@ -31,9 +31,11 @@ def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
 
 def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percent: float = 100.0
                ) -> tuple[Requirement, ...]:
-    """What every design must meet whatever its file asks: for each plant the sampled loop of all axes is stable, stays
-    within its voltage limits, and moves as the linear model predicts; the offset of the electronics uses at most that
-    part of a drive's range."""
+    """Requirements that every design must meet, in addition to those of its file.
+
+    For each plant the sampled loop of all axes is stable, stays within its voltage limits, and moves as the linear
+    model predicts. The offset of the electronics uses at most `offset_percent` of a drive's range.
+    """
     n = len(check.plants)
 
     def row(name: str, kept: int, note: str) -> Requirement:
@@ -52,14 +54,14 @@ def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percen
 
 def judge(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequence[AxisGain] = ()
           ) -> tuple[Requirement, ...]:
-    """One line a requirement of the design file, in its order."""
+    """One row per requirement of the design file, in the order of the file."""
     by_name = {c.name: c for c in controllers}
     mu, skyhook, passive = (by_name.get(name) for name in ("mu", "skyhook", "passive"))
     if mu is None or passive is None:
         raise InputError("requirements need the controllers mu and passive", field="controllers",
                          value=sorted(by_name))
     low, high = design.transmissibility.band_Hz
-    # The poles of a controller that does nothing say nothing.
+    # The poles of a controller that does nothing have no meaning.
     idle = no_better_than_none(mu, controllers)
     band = f"over {low:g} to {high:g} Hz"
     measured: dict[Quantity, tuple[str, Callable[[], float], str]] = {

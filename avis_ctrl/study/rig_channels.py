@@ -1,4 +1,4 @@
-"""A measurement in the words of the rig: its name and channels where the file states none, and what to do if wrong."""
+"""Match the names of a measurement to those of a rig; errors come with instructions."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ from avis_ctrl.measurement.formats.records import UNNAMED, with_header
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.rig import Rig
 
-# Variables whose columns readers number where nobody names them: "y1", "y2", ...
+# Variables whose columns the readers number if they have no names: "y1", "y2", ...
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output")}
 WHAT = {"u": "actuators", "y": "sensors"}
 
 
 def in_words_of(rig: Rig, measured: Campaign | FrequencyResponse,
                 columns: Mapping[str, Sequence[str]] | None = None) -> Campaign | FrequencyResponse:
-    """The measurement with the rig's name where the file states none, and the rig's channels where they are numbered.
+    """The measurement with the rig's name, if the file states none, and the rig's channels, if only numbered.
 
-    Channels that are only numbered, as many as the rig has, are taken in the rig's own order; a note of the campaign
-    says so, and the gate that compares the channels with the model speaks where that is wrong. Doing it twice does no
-    more than once.
+    Numbered channels, if as many as the rig has, are assumed to be in the order of the rig. A note of the campaign
+    states this, and the gate that compares the channels with the model reports a wrong order. The function is
+    idempotent.
 
-    columns : the mapping that the file was read with; columns of a variable that it names may be numbered, too.
+    columns : the mapping used to read the file; columns of a variable that it names may be numbered, too.
 
     Raises
     ------
-    InputError : channels that the rig does not have; says how to name them, and of which rig the file says it is.
+    InputError : channels that the rig does not have. The message explains how to name them and which rig the file
+        names.
     """
     of_rig = {"u": tuple(rig.equations_of_motion().actuators), "y": tuple(rig.sensor_rows()[0])}
     if isinstance(measured, FrequencyResponse):
@@ -59,13 +60,13 @@ def in_words_of(rig: Rig, measured: Campaign | FrequencyResponse,
 
 
 def numbered(stem: str, count: int) -> tuple[str, ...]:
-    """What a reader calls the columns of a variable."""
+    """Names that a reader gives the columns of a variable."""
     return tuple(f"{stem}{k + 1}" for k in range(count))
 
 
 def _refusal(rig: Rig, had: Mapping[str, Sequence[str]], known: Mapping[str, Sequence[str]],
              of_rig: Mapping[str, Sequence[str]], stated: str) -> InputError:
-    """What is wrong with the channels of one or both roles, and what to do."""
+    """Error on the channels of one or both roles, with instructions."""
     strange = {role: [name for name in names if name not in known[role]] for role, names in had.items()}
     said = "; ".join(f"the {WHAT[role]} of the rig {rig.name} are {', '.join(of_rig[role])}" for role in had)
     field = " and ".join(f"{role} names" for role in had)

@@ -1,4 +1,4 @@
-"""What a controller's gain may be from half the sample rate on, for the proof of stability of the code that runs it."""
+"""Limit on a controller's gain above half the sample rate, for the stability proof of the exported code."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from avis_ctrl.study.plant import DesignPlant
 
 @dataclass(frozen=True)
 class RollOffSettings:
-    """beyond, points : the limit is computed at so many frequencies from half the sample rate to this multiple of it;
-    the table's gain falls smoothly there. held : gain of the hold at half the sample rate."""
+    """Settings of the gain limit.
+
+    beyond, points : the limit is computed at `points` frequencies from half the sample rate to `beyond` times this
+        rate; the table's gain decreases smoothly there. held : gain of the hold at half the sample rate.
+    """
 
     beyond: float = 30.0
     points: int = 10
@@ -23,10 +26,11 @@ class RollOffSettings:
 
 
 def gain_limit(plant: DesignPlant, sample_rate_Hz: float, settings: RollOffSettings = RollOffSettings()) -> GainLimit:
-    """Largest gains [N s/m] with which the loop gain of the certificate stays below one.
+    """Largest gains [N s/m] for which the loop gain of the certificate stays below one.
 
-    The sampled controller is taken as the continuous one and an error of any phase: that one's gain, and `held` times
-    it, which is what the hold leaves of it. At half the sample rate the image falls onto itself and counts once more.
+    The sampled controller is represented by the continuous-time one and an error of any phase. The error is at most the
+    gain of the continuous-time controller plus `held` times this gain, the part that passes the hold. At half the
+    sample rate the image coincides with the signal and counts twice.
 
     Raises
     ------

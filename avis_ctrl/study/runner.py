@@ -1,4 +1,4 @@
-"""A whole design study: rig, plant, controllers, bounds, simulation, verdict."""
+"""A complete design study: rig, plant, controllers, bounds, simulation, verdict."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
 SAMPLES = 60
-# Entered around the D-K iteration; gives a function that is called after each step and returns whether to stop.
+# Context of the D-K iteration; it gives a function that is called after each step and returns whether to stop.
 Stop = AbstractContextManager[Callable[[], bool]]
 NEVER: Stop = nullcontext(lambda: False)
 
@@ -56,13 +56,13 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     Parameters
     ----------
     progress : called with a line of text at each step.
-    source : design file, hashed into the provenance.
-    stop : ends the D-K iteration before its time; the design continues with the best controller so far.
+    source : design file, named in the provenance.
+    stop : ends the D-K iteration early; the design continues with the best controller so far.
     """
     began = time.monotonic()
     progress("model: rig, uncertainty, weights")
     plant = build_plant(design, rig)
-    # What does not depend on the mu controller is computed beside the D-K iteration.
+    # Computations that do not depend on the mu controller run in parallel with the D-K iteration.
     with Workers(beside=True) as workers:
         others, failed = other_controllers(design, plant, rig, progress)
         early = begin(design, plant, rig, others, workers)
@@ -78,8 +78,7 @@ INITIAL = {HINF: "H-infinity, uncertainty as performance", NOMINAL: "H-infinity,
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Controllers in the report's order, those that failed with their reasons, the loop of all axes, and each axis of
-    the design against the skyhook."""
+    """Controllers in the report's order, failed ones with reasons, the loop of all axes, each axis against skyhook."""
 
     controllers: tuple[ControllerResult, ...]
     failed: tuple[FailedController, ...]
@@ -89,9 +88,9 @@ class Compared:
 
 def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
                       ) -> tuple[list[Candidate], list[FailedController]]:
-    """Those that the design compares with and that do not depend on mu: nominal H-infinity, classical skyhook, none.
+    """Controllers for comparison that do not depend on mu: nominal H-infinity, classical skyhook, no control.
 
-    One that cannot be made does not stop the design: it is returned among the failed.
+    A controller that cannot be designed does not stop the study: it is returned among the failed ones.
     """
     made: list[Candidate] = []
     failed: list[FailedController] = []
@@ -109,14 +108,14 @@ def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Pr
 
 @dataclass(frozen=True)
 class Early:
-    """Bounds under way by the controllers' names, and the peak that the tuned skyhook among them may have at worst."""
+    """Bounds in progress, by controller, and the allowed worst-case peak of the tuned skyhook among them."""
 
     bounds: Mapping[str, Future]
     peak_limit: float | None
 
 
 def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers) -> Early:
-    """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design asks for."""
+    """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design requires."""
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
     jobs = {}
@@ -127,14 +126,14 @@ def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candida
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate],
                progress: Progress = lambda text: None, stop: Stop = NEVER) -> tuple[Candidate, DKIteration]:
-    """The mu controller, and the D-K iteration, which starts from the best of the others."""
+    """The mu controller and its D-K iteration, which starts from the best of the other controllers."""
     with threadpool_limits(1):
         def shown(row: Any) -> bool:
-            """After each iteration; False ends it."""
+            """Called after each iteration; False stops it."""
             if row.kind in INITIAL:
                 progress(f"initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, order {row.order}")
                 return True
-            ends = enough()  # before the line: from when it is seen, Ctrl-C keeps this controller
+            ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
             progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
                      f"{row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
             return not ends
@@ -146,7 +145,7 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
 
 def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteration, compared: Compared, seconds: float,
              source: Path | None = None) -> DesignResult:
-    """The verdict, with what the reduction to the kept axes leaves out, and the provenance."""
+    """The verdict, the error of the reduction to the kept axes, and the provenance."""
     controllers = compared.controllers
     with threadpool_limits(1):
         reduction = reduction_error(rig, design.keep)
@@ -171,17 +170,17 @@ ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None,
             early: Early | None = None) -> Compared:
-    """Bounds of every controller, one loop an axis tuned on mu and a skyhook tuned to the worst-case peak of mu where
-    the design compares with them, and the simulation of mu.
+    """Bounds of every controller, of the tuned loops and the tuned skyhook if required, and the simulation of mu.
 
-    Runs on two processes, beside those of `early`. The simulation, and the tuning of a skyhook whose peak the design
-    does not limit, wait for the bounds of all the others, because the best of these is delivered as the mu controller.
+    Runs on two processes, in parallel with those of `early`. The simulation waits for the bounds of all other
+    controllers, because the best of these is delivered as the mu controller. So does the tuning of a skyhook whose peak
+    the design does not limit.
 
-    early : bounds that were started before, on processes that give way to those for the mu controller.
+    early : bounds that were started before, on processes with a lower priority than those for the mu controller.
 
     Raises
     ------
-    ComputationError : the mu controller itself, or the table without control, could not be analysed.
+    ComputationError : the mu controller, or the passive table, could not be analysed.
     """
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     begun = early.bounds if early is not None else {}
@@ -203,7 +202,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         mu = found["mu"]
         if isinstance(mu, FailedController):
             raise ComputationError(f"the controller {mu.title!r} could not be analysed: {mu.reason}")
-        # The best one found is delivered, whatever its name; the skyhook's limit follows from it.
+        # The best controller found is delivered, whatever its name; it determines the skyhook's limit.
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
         axes = range(len(plant.axes))
@@ -254,7 +253,7 @@ def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndar
 
 def _tuned(design: Design, plant: DesignPlant, rig: Rig, name: Literal["skyhook", "loops"], given: Any,
            samples: np.ndarray) -> ControllerResult | FailedController:
-    """given : the peak that the skyhook may have, or the controller that the loops start from."""
+    """given : allowed peak of the skyhook, or the controller from which the loops start."""
     make, title = (tuned_skyhook, "skyhook, tuned") if name == "skyhook" else (tuned_loops, LOOPS_TITLE)
     with threadpool_limits(1):
         try:
@@ -265,7 +264,7 @@ def _tuned(design: Design, plant: DesignPlant, rig: Rig, name: Literal["skyhook"
 
 
 def skyhook_limit(design: Design, mu: ControllerResult) -> float:
-    """Worst-case peak that the skyhook may have: what the design asks of its rival, or the rival's own if larger."""
+    """Allowed worst-case peak of the skyhook: the limit of the design, or the peak of the mu controller if larger."""
     known = [limit for limit in (*_asked_peaks(design), mu.worst_peak.upper) if np.isfinite(limit)]
     return max(known, default=10 ** (design.transmissibility.peak_dB / 20))
 

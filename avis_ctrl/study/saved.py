@@ -1,4 +1,4 @@
-"""Design and rig of a study as a file of its folder, so that later commands need nothing but the folder."""
+"""Design and rig of a study as a file in its folder, so that later commands need only the folder."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ STUDY = "study.json"
 
 
 def study_dict(design: Design, rig: Rig) -> dict[str, Any]:
-    """The inputs of a study; the rig as the text of a rig file. Raises InputError for a rig that has no file form."""
+    """The inputs of a study; the rig as the text of a rig file. Raises InputError for a rig without a file format."""
     return {"format": "avis-study", "version": 1, "design": design.model_dump(), "rig": rig_toml(rig),
             "loaded": getattr(rig, "load", None) is not None}
 
 
 def read_saved(folder: Path) -> tuple[Design, Rig]:
-    """Design and rig of a study's folder. Raises InputError in one line for whatever is wrong with the file."""
+    """Design and rig of a study's folder. Raises InputError in one line if the file is invalid."""
     path = folder / STUDY
     content = read_json(path, "avis-study")
     try:

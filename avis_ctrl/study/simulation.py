@@ -1,4 +1,4 @@
-"""The mu controller on the nonlinear six-degree-of-freedom rig, the other axes under skyhook loops of their own."""
+"""The mu controller on the nonlinear six-degree-of-freedom rig, with skyhook loops on the other axes."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from avis_ctrl.study.random_plants import random_perturbations
 
 
 def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult) -> Simulated:
-    """Nominal, worst-case and random plants in closed loop, each judged against the linear prediction.
+    """Simulate nominal, worst-case and random plants in closed loop; each is compared with the linear prediction.
 
-    The other axes get loops that are designed here, around this controller and for this rig's sensors.
+    The loops of the other axes are designed here, around this controller and for this rig's sensors.
     """
     with threadpool_limits(1):
         bare = bare_loop(design, rig, plant, result.K)
@@ -41,7 +41,8 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
         companions = until_stable(design_companions(bare, errors, design.floor.band_Hz), [bare, *perturbed])
         loops = [replace(one, loops=companions.systems()) for one in (bare, *perturbed)]
         rest = at_rest(loops[0])
-        # The offsets that cost most of a drive; a controller that integrates has no state of rest with them.
+        # The offsets that use the largest part of a drive's range; with an integrating controller there is no
+        # equilibrium.
         offset = [replace(one, sensors=replace(one.sensors, offset_V=rest.worst_offset_V)) for one in loops
                   ] if np.isfinite(rest.percent) else loops
         check = check_designs(offset, design.simulation.duration_s, design.simulation.seed)
@@ -53,8 +54,10 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
 
 
 def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
-    """The design's controller on its nominal rig, without loops on the other axes; the floor moves along x, y, z and
-    the controlled rotations."""
+    """The design's controller on its nominal rig, without loops on the other axes.
+
+    The floor moves along x, y, z and the controlled rotations.
+    """
     if K is None:
         K = gain(np.zeros((len(design.keep), len(design.keep))))
     return SampledLoop(rig, K, tuple(design.keep), {}, sensor_bank(design, rig),
@@ -72,10 +75,10 @@ def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | N
 
 def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
                   companions: Companions) -> SixDofCheck:
-    """Transmissibility of the sampled loop in six degrees of freedom against the design model's.
+    """Compare the transmissibility of the sampled loop in six degrees of freedom with that of the design model.
 
-    At the design model's frequencies, the ends of the band, and around the peaks, over all frequencies and in the band:
-    a lightly damped mode is narrower than the steps between those.
+    The frequencies are those of the design model, the ends of the band, and points around the peaks, over all
+    frequencies and in the band: a lightly damped mode is narrower than the grid.
     """
     T2, loop = result.transmissibility, nominal_loop(design, rig, plant, result.K, companions)
     kept = [COORDINATES.index(name) for name in design.keep]
@@ -108,7 +111,7 @@ def sensor_bank(design: Design, rig: Rig) -> SensorBank:
 
 
 def floor_by_coordinate(design: Design, rig: Rig, spectrum: SpectrumModel) -> dict[str, SpectrumModel]:
-    """Each translation at the site's level; each kept rotation so that the edge has that level too."""
+    """Floor spectra: the site's level for each translation, and for each kept rotation at the edge."""
     rms, (low, high) = spectrum.rms(*_band(design)), _band(design)
     turning = spectrum.scaled_to_rms(rms / rig.edge_m, low, high)
     return {name: turning if name.startswith("phi") else spectrum
@@ -121,7 +124,7 @@ def _band(design: Design) -> tuple[float, float]:
 
 def perturbed_loops(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
                     nominal: SampledLoop) -> Iterator[SampledLoop]:
-    """The worst case of transmissibility, then the random plants, as rigs with changed parameters and chains."""
+    """The worst case of transmissibility, then the random plants, as rigs with changed parameters and channels."""
     blocks = plant.synthesis.blocks
     if result.worst_peak.delta is not None:
         delta = result.worst_peak.delta[:blocks.n_w, :blocks.n_z]
@@ -129,13 +132,13 @@ def perturbed_loops(design: Design, rig: Rig, plant: DesignPlant, result: Contro
     rng = np.random.default_rng((design.simulation.seed, 2))
     samples = random_perturbations(plant, design.simulation.random_plants, design.simulation.seed)
     for k, delta in enumerate(samples, 1):
-        # A chain's random phase is met at a random frequency of the loop's band.
+        # The random phase of a chain is attained at a random frequency from 1 to 100 Hz.
         yield with_delta(rig, plant, nominal, f"random {k}", delta, 2 * np.pi * 10 ** rng.uniform(0.0, 2.0))
 
 
 def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, delta: np.ndarray,
                omega: float) -> SampledLoop:
-    """The loop around the rig that a perturbation stands for."""
+    """The loop around the rig with a given perturbation."""
     blocks = plant.synthesis.blocks
     real = {block.name: complex(np.ravel(value)[0]).real
             for value, block in zip(blocks.values(delta), blocks.blocks, strict=True) if block.kind == "real"}
@@ -151,9 +154,9 @@ def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, de
 
 def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains: dict, omega: float
                     ) -> StateSpace | None:
-    """I + A W(s) Delta(s) T from all drives to all drives, None where the plant has no such error.
+    """I + A W(s) Delta(s) T from all drives to all drives; None if the plant has no such error.
 
-    T takes volts to the axes' forces, A the forces that make the difference back to volts.
+    T maps volts to the forces on the axes, A maps the additional forces back to volts.
     """
     if RESPONSE not in chains:
         return None
@@ -170,7 +173,7 @@ def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains:
 
 
 def _chain(plant: DesignPlant, chains: dict, kind: str, name: str, omega: float) -> StateSpace | None:
-    """1 + W(s) delta(s) of one channel, None where it is certain."""
+    """1 + W(s) delta(s) of one channel; None if the channel is certain."""
     if f"{kind} {name}" not in chains:
         return None
     value, block = chains[f"{kind} {name}"]

@@ -1,7 +1,7 @@
 """Skyhook controllers for comparison: by the classical rule, and tuned for the worst case of the uncertainty set.
 
-A comparison with a badly tuned skyhook is worthless. So the search starts from the classical tunings, which remain
-candidates to its end, and tunings are ranked by the same bound over the whole set that the report shows.
+A comparison with a badly tuned skyhook is worthless. The search therefore starts from the classical tunings and keeps
+them as candidates. Tunings are ranked by the same bound over the whole set as in the report.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.plant import DesignPlant
 
-# Tilt corner well below the table's modes, roll-off well above its loops' band.
+# Tilt corner well below the table's modes, roll-off well above the bandwidth of its loops.
 CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
 TUNING_HZ = np.concatenate([np.geomspace(0.1, 5.0, 20), np.geomspace(5.5, 200.0, 44), [300.0, 400.0]])
 
 
 @dataclass(frozen=True)
 class SkyhookSettings:
-    """Limits of the search for the worst case; every limit is a count, none a time.
+    """Limits of the search for the worst case. Every limit is a count, not a time.
 
-    samples : number of plants on the boundary of the set that the search begins with.
-    rounds : how often, at most, the worst case of the best tuning is added to the samples.
+    samples : number of plants on the boundary of the set at the start of the search.
+    rounds : maximum number of times that the worst case of the best tuning is added to the samples.
     agreement : relative excess of a worst case over the samples' largest value above which it is added to them.
-    room : fraction of the limit that the search aims at, so that the worst case ends below the limit and not at it.
-    certified : number of tunings, besides the classical one, whose bound over the whole set is computed; if one is
-        above the limit, its worst case and frequency are added to the samples for the next.
+    room : fraction of the limit that is the target of the search, so that the worst case ends below the limit.
+    certified : number of tunings, besides the classical one, for which the bound over the whole set is computed; if a
+        bound is above the limit, its worst case and frequency are added to the samples for the next tuning.
     beside : frequencies added around the worst one, as factors, so that a narrow peak is not missed.
     ascents, ascent_steps : effort of the search for a worst case at each frequency.
     """
@@ -52,7 +52,7 @@ class SkyhookSettings:
 
 
 def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
-    """Critical damping of each axis taken alone, with the usual corners."""
+    """Critical damping of each decoupled axis, with the usual corners."""
     loops = classical_loops(plant, rig, design)
     return Candidate("skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(),
                      (in_words(loops),))
@@ -65,14 +65,15 @@ def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
 
 def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: float,
                   settings: SkyhookSettings = SkyhookSettings()) -> Candidate:
-    """The best skyhook found: of those whose worst-case peak meets the limit, the one with the least worst-case
-    transmissibility in the band; if none meets it, the one with the least worst-case peak, and a note says so.
+    """The best skyhook found for a limit on the worst-case peak.
 
-    Never worse, by the bounds over the whole set, than critical damping with the usual corners.
+    Of the tunings that meet the limit, it has the smallest worst-case transmissibility in the band. If none meets it,
+    it has the smallest worst-case peak, and a note states this. By the bounds over the whole set it is never worse than
+    critical damping with the usual corners.
 
     Raises
     ------
-    ComputationError : no tuning tried, the classical ones included, is stable on the nominal plant.
+    ComputationError : no tuning tried, including the classical ones, is stable on the nominal plant.
     """
     contest = _Contest(plant, design, peak_limit, settings)
     classical = classical_loops(plant, rig, design)
@@ -110,7 +111,7 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
 
 @dataclass(frozen=True, eq=False)
 class _Contest:
-    """What all tunings of a plant are judged by."""
+    """Evaluation of all tunings of a plant."""
 
     plant: DesignPlant
     design: Design
@@ -133,10 +134,10 @@ class _Contest:
 
     def tuned(self, task: Search, points: Sequence[np.ndarray],
               target: float) -> tuple[np.ndarray, list[np.ndarray], Search]:
-        """The best tuning by the worst case at each frequency; the points known, and the search with its worst cases.
+        """The best tuning by the worst case at each frequency, the known points, and the search with its worst cases.
 
-        Each round improves the points on the samples; the worst case of the best one joins the samples, until it is no
-        worse than they said.
+        Each round improves the points on the samples. The worst case of the best point is then added to the samples,
+        until it is no worse than the samples predict.
         """
         judged: list[tuple[Merit, np.ndarray]] = []
         for _ in range(self.settings.rounds):
@@ -151,7 +152,7 @@ class _Contest:
         return min(judged, key=lambda one: one[0].key())[1], list(points), task
 
     def worst(self, task: Search, point: np.ndarray) -> tuple[Merit, np.ndarray | None]:
-        """The worst case found at each frequency, which is a lower bound, and its perturbations (n_omega, n_w, n_z)."""
+        """The worst case found at each frequency (a lower bound), and its perturbations (n_omega, n_w, n_z)."""
         motion = task.scenarios.plant
         closed = motion.closed(task.search.skyhook(task.axes, point).controller())
         if not closed.is_stable():
@@ -161,7 +162,7 @@ class _Contest:
         return Merit(float(np.max(found.gain)), float(np.max(found.gain[task.inside])), self.peak_limit), found.delta
 
     def learned(self, task: Search, worst: MuPeak) -> Search:
-        """The search with the worst case of a bound among its samples, and its frequency among theirs."""
+        """The search with the worst case of a bound added to its samples, and its frequency to the grid."""
         scenarios = task.scenarios
         if np.isfinite(worst.omega) and worst.omega > 0:
             scenarios = scenarios.with_frequencies(worst.omega * np.array(self.settings.beside))
@@ -171,9 +172,9 @@ class _Contest:
         return replace(task, scenarios=scenarios)
 
     def certified(self, loops: Skyhook) -> tuple[Merit, MuPeak | None]:
-        """The bounds over the whole set, as the report computes them, and the one of the peak.
+        """The bounds over the whole set, as in the report, and the result for the peak.
 
-        That of the band is computed only where the peak keeps the limit: elsewhere it decides nothing.
+        The bound in the band is computed only if the peak meets the limit; otherwise it does not affect the ranking.
         """
         plant = self.plant
         motion = plant.full.restricted(plant.floor_velocities, plant.velocities)
@@ -204,7 +205,7 @@ def in_words(loops: Skyhook) -> str:
 
 
 def at_limits(loops: Skyhook, search: TuningRange) -> list[str]:
-    """A sentence on the tuned values at an end of their range, where the best of a wider range may be better."""
+    """A sentence on tuned values at an end of their range, where a wider range may give a better result."""
     values = [*((f"the gain of {axis}", gain / critical, search.gain_factor) for axis, gain, critical in
                 zip(loops.axes, loops.gains, search.critical, strict=True)),
               ("the tilt corner", loops.tilt_corner_Hz, search.tilt_corner_Hz),

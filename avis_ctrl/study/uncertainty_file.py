@@ -1,7 +1,7 @@
-"""The file of what an identification leaves uncertain: covariance of parameters, spread of responses.
+"""The uncertainty file of an identification: covariance of the parameters, spread of the responses.
 
-It holds what depends on the measurement only. Which directions a design keeps, and how its filter covers the spread,
-follows from the design's coordinates, its confidence and what it declares itself.
+It contains only what depends on the measurement. The directions that a design keeps, and the filter that covers the
+spread, follow from the design's coordinates, confidence and declared uncertainty.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.rig import Rig
 
-# An isolation table has a few dozen parameters; more in a file is no uncertainty of a rig.
+# An isolation table has a few dozen parameters; a file with many more does not describe a rig.
 MOST_PARAMETERS, MOST_POINTS = 500, 20_000
 
 LARGEST = 1e12
@@ -30,7 +30,7 @@ Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 
 
 class ParameterSection(Section):
-    """An identified parameter; scale is what one relative unit of it is."""
+    """An identified parameter; scale is the size of one relative unit."""
 
     name: str
     unit: str
@@ -39,16 +39,16 @@ class ParameterSection(Section):
 
 
 class DirectionSection(Section):
-    """A determined combination: relative standard deviation and its unit vector in relative parameters."""
+    """A determined combination: relative standard deviation, and unit vector in relative parameters."""
 
     standard_deviation: NotNegative
     vector: list[Finite]
 
 
 class WeightSection(Section):
-    """The filter of lowest order that covers the spread alone, for a reader of the file; roots in rad/s.
+    """The filter of lowest order that covers the spread alone, for information; roots in rad/s.
 
-    Of lines that noise drowns it covers the 100 % that designs assume there.
+    At lines where noise hides the response it covers the 100 % that designs assume there.
     """
 
     zeros: list[Pair]
@@ -59,7 +59,7 @@ class WeightSection(Section):
 
 
 class SpreadSection(Section):
-    """Largest singular value of the relative error in the kept coordinates: as measured, and quantiles of its noise."""
+    """Largest singular value of the relative error in the kept coordinates: measured, and quantiles of its noise."""
 
     keep: Annotated[list[str], Field(min_length=1)]
     frequency_Hz: Annotated[list[Positive], Field(min_length=2, max_length=MOST_POINTS)]
@@ -78,7 +78,7 @@ class SpreadSection(Section):
         return self
 
     def values(self) -> FrfSpread:
-        """As arrays."""
+        """The spread as arrays."""
         return FrfSpread(tuple(self.keep), np.array(self.frequency_Hz), np.array(self.measured), np.array(self.noise),
                          tuple(self.confidence))
 
@@ -113,7 +113,7 @@ class UncertaintyFile(Section):
         return self
 
     def factor(self) -> np.ndarray:
-        """S (n_p, r) with the covariance S S^T, in the parameters' units."""
+        """S (n_p, r) with covariance S S^T, in the parameters' units."""
         V = np.reshape(np.array([one.vector for one in self.direction], float), (-1, len(self.parameter))).T
         return V * np.array([one.standard_deviation for one in self.direction]) * self.scale[:, None]
 
@@ -126,7 +126,7 @@ class UncertaintyFile(Section):
         return np.array([one.scale for one in self.parameter])
 
     def check_rig(self, rig: Rig) -> None:
-        """Raises InputError unless the rig has the identified values, and what was not identified is unchanged too."""
+        """Raise InputError unless the rig has the identified values and its other parameters are unchanged."""
         known = rig.parameters()
         for one in self.parameter:
             if one.name in known and abs(known[one.name].value - one.value) > 1e-9 * one.scale:
@@ -139,7 +139,7 @@ class UncertaintyFile(Section):
 
 
 def rig_sha256(rig: Rig) -> str:
-    """Hash of the rig's parameters to ten digits: a file that was written and read back is the same rig."""
+    """Hash of the rig's parameters to ten digits: writing and reading a file does not change it."""
     text = ";".join(f"{name}={one.value:.10g}" for name, one in sorted(rig.parameters().items()))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -156,6 +156,6 @@ def read_uncertainty(path: str | Path) -> UncertaintyFile:
     try:
         return validated(UncertaintyFile, content, path)
     except InputError as error:
-        # What contradicts itself is a whole section, too long for a line.
+        # An inconsistent value is a whole section, too long for one line.
         value = None if isinstance(error.value, (dict, list)) else error.value
         raise InputError(error.expected, file=path, field=error.field or None, value=value) from None

@@ -1,4 +1,4 @@
-"""From an identification to uncertainty.json."""
+"""uncertainty.json from an identification."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
 
 def uncertainty_content(rig: Rig, information: Information, spreads: Sequence[FrfSpread],
                         provenance: Mapping[str, Any] | None = None) -> UncertaintyFile:
-    """The file's content.
+    """The content of the file.
 
     Parameters
     ----------
-    rig : identified. information : of the fit; parameters that are not the rig's are kept in the covariance.
-    spreads : of the coordinates that designs may keep, all of them checked against the rig.
+    rig : identified. information : of the fit; the covariance also keeps parameters that are not the rig's.
+    spreads : for the sets of coordinates that designs may keep.
     """
     sigma, V = information.directions
     kept = np.flatnonzero(information.determined)
@@ -55,5 +55,5 @@ def _spread_section(spread: FrfSpread, confidence: float = 0.95) -> SpreadSectio
 
 
 def uncertainty_json(content: UncertaintyFile) -> str:
-    """The file's text."""
+    """The text of the file."""
     return content.model_dump_json(indent=1) + "\n"

@@ -10,7 +10,7 @@ from avis_ctrl.study.design_result import DesignResult
 
 
 def first_sentence(result: DesignResult) -> str:
-    """That the loop is unstable, if it is; otherwise which requirements are not met."""
+    """A sentence on instability, if the loop is unstable; otherwise on the requirements that are not met."""
     return unstable(result) or _counted(result)
 
 
@@ -25,10 +25,10 @@ def unstable(result: DesignResult) -> str:
 
 
 def all_axes(result: DesignResult) -> str:
-    """What the sampled loop of all six degrees of freedom reaches, beside the bounds of the design model.
+    """Transmissibility of the sampled loop with all six degrees of freedom, and the bounds of the design model.
 
     The bounds are those of the kept coordinates with the others locked. If the nominal loop of all axes exceeds them,
-    the sentence says so; where there are no bounds it speaks of none.
+    the sentence states this; without bounds it mentions none.
     """
     mu, six = result.controller("mu"), result.six_dof
     low, high = result.design.transmissibility.band_Hz
@@ -49,7 +49,7 @@ def all_axes(result: DesignResult) -> str:
 
 
 def refuse_unstable(result: DesignResult) -> None:
-    """Raises ComputationError, exit code 3, if the delivered loop is unstable for any plant."""
+    """Raise ComputationError (exit code 3) if the delivered loop is unstable for any plant."""
     if not (text := unstable(result)):
         return
     kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""

@@ -1,4 +1,4 @@
-"""Two processes for work that needs no exchange: analyses of controllers, simulations."""
+"""A pool of two processes for independent computations: analyses of controllers, simulations."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class WorkerSettings:
-    """most : processes of a pool: the commands are made for two processors.
-    watch_s : time between two looks at whether the parent still lives [s].
-    niceness : added to that of workers beside the main computation, so that it keeps a processor of its own.
+    """most : maximum number of processes of a pool: the commands are made for two processors.
+    watch_s : interval between checks whether the parent is alive [s].
+    niceness : added to that of workers beside the main computation, so that the main computation keeps a processor.
     """
 
     most: int = 2
@@ -30,11 +30,10 @@ SETTINGS = WorkerSettings()
 
 
 def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, niceness: int = 0) -> None:
-    """Make this process a worker: Ctrl-C and SIGTERM end it at once and silently (the parent speaks); so does the
-    parent's own death.
+    """Make this process a worker: Ctrl-C, SIGTERM and the death of the parent end it at once and silently.
 
-    on_interrupt : SIG_IGN where Ctrl-C, which reaches all processes, is the parent's to decide on: it may go on with
-        what it has.
+    on_interrupt : SIG_IGN if the parent decides on Ctrl-C, which reaches all processes: it may continue with its
+        results.
     """
     if niceness and hasattr(os, "nice"):
         os.nice(niceness)
@@ -53,7 +52,7 @@ _alone = False
 
 @contextlib.contextmanager
 def alone() -> Iterator[None]:
-    """Within it, `Workers` and `each` compute in this process: for one of many processes that fill the machine."""
+    """Context in which `Workers` and `each` compute in this process: for one of many processes on a busy machine."""
     global _alone
     before, _alone = _alone, True
     try:
@@ -63,7 +62,7 @@ def alone() -> Iterator[None]:
 
 
 class Workers:
-    """A pool where there are processors for one, else the same calls one after the other in this process.
+    """A pool if several processors are available; otherwise the same calls one after the other in this process.
 
     beside : this process computes as well, with priority over the workers, and decides what Ctrl-C does.
     """
@@ -83,7 +82,7 @@ class Workers:
         return self
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
-        """A future of function(*arguments); errors come out of its result()."""
+        """A future of function(*arguments); its result() raises the errors of the function."""
         if self._pool is not None:
             return self._pool.submit(function, *arguments)
         done: Future = Future()
@@ -97,7 +96,7 @@ class Workers:
         if self._pool is None:
             return
         if kind is not None:
-            # Nobody waits for the answers any more; without this the interpreter would, before it ends.
+            # The results are no longer needed; without this the interpreter would wait for them before it exits.
             for child in set(multiprocessing.active_children()) - self._others:
                 child.terminate()
         self._pool.shutdown(cancel_futures=True)
@@ -107,10 +106,10 @@ _questions: tuple[Callable[[Any], Any], list[Any]] | None = None
 
 
 def each(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """function of every item, in their order, two at a time where there are processors for it.
+    """Apply a function to every item, in order, two at a time if there are processors for it.
 
-    The function and the items are those that a forked process finds in its memory; only answers are sent. Errors are
-    raised as they were.
+    Forked processes find the function and the items in their memory; only results are sent. Errors are raised
+    unchanged.
     """
     global _questions
     items = list(items)

@@ -1,1 +1,1 @@
-"""Many designs, skyhooks, gaps or functions from one file of points, on one machine or on a cluster."""
+"""Many designs, skyhooks, gap searches or function calls from one points file, on one machine or on a cluster."""

@@ -1,4 +1,4 @@
-"""Tasks on a cluster, by dask.distributed: on a scheduler that runs, or on one with workers on this machine."""
+"""Tasks on a cluster with dask.distributed: on a running scheduler, or on a new one with workers on this machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from avis_ctrl.sweep.task import Task, lost, perform
 
 
 def require_distributed() -> None:
-    """Raises InputError, with what to do, where dask.distributed is not installed."""
+    """Raise InputError, with instructions, if dask.distributed is not installed."""
     try:
         import distributed  # noqa: F401
     except ImportError:
@@ -26,13 +26,13 @@ def require_distributed() -> None:
 
 def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, settings: SweepSettings | None = None
                ) -> Iterator[dict[str, Any]]:
-    """Contents of the points as they are finished, in any order.
+    """Content of each point as it is finished, in any order.
 
-    Points of a worker that dies go to the others.
+    If a worker dies, its points are given to other workers.
 
     Parameters
     ----------
-    address : of a scheduler; None starts one with `workers` processes here.
+    address : of a scheduler; None starts one with `workers` processes on this machine.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
     import dask
     from distributed import Client, LocalCluster, as_completed
 
-    # A worker that is killed, or a scheduler that ends, is said in a row or in one line, not in the library's log.
+    # A killed worker or a lost scheduler is reported in a row or in one line, not in the library's log.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": settings.deaths - 1,
@@ -55,7 +55,7 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
                     silence_logs=logging.CRITICAL))
             address = cluster.scheduler_address
         client = stack.enter_context(_connected(Client, address, settings.patience_s))
-        # A task has its identity for name: a resumed sweep joins what still runs of the one before.
+        # Tasks are named by their identity: a resumed sweep joins tasks that are still running.
         by_name = {f"avis-sweep-{os.fspath(task.folder)}-{task.identity}": task for task in tasks}
         futures = [client.submit(perform, task, key=name) for name, task in by_name.items()]
         for future in as_completed(futures, loop=client.loop):
@@ -65,7 +65,7 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
 
 @contextlib.contextmanager
 def _ignored_interrupts() -> Iterator[None]:
-    """Processes that are started in it ignore Ctrl-C, which a terminal sends to all: the parent ends them."""
+    """Processes started in this context ignore Ctrl-C, which a terminal sends to all of them: the parent ends them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -100,12 +100,12 @@ def _content(future: Any, task: Task) -> dict[str, Any]:
     from distributed import CancelledError, KilledWorker
 
     try:
-        # It also waits where a worker died with a result that nobody had fetched: another one reads the point's file.
+        # This also waits if a worker died before its result was fetched: another worker reads the point's file.
         return future.result()
     except KilledWorker:
         return lost(task, "every process that computed it died; likely cause: memory, or a fault in compiled code")
     except CancelledError:
         raise ComputationError("the scheduler was lost", next_step="run the same command again: finished points are "
                                "kept") from None
-    except Exception as error:  # a worker that cannot load the package, for example
+    except Exception as error:  # for example, a worker that cannot load the package
         return lost(task, f"{type(error).__name__}: {' '.join(str(error).split())}")

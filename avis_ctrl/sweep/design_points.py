@@ -1,4 +1,4 @@
-"""Points that are designs: the certified mu controller, or the skyhook of the classical rule, which takes seconds."""
+"""Points that are designs: the certified mu controller, or the skyhook of the classical rule (takes seconds)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BAND = "worst_case_band_transmissibility_dB"
 
 @dataclass(frozen=True, eq=False)
 class DesignBase:
-    """A design file. The key `base` of a point names another one: another structure."""
+    """A design file. The key `base` of a point selects another design file, with another structure."""
 
     path: Path
     skyhook: bool
@@ -45,7 +45,7 @@ class DesignBase:
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> DesignBase:
-        """Raises InputError for a base that is not there or is no design file."""
+        """Raises InputError for a base that is missing or is not a design file."""
         if file.rig is not None:
             raise InputError("expected no rig: the design file names it; vary the key \"rig\"", field="rig",
                              value=file.rig)
@@ -53,12 +53,12 @@ class DesignBase:
 
     @classmethod
     def of(cls, path: Path, skyhook: bool) -> DesignBase:
-        """The base of a path."""
+        """Read the base from a path."""
         table = read_toml(path, "a design file such as designs/avis_z_phix.toml")
         return cls(path, skyhook, table, study_of(design_from_table(table, path), path)[1])
 
     def expand(self, key: str) -> Sequence[str]:
-        """Keys of a design file, and parameters of its rig."""
+        """Expand a key of the design file or a parameter of its rig."""
         return expanded(key, KEYS, self.rig)
 
     def job(self, point: Mapping[str, Any]) -> DesignJob:
@@ -108,7 +108,7 @@ class DesignJob:
 
 
 def figures_of(found: ControllerResult) -> dict[str, Any]:
-    """What the table shows of a controller."""
+    """The figures of a controller for the table."""
     return {"mu_upper": found.mu.upper, "mu_lower": found.mu.lower,
             "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
             "worst_case_peak_transmissibility_dB": decibels(found.worst_peak.upper),

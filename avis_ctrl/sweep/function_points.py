@@ -1,4 +1,4 @@
-"""Points that are calls of a function of the user's own, from a Python file."""
+"""Points that are calls of a user function from a Python file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avis_ctrl.sweep.points_file import PointsFile
 
 @dataclass(frozen=True, eq=False)
 class FunctionBase:
-    """FILE.py:NAME. Its source goes to the workers, so that they need no copy of the file."""
+    """A user function, FILE.py:NAME. Its source is sent to the workers, which need no copy of the file."""
 
     source: str
     path: Path
@@ -25,7 +25,7 @@ class FunctionBase:
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> FunctionBase:
-        """Raises InputError for a file that is not there or has no such function. The file is run."""
+        """Run the file. Raises InputError if the file or the function is missing."""
         where, _, name = file.base.partition(":")
         if not where.endswith(".py") or not name:
             raise InputError("expected FILE.py:NAME", field="base", value=file.base)
@@ -39,7 +39,7 @@ class FunctionBase:
         return made
 
     def expand(self, key: str) -> Sequence[str]:
-        """Any key is one of the function's."""
+        """Every key is valid: it is an argument of the function."""
         return [key]
 
     def job(self, point: Mapping[str, Any]) -> FunctionJob:
@@ -49,9 +49,9 @@ class FunctionBase:
 
 @dataclass(frozen=True, eq=False)
 class FunctionJob:
-    """NAME(point), which returns figures by name, or these and details that only the point's file keeps.
+    """The call NAME(point), which returns figures by name, or a pair (figures, details).
 
-    The code runs with the rights of the user.
+    Only the point's file keeps the details. The code runs with the user's permissions.
     """
 
     source: str
@@ -65,7 +65,7 @@ class FunctionJob:
         return f"{self.source}\n{self.name}\n{self.point!r}"
 
     def function(self) -> Any:
-        """Run the file. Raises InputError where it does not run or has no such function."""
+        """Run the file. Raises InputError if it fails or has no such function."""
         module = types.ModuleType(f"avis_sweep_{self.path.stem}")
         module.__file__ = str(self.path)
         try:
@@ -79,7 +79,7 @@ class FunctionJob:
         return found
 
     def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The figures that the function returns, and what else it returns beside them."""
+        """The figures that the function returns, and its details."""
         found = self.function()(dict(self.point))
         figures, details = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
         if not isinstance(figures, dict) or not all(isinstance(name, str) for name in figures):

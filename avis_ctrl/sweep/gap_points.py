@@ -1,4 +1,4 @@
-"""Points that are searches for what a model misses: campaigns, rigs, options of `avis gap`."""
+"""Points that are searches for missing effects, with different campaigns, rigs and options of `avis gap`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Hertz = Annotated[float, Field(gt=0)]
 
 
 class Options(BaseModel):
-    """The options of `avis gap` that may vary, checked."""
+    """The options of `avis gap` that may vary, validated."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
@@ -40,7 +40,7 @@ KEYS = {**keys_of(Options), "base": False, "rig": False}
 
 @dataclass(frozen=True, eq=False)
 class GapBase:
-    """A campaign and a rig; the keys `base` and `rig` of a point name others."""
+    """A campaign and a rig; the keys `base` and `rig` of a point select other ones."""
 
     folder: Path
     campaign: str
@@ -55,7 +55,7 @@ class GapBase:
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> GapBase:
-        """Raises InputError for a campaign or a rig that is not there."""
+        """Raises InputError for a missing campaign or rig."""
         if file.rig is None:
             raise InputError("this key is missing: the rig of the campaign", field="rig")
         made = cls(folder, file.base, file.rig, _rig(folder, file.rig))
@@ -63,7 +63,7 @@ class GapBase:
         return made
 
     def expand(self, key: str) -> Sequence[str]:
-        """Options of `avis gap`, and parameters of the rig."""
+        """Expand an option of `avis gap` or a parameter of the rig."""
         return expanded(key, KEYS, self.rig)
 
     def job(self, point: Mapping[str, Any]) -> GapJob:
@@ -83,7 +83,7 @@ class GapBase:
 
 @dataclass(frozen=True, eq=False)
 class GapJob:
-    """One search; the campaign is read where it is computed, because it may be large."""
+    """One search. The campaign may be large, so it is read where the point is computed."""
 
     campaign: Path
     digest: str
@@ -92,7 +92,7 @@ class GapJob:
 
     @property
     def inputs(self) -> str:
-        """The samples' hash, the options and the rig file."""
+        """Hash of the samples, the options and the rig file."""
         return self.digest + self.options.model_dump_json() + rig_toml(self.rig)
 
     def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Keys that may vary: those of a file's sections, and the parameters of its rig."""
+"""Keys that may vary: keys of the sections of an input file, and parameters of its rig."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pydantic import BaseModel
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.rig import Rig
 
-# What stands before a parameter's name: its value, or a factor of the rig file's value.
+# Prefixes of a parameter's name: its value, or a factor on the value in the rig file.
 VALUE, FACTOR = "rig.", "rig_factor."
 
 
 def keys_of(model: type[BaseModel], before: str = "") -> dict[str, bool]:
-    """Dotted keys of a file's model; True for a table whose own keys are free, such as parameters_percent."""
+    """Dotted keys of a file's model; True for a table with arbitrary keys, such as parameters_percent."""
     found: dict[str, bool] = {}
     for name, field in model.model_fields.items():
         kinds = [one for one in (field.annotation, *get_args(field.annotation)) if one is not type(None)]
@@ -29,14 +29,14 @@ def keys_of(model: type[BaseModel], before: str = "") -> dict[str, bool]:
 
 
 def parts_of(key: str, known: Mapping[str, bool]) -> list[str]:
-    """The way to a key: a free key ("isolator*.k_z") keeps its dots."""
+    """Split a dotted key; an arbitrary key inside a table ("isolator*.k_z") keeps its dots."""
     for table in (name for name, free in known.items() if free and key.startswith(f"{name}.")):
         return [*table.split("."), key[len(table) + 1:]]
     return key.split(".")
 
 
 def put(table: dict[str, Any], key: str, value: Any, known: Mapping[str, bool]) -> None:
-    """Set a key in a table of tables."""
+    """Set a dotted key in nested tables."""
     *parents, last = parts_of(key, known)
     for name in parents:
         table = table.setdefault(name, {})
@@ -44,9 +44,9 @@ def put(table: dict[str, Any], key: str, value: Any, known: Mapping[str, bool]) 
 
 
 def expanded(key: str, known: Mapping[str, bool], rig: Rig) -> list[str]:
-    """The keys that one with wildcards stands for.
+    """The keys that match a key with wildcards.
 
-    Raises InputError with the nearest keys that there are.
+    Raises InputError with the closest known keys.
     """
     if key in known or any(free and key.startswith(f"{name}.") for name, free in known.items()):
         return [key]

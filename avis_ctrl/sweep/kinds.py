@@ -1,4 +1,4 @@
-"""What a point may be: a design, a skyhook, a gap, a function of the user's own."""
+"""Kinds of points: a design, a skyhook, a gap search, a user function."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from avis_ctrl.sweep.points_file import PointsFile
 
 
 class Base(Protocol):
-    """What the points of a sweep have in common.
+    """The common part of the points of a sweep.
 
-    quantities : labels, with units, of the figures. pareto : the two of the picture, None where nothing is natural.
+    quantities : labels, with units, of the figures. pareto : the two quantities of the plot; None without a natural
+        choice.
     """
 
     @property
@@ -23,15 +24,15 @@ class Base(Protocol):
     def pareto(self) -> tuple[str, str] | None: ...
 
     def expand(self, key: str) -> Sequence[str]:
-        """The keys that a key stands for. Raises InputError for an unknown one."""
+        """The keys that match a key. Raises InputError for an unknown key."""
 
     def job(self, point: Mapping[str, Any]) -> Job:
-        """The base with the values of a point. Raises InputError for one that does not fit."""
+        """The base with the values of a point. Raises InputError for values that do not fit."""
 
 
 def open_base(file: PointsFile, folder: Path) -> Base:
-    """The base of a file of points in a folder. Raises InputError where it does not exist or is wrong."""
-    # Late: a process that computes one kind loads nothing of the others.
+    """The base of a points file in a folder. Raises InputError if it is missing or invalid."""
+    # Late imports: a process that computes one kind does not load the others.
     if file.kind == "gap":
         from avis_ctrl.sweep.gap_points import GapBase
 

@@ -1,4 +1,4 @@
-"""Tasks on the processors of this machine, by joblib."""
+"""Tasks on the processors of this machine, with joblib."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def available() -> int:
 
 
 def on_this_machine(tasks: Sequence[Task], jobs: int) -> Iterator[dict[str, Any]]:
-    """Contents of the points as they are finished, in any order.
+    """Content of each point as it is finished, in any order.
 
-    If a process is killed, the points under way are computed again, each alone; only a point whose process dies then,
-    too, is lost.
+    If a process is killed, the points in progress are computed again, one at a time. A point is lost only if its
+    process is killed a second time.
     """
     if jobs == 1:
         yield from map(perform, tasks)
@@ -52,7 +52,7 @@ def _parallel(tasks: Sequence[Task], jobs: int, handed_out: list[Task]) -> Itera
         for task in tasks:
             handed_out.append(task)
             yield joblib.delayed(_in_worker)(task, os.getpid())
-    # One task at a time to each process, and none before a process is free: what is under way is known.
+    # Each process gets one task at a time, and only when it is free: the tasks in progress are known.
     parallel = joblib.Parallel(jobs, backend="loky", return_as="generator_unordered", batch_size=1,
                                pre_dispatch=jobs, max_nbytes=None)
     yield from parallel(calls())

@@ -1,4 +1,4 @@
-"""Files of a sweep: table, JSON, Pareto picture, a page."""
+"""Files of a sweep: table, JSON, Pareto plot, HTML page."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ FILES = "sweep.csv", "pareto.png", "sweep.html", "sweep.json"
 
 
 def front_of(sweep: Sweep) -> list[int]:
-    """Places of the rows on the Pareto front. Raises InputError for a quantity that no row has."""
+    """Indices of the rows on the Pareto front. Raises InputError for a quantity that no row has."""
     return [] if sweep.pareto is None else pareto_front(_values(sweep)).tolist()
 
 
 def columns(sweep: Sweep) -> tuple[list[str], list[str]]:
-    """Names of what varies and of the figures, in the order of their first row."""
+    """Names of the varied keys and of the figures, in the order in which they first appear."""
     keys = dict.fromkeys(key for row in sweep.rows for key in row.point)
     figures = dict.fromkeys([*sweep.quantities, *(name for row in sweep.rows for name in row.figures)])
     return [*keys], [*figures]
 
 
 def write_sweep(sweep: Sweep, folder: Path) -> list[Path]:
-    """All files or none, sweep.json last. Raises InputError as `front_of`, ComputationError where the disk refuses."""
+    """All files or none, sweep.json last. Raises InputError as `front_of`, ComputationError if the disk is full."""
     front, contents = front_of(sweep), {"sweep.csv": _csv(sweep).encode()}
     drawn = sweep.pareto is not None and bool(front)
     if drawn:
         assert sweep.pareto is not None
-        # Two values of a few points can be read; else a point is the number of its row.
+        # Up to two values are readable as labels of a few points; otherwise the label is the row number.
         in_words = len(front) <= 12 and len(columns(sweep)[0]) <= 2
         names = [", ".join(f"{key.rpartition('.')[2]} {_short(row.point[key])}" for key in row.point)
                  if in_words else str(k + 1) for k, row in enumerate(sweep.rows)]

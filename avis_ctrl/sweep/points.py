@@ -1,4 +1,4 @@
-"""The points of a file: listed points times grid axes times random draws."""
+"""The points of a sweep: listed points times grid axes times random draws."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Point = dict[str, Any]
 class SweepSettings:
     """Limits of a sweep.
 
-    most_points : more are refused, because a grid grows by its product and a slip in the file would fill the disk.
-    patience_s : wait [s] for a scheduler and its first worker; a scheduler's own start takes a few seconds.
-    deaths : processes of a cluster that may die under one point before it counts as their cause (a machine that is
-        switched off is not).
+    most_points : maximum number; a grid grows as a product, and a typing error in the file could fill the disk.
+    patience_s : time [s] to wait for a scheduler and its first worker; a scheduler takes a few seconds to start.
+    deaths : number of cluster processes that may die while computing a point before the point counts as the cause (a
+        process may also die because its machine is switched off).
     """
 
     most_points: int = 20_000
@@ -33,18 +33,18 @@ class SweepSettings:
 
 def points_of(file: PointsFile, expand: Callable[[str], Sequence[str]], settings: SweepSettings = SweepSettings()
               ) -> list[Point]:
-    """Values by key of every point.
+    """All points, each with its values by key.
 
-    The random axes are drawn together, `count` points in all. Draws depend on seed and key only.
+    Random axes are drawn together: `count` draws in total. The draws depend on seed and key only.
 
     Parameters
     ----------
-    expand : the keys that a key with wildcards stands for; raises InputError for an unknown one. Random values are
-        drawn for each of them, those of a list are for all of them.
+    expand : returns the keys that match a key with wildcards; raises InputError for an unknown key. Random values are
+        drawn for each matching key separately; the values of a list apply to all of them.
 
     Raises
     ------
-    InputError : an unknown key, one that varies twice, random axes of different counts, too many points.
+    InputError : an unknown key, a key that varies twice, random axes of different counts, too many points.
     """
     listed = [_flat(point) for point in file.point] or [{}]
     grids = [one for one in file.vary if one.values is not None]
@@ -74,7 +74,7 @@ def _require_single(keys: Sequence[str]) -> None:
 
 
 def _flat(table: dict[str, Any], before: str = "") -> Point:
-    """A listed point: TOML makes tables of keys with dots; a table in quotes or braces at the end is the same."""
+    """Flatten a listed point: TOML reads dotted keys as nested tables; explicit tables are treated the same way."""
     found: Point = {}
     for key, value in table.items():
         found |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
@@ -83,6 +83,6 @@ def _flat(table: dict[str, Any], before: str = "") -> Point:
 
 def _column(axis: VarySection, key: str) -> list[tuple[str, float]]:
     drawn = axis.random
-    assert drawn is not None  # as points_of chose them
+    assert drawn is not None  # points_of passes random axes only
     fractions = np.random.default_rng([drawn.seed, *key.encode()]).random(drawn.count)
     return [(key, drawn.between(float(fraction))) for fraction in fractions]

@@ -1,4 +1,4 @@
-"""The file of points: what is computed, from which base, and which of its keys vary."""
+"""The points file: what is computed, from which base, and which of its keys vary."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avis_ctrl.rigs.file_errors import Section, read_toml, validated
 
 
 class RandomSection(Section):
-    """Values drawn between two ends, evenly ("linear") or evenly in their logarithm ("log")."""
+    """Random values between two limits, uniform on a linear ("linear") or logarithmic ("log") scale."""
 
     count: Annotated[int, Field(ge=1)]
     seed: Annotated[int, Field(ge=0)]
@@ -36,7 +36,7 @@ class RandomSection(Section):
 
 
 class VarySection(Section):
-    """A key and its values: a list, or random ones."""
+    """A key with a list of values or with random values."""
 
     key: Annotated[str, Field(min_length=1)]
     values: Annotated[list[Any], Field(min_length=1)] | None = None
@@ -50,10 +50,10 @@ class VarySection(Section):
 
 
 class PointsFile(Section):
-    """A whole file of points.
+    """A complete points file.
 
-    base : a design file; of kind "gap" a campaign; of kind "function" FILE.py:NAME. rig : of kind "gap" only.
-    pareto : the two quantities of the picture, less of both is better; None for those of the kind.
+    base : a design file; for kind "gap" a campaign; for kind "function" FILE.py:NAME. rig : for kind "gap" only.
+    pareto : the two quantities of the plot, both minimised; None for the default of the kind.
     """
 
     title: str = "sweep"
@@ -66,5 +66,5 @@ class PointsFile(Section):
 
 
 def read_points_file(path: Path) -> PointsFile:
-    """Read and check a file of points. Raises InputError: one line naming file, field, value and what was expected."""
+    """Read and check a points file. Raises InputError: one line naming file, field, value and what was expected."""
     return validated(PointsFile, read_toml(path, "a file of points as in docs/sweep.md"), path)

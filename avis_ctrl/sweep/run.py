@@ -1,4 +1,4 @@
-"""A whole sweep: points, what is finished of them, the rest computed, a table."""
+"""A complete sweep: read the points, reuse the finished ones, compute the others, make a table."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from avis_ctrl.sweep.points_file import PointsFile, read_points_file
 from avis_ctrl.sweep.task import LASTING, Task, identity_of, read_point, save_point
 
 Backend = Callable[[Sequence[Task]], Iterator[dict[str, Any]]]
-# Points finished, of how many, and what is known of the last one.
+# Arguments: number of finished points, number of all points, message about the last one.
 Progress = Callable[[int, int, str], None]
 POINTS = "points"
 
 
 @dataclass(frozen=True)
 class Row:
-    """A point of the table. status : done, failed (the message says why), lost (computed again next time)."""
+    """A point of the table. status : done, failed (reason in the message), lost (computed again in the next run)."""
 
     identity: str
     point: Point
@@ -37,10 +37,10 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """All rows in the order of the file of points.
+    """All rows in the order of the points file.
 
-    quantities : labels of the figures. pareto : the two of the picture; None where there are none. computed : points
-    that this run computed, the others were there.
+    quantities : labels of the figures. pareto : the two quantities of the plot, or None. computed : number of points
+        computed in this run; the others were finished before.
     """
 
     file: PointsFile
@@ -53,7 +53,7 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A checked file of points: a task for each of them, or why there is none."""
+    """A checked points file: a task for each point, or the error that prevents it."""
 
     path: Path
     file: PointsFile
@@ -63,11 +63,11 @@ class Plan:
 
 
 def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) -> Plan:
-    """Check a file of points before anything is computed or written.
+    """Check a points file before anything is computed or written.
 
     Raises
     ------
-    InputError : a file, a base or a key that is wrong; values with which no point at all can be made.
+    InputError : an invalid file, base or key; values from which not a single point can be made.
     """
     file = read_points_file(path)
     try:
@@ -99,10 +99,10 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
 
 def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks, 1),
               progress: Progress = lambda done, total, text: None) -> Sweep:
-    """Compute the points that are not finished, each into its file, and gather all.
+    """Compute the unfinished points, each into its file, and collect all points.
 
-    The folder of the points must exist. After a kill at any moment the same call goes on with the points that are not
-    finished.
+    The folder of the points must exist. If the process is killed at any time, the same call continues with the
+    unfinished points.
 
     Raises
     ------

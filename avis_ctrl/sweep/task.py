@@ -1,4 +1,4 @@
-"""One point as a task: computed anywhere, kept as one whole file, never computed again once that is there."""
+"""One point as a task: it can run anywhere, its result is one file, and it is computed only if the file is missing."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ from avis_ctrl.study.workers import alone
 from avis_ctrl.sweep.job import Job
 
 FORMAT = "avis-sweep-point"
-# Computed and kept; a process that died, a full disk or memory, a missing library may go better next time.
+# Status of results that are kept. A lost point (a process that died, a full disk or memory, a missing library) may
+# succeed in the next run.
 LASTING = ("done", "failed")
-# The kernels keep state in their modules: a cluster's process with several threads computes one point at a time.
+# The kernels keep module-level state: a cluster process with several threads computes one point at a time.
 _one_at_a_time = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A point to compute. folder : of the points' files, as the machine that began the sweep names it."""
+    """A point to compute. folder : folder of the point files, as named by the machine that started the sweep."""
 
     identity: str
     folder: Path
@@ -40,21 +41,21 @@ class Task:
 
 
 def identity_of(kind: str, inputs: str) -> str:
-    """SHA-256 of all that a result depends on: kind, inputs, version of the package."""
+    """SHA-256 of everything that a result depends on: kind, inputs, version of the package."""
     return hashlib.sha256("\n".join((kind, avis_ctrl.__version__, inputs)).encode()).hexdigest()
 
 
 def perform(task: Task) -> dict[str, Any]:
-    """Content of the point's file, which is written before this returns where its folder is within reach.
+    """Compute a point and return the content of its file. The file is written first if its folder can be reached.
 
-    What goes wrong is the content's message; nothing is raised.
+    Errors become the message of the content; nothing is raised.
     """
     with _one_at_a_time:
         if (kept := read_point(task.folder, task.identity)) is not None:
             return kept
         content = _computed(task)
         if content["status"] in LASTING and task.folder.is_dir():
-            with contextlib.suppress(AvisError):  # whoever began the sweep tries, too, and says so
+            with contextlib.suppress(AvisError):  # the process that started the sweep also tries, and reports the error
                 save_point(task.folder, content)
         return content
 
@@ -75,12 +76,12 @@ def _computed(task: Task) -> dict[str, Any]:
         return lost(task, f"{type(error).__name__}: {_one_line(error)}")
     except Exception as error:
         status, message = "failed", f"{type(error).__name__}: {_one_line(error)}"
-    # Through the file's form, so that a figure is the same whether it was read or computed.
+    # Round trip through JSON: a computed figure equals one that was read.
     return json.loads(as_json(_content(task, status, message, time.monotonic() - began, figures) | details))
 
 
 def lost(task: Task, message: str) -> dict[str, Any]:
-    """Content of a point that could not be computed for a reason that is not the point's."""
+    """Content of a point that could not be computed for a reason unrelated to the point."""
     return _content(task, "lost", message, None, {})
 
 
@@ -97,7 +98,7 @@ def point_path(folder: Path, identity: str) -> Path:
 
 
 def read_point(folder: Path, identity: str) -> dict[str, Any] | None:
-    """Content of a finished point; None where there is none, or a file that is none."""
+    """Content of a finished point; None if the file is missing or invalid."""
     try:
         content = json.loads(point_path(folder, identity).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -108,7 +109,7 @@ def read_point(folder: Path, identity: str) -> dict[str, Any] | None:
 
 
 def save_point(folder: Path, content: dict[str, Any]) -> None:
-    """Write a point's file whole, unless it is there. Raises ComputationError where the disk is full."""
+    """Write a point's file, unless it exists. Raises ComputationError if the disk is full."""
     if read_point(folder, content["identity"]) is None:
         write_whole(point_path(folder, content["identity"]), as_json(content))
 

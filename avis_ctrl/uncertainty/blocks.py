@@ -1,7 +1,7 @@
-"""Blocks of a structured perturbation Delta, mapping z_delta to w_delta: w_delta = Delta z_delta.
+"""Blocks of a structured perturbation Delta, w_delta = Delta z_delta.
 
-A block of r rows and c columns takes c entries of z_delta and gives r entries of w_delta, so that
-the matrix M seen by Delta (z_delta = M w_delta) has sum(cols) rows and sum(rows) columns.
+A block with r rows and c columns maps c entries of z_delta to r entries of w_delta, so that the
+matrix M connected to Delta (z_delta = M w_delta) has sum(cols) rows and sum(rows) columns.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Block:
 
     @property
     def repeated(self) -> bool:
-        """delta I with more than one copy: its scaling is a full matrix."""
+        """Whether the block is delta I with more than one copy, so that its scaling is a full matrix."""
         return self.kind != "full" and self.rows > 1
 
     @property
@@ -41,7 +41,7 @@ class Block:
         return self.kind != "full"
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract's JSON form."""
+        """JSON form, as in docs/contracts/design.md."""
         return {"kind": self.kind, "rows": self.rows, "cols": self.cols, "name": self.name}
 
 
@@ -61,7 +61,7 @@ class RealScalar(Block):
 
 
 class ComplexScalar(Block):
-    """delta I_n with delta complex: one neglected dynamic that acts n times.
+    """delta I_n with delta complex: one scalar of neglected dynamics, repeated n times.
 
     Examples
     --------
@@ -90,15 +90,15 @@ class ComplexFull(Block):
         super().__init__(rows, rows if cols is None else cols, name)
 
 
-# From so many blocks on, full scalings (matrices of repeated blocks, numbers for real ones) cost more than they gain at
-# most frequencies: 20 ms a matrix with one number a block, 37 ms with full ones (34 blocks, 47 signals); 24 and 142 ms
-# where blocks of up to six rows are repeated (23 blocks, 49 signals).
+# Number of blocks above which full scalings (matrices for repeated blocks, G for real blocks) cost more than they gain
+# at most frequencies: 20 ms per matrix with one number per block, 37 ms with full scalings (34 blocks, 47 signals); 24
+# and 142 ms if blocks of up to six rows are repeated (23 blocks, 49 signals).
 MANY = 16
 
 
 @dataclass(frozen=True)
 class BlockStructure:
-    """The blocks of Delta in order, with their places in z_delta and w_delta.
+    """The blocks of Delta in order, with their positions in z_delta and w_delta.
 
     Examples
     --------
@@ -111,7 +111,7 @@ class BlockStructure:
 
     @staticmethod
     def of(blocks: BlockStructure | Sequence[Block]) -> BlockStructure:
-        """From any sequence of blocks; an InputError where something else is in it."""
+        """From any sequence of blocks; InputError for anything else."""
         if isinstance(blocks, BlockStructure):
             return blocks
         blocks = (blocks,) if isinstance(blocks, Block) else tuple(blocks)
@@ -122,7 +122,7 @@ class BlockStructure:
 
     @staticmethod
     def from_dicts(items: Sequence[Mapping[str, Any]]) -> BlockStructure:
-        """From the contract's JSON form."""
+        """From the JSON form of `Block.as_dict`."""
         made: list[Block] = []
         for item in items:
             if not isinstance(item, Mapping):
@@ -148,14 +148,14 @@ class BlockStructure:
         return sum(block.cols for block in self.blocks)
 
     def slices(self) -> Iterator[tuple[Block, slice, slice]]:
-        """(block, its rows of Delta i.e. place in w_delta, its columns i.e. place in z_delta)."""
+        """(block, its rows of Delta, a slice of w_delta, and its columns, a slice of z_delta)."""
         w = z = 0
         for block in self.blocks:
             yield block, slice(w, w + block.rows), slice(z, z + block.cols)
             w, z = w + block.rows, z + block.cols
 
     def with_performance(self, n_w: int, n_z: int) -> BlockStructure:
-        """These blocks followed by a full performance block that closes n_z outputs z onto n_w inputs w."""
+        """These blocks followed by a full performance block from n_z outputs z to n_w inputs w."""
         return BlockStructure((*self.blocks, ComplexFull(n_w, n_z, "performance")))
 
     def complexified(self) -> BlockStructure:
@@ -164,17 +164,17 @@ class BlockStructure:
 
     @property
     def many(self) -> bool:
-        """Whether there are so many blocks that scalings are first sought with one number for each."""
+        """Whether there are so many blocks that scalings with one number per block are tried first."""
         return len(self.blocks) >= MANY
 
     def simplified(self) -> BlockStructure:
-        """Complexified, and every repeated scalar replaced by a full block: a superset of perturbations, whose scalings
-        are one number a block and real."""
+        """Complexified, with every repeated scalar replaced by a full block: a superset of perturbations, with one real
+        number per block as scaling."""
         return BlockStructure(tuple(ComplexFull(b.rows, b.cols, b.name) if b.repeated else b
                                     for b in self.complexified().blocks))
 
     def assemble(self, values: Sequence[complex | np.ndarray]) -> np.ndarray:
-        """Delta (n_w, n_z) from one value a block: a number for scalars, an array for full blocks."""
+        """Delta (n_w, n_z) from one value per block: a number for scalars, an array for full blocks."""
         delta = np.zeros((self.n_w, self.n_z), complex)
         for value, (block, w, z) in zip(values, self.slices(), strict=True):
             delta[w, z] = np.eye(block.rows) * value if block.is_scalar_delta else value
@@ -186,7 +186,7 @@ class BlockStructure:
                 for block, w, z in self.slices()]
 
     def contains(self, delta: np.ndarray, tolerance: float = 1e-9) -> bool:
-        """Whether a matrix has this structure (zero outside, repeated, real where it must be)."""
+        """Whether a matrix has this structure (zero outside the blocks, repeated, real where required)."""
         if delta.shape != (self.n_w, self.n_z):
             return False
         rebuilt = self.assemble([np.real(v) if b.kind == "real" else v
@@ -195,7 +195,7 @@ class BlockStructure:
         return bool(error <= tolerance * max(1.0, np.max(np.abs(delta), initial=0.0)))
 
     def random(self, rng: np.random.Generator, norm: float = 1.0, real: bool = False) -> np.ndarray:
-        """A random Delta whose largest block norm is at most `norm` (real=True: without phases)."""
+        """A random Delta whose largest block norm is at most `norm` (real=True: with real entries)."""
         values: list[complex | np.ndarray] = []
         for block in self.blocks:
             if block.kind == "full":

@@ -1,6 +1,6 @@
-"""What can be uncertain: real parameters, complex numbers in a disk, dynamics of bounded size.
+"""Uncertain elements: real parameters, complex numbers in a disk, dynamics of bounded norm.
 
-Each is an LFT in a normalised delta, |delta| <= 1 (or a matrix Delta of norm at most 1), with delta = 0 at its nominal
+Each is an LFT in a normalised delta, |delta| <= 1 (or a matrix Delta of norm at most 1); delta = 0 is the nominal
 value.
 """
 
@@ -16,7 +16,7 @@ from avis_ctrl.uncertainty.blocks import Block, ComplexFull, ComplexScalar, Real
 
 @dataclass(frozen=True)
 class Element:
-    """Something uncertain, by name. rows, cols : of one copy of its Delta."""
+    """An uncertain element with a name. rows, cols : size of one copy of its Delta."""
 
     name: str
     rows: int = 1
@@ -28,11 +28,11 @@ class Element:
 
     @property
     def scalar(self) -> bool:
-        """Whether copies of it make a block delta I."""
+        """Whether its copies form a block delta I."""
         return self.rows == self.cols == 1
 
     def block(self, copies: int) -> Block:
-        """The block of so many copies."""
+        """The block of a number of copies."""
         return ComplexScalar(copies, self.name)
 
 
@@ -55,7 +55,7 @@ class RealParameter(Element):
 
     @property
     def skew(self) -> float:
-        """a of value = (nominal + b delta)/(1 + a delta); 0 where the range is symmetric."""
+        """a in value = (nominal + b delta)/(1 + a delta); 0 for a symmetric range."""
         width = self.high - self.low
         skew = (2 * self.nominal - self.high - self.low) / width
         return skew if abs(skew) > 1e-14 * (abs(self.high) + abs(self.low)) / width else 0.0
@@ -64,7 +64,7 @@ class RealParameter(Element):
         """(2, 2): value = F_u of this matrix and delta."""
         a = self.skew
         b = self.high + a * self.high - self.nominal
-        # n + (b - n a) delta/(1 + a delta); both channels of one size.
+        # n + (b - n a) delta/(1 + a delta); both channels get the same size.
         change = b - self.nominal * a
         size = np.sqrt(abs(change))
         return np.array([[-a, np.sign(change) * size], [size, self.nominal]])

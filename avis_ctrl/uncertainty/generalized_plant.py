@@ -1,16 +1,16 @@
 r"""The generalized plant, assembled by signal name.
 
                  +-----------+
-     z_delta <---|           |<--- w_delta        Delta: what the model does not know
+     z_delta <---|           |<--- w_delta        Delta: uncertainty of the model
                  |           |
-           z <---|     P     |<--- w              what is asked of the loop
+           z <---|     P     |<--- w              performance of the loop
                  |           |
         +-- y <--|           |<--- u <--+
         |        +-----------+          |
         +------------> K ---------------+         u = K y (positive feedback)
 
-A `Diagram` collects parts whose inputs and outputs carry signal names; it knows which signals are
-w_delta/z_delta (they come with an uncertainty block), w, z, u and y. Nothing is ever found by index.
+A `Diagram` collects parts whose inputs and outputs have signal names. It records which signals are
+w_delta/z_delta (declared with an uncertainty block), w, z, u and y. Signals are found by name only, not by index.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Role = Literal["w", "z", "u", "y"]
 
 @dataclass(frozen=True)
 class Signal:
-    """A line of the connection table."""
+    """A row of the connection table."""
 
     name: str
     meaning: str
@@ -47,12 +47,12 @@ class GeneralizedPlant:
 
     Attributes
     ----------
-    P : StateSpace, signals named.
+    P : StateSpace with named signals.
     blocks : uncertainty blocks in the order of w_delta.
     w, z, u, y : names of the remaining signals.
     signals : the connection table.
-    parts : (name, kind) of each part with its system, for the drawn block diagram.
-    units : unit of each signal where known.
+    parts : the parts with their systems, for the block diagram.
+    units : unit of each signal, if known.
     """
 
     P: StateSpace
@@ -79,21 +79,21 @@ class GeneralizedPlant:
         return self.blocks.with_performance(len(self.w), len(self.z))
 
     def closed(self, K: StateSpace | None) -> StateSpace:
-        """N = F_l(P, K); without a controller, P with its actuators at rest (u = 0)."""
+        """N = F_l(P, K); without a controller, P with u = 0."""
         outputs, inputs = self.P.outputs[:self.P.noutputs - self.nmeas], self.P.inputs[:self.P.ninputs - self.ncon]
         if K is None:
             return self.P.select(list(outputs), list(inputs))
         return lft_lower(self.P, K)
 
     def restricted(self, w: Sequence[str], z: Sequence[str]) -> GeneralizedPlant:
-        """The same connection with fewer performance signals; parts that no output depends on are left out."""
+        """The same connection with fewer performance signals; parts that no output depends on are omitted."""
         if unknown := [name for name in (*w, *z) if name not in (*self.w, *self.z)]:
             raise InputError(f"the performance signals are {[*self.w, *self.z]}", field="w, z", value=unknown)
         w_delta = self.P.inputs[:self.blocks.n_w]
         z_delta = self.P.outputs[:self.blocks.n_z]
         parts = _contributing(self.parts, [*z_delta, *z, *self.y])
         inputs, outputs = [*w_delta, *w, *self.u], [*z_delta, *z, *self.y]
-        # An input that is left out is at rest.
+        # An omitted input is zero.
         absent = [name for name in self.w if name not in w]
         systems = {p.name: p.system.select(None, [n for n in p.system.inputs if n not in absent]) for p in parts}
         kept = {name for part in parts for name in (*part.system.inputs, *part.system.outputs)}
@@ -102,12 +102,12 @@ class GeneralizedPlant:
                                 signals, parts, self.units)
 
     def nominal(self) -> GeneralizedPlant:
-        """The plant with Delta = 0: w_delta and z_delta left out."""
+        """The plant with Delta = 0, without w_delta and z_delta."""
         P = self.P.select(slice(self.blocks.n_z, None), slice(self.blocks.n_w, None))
         return replace(self, P=P, blocks=BlockStructure(()))
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract's avis-plant JSON form."""
+        """JSON form of the format avis-plant (docs/contracts/design.md)."""
         P = self.P
         return {"format": "avis-plant", "version": 1, "A": P.A.tolist(), "B": P.B.tolist(), "C": P.C.tolist(),
                 "D": P.D.tolist(), "dt": P.dt, "inputs": list(P.inputs), "outputs": list(P.outputs),
@@ -125,7 +125,7 @@ class Part:
 
 
 def _contributing(parts: Sequence[Part], outputs: Sequence[str]) -> tuple[Part, ...]:
-    """The parts that the outputs depend on, directly or through others, in their order."""
+    """The parts that the outputs depend on, directly or through other parts, in their order."""
     maker = {name: part for part in parts for name in part.system.outputs}
     needed: set[str] = set()
     frontier = [name for name in outputs if name in maker]
@@ -138,7 +138,7 @@ def _contributing(parts: Sequence[Part], outputs: Sequence[str]) -> tuple[Part, 
 
 
 class Diagram:
-    """Collects parts and signals, then closes the connection.
+    """Collection of parts and named signals, from which the generalized plant is built.
 
     >>> diagram = Diagram()
     >>> diagram.add("rig", rig_system, kind="rig")
@@ -152,20 +152,20 @@ class Diagram:
         self._meaning: dict[str, tuple[str, str]] = {}
 
     def add(self, name: str, system: StateSpace, kind: str = "system") -> None:
-        """Add a part; its inputs read, and its outputs drive, the signals of those names."""
+        """Add a part; its inputs read and its outputs drive the signals of the same names."""
         if any(part.name == name for part in self._parts):
             raise InputError("two parts of this name", field="diagram", value=name)
         self._parts.append(Part(name, kind, system))
 
     def uncertain(self, block: Block, w: Sequence[str], z: Sequence[str]) -> None:
-        """Declare that `block` closes the signals z onto the signals w."""
+        """Declare that `block` maps the signals z to the signals w."""
         if (len(w), len(z)) != (block.rows, block.cols):
             raise InputError(f"block of {block.rows} x {block.cols} given {len(w)} w and {len(z)} z signals",
                              field="uncertainty", value=block.name)
         self._blocks.append((block, list(w), list(z)))
 
     def means(self, signal: str, meaning: str, unit: str) -> None:
-        """Say what a signal is, for the table of the report."""
+        """State meaning and unit of a signal, for the table of the report."""
         self._meaning[signal] = (meaning, unit)
 
     def plant(self, w: Sequence[str], z: Sequence[str], u: Sequence[str], y: Sequence[str]) -> GeneralizedPlant:
@@ -173,7 +173,7 @@ class Diagram:
 
         Raises
         ------
-        InputError : a signal driven twice, driven by nothing, or made but read by nobody.
+        InputError : a signal that is driven twice or not at all, or that is driven but not read.
         """
         parts = {part.name: part.system for part in self._parts}
         w_delta = [name for _, names, _ in self._blocks for name in names]

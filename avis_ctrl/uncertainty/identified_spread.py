@@ -15,28 +15,28 @@ from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 POINTS_PER_OCTAVE = 8
-# How far beyond the data (and a declared crossover) the filter is asked to follow.
+# Factor in frequency by which the fit extends beyond the data (and beyond a declared crossover).
 REACH = 10.0
-# Steepest envelope first; a flatter one where no filter of its order follows.
+# Slopes of the envelope and maximum orders: the flatter envelope is used if order 6 cannot follow the steep one.
 SLOPES, ORDERS = (2.0, 1.0), (6, 12)
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedSpread(Weight):
-    """Relative error of a model's response: covers the data, and what is declared beyond them.
+    """Relative error of a model's response: covers the measured data and a declared uncertainty.
 
-    The envelope is the smallest curve above the data that changes by no more than `slope` decades a decade, and above
-    `declared`; outside the measured band it keeps the value at the band's end. The filter is the one of
-    lowest order that lies above the envelope by no more than `tolerance_dB`.
+    The envelope is the smallest curve above the data with slopes of at most `slope` decades per decade, constant
+    outside the measured band, or `declared` where that is larger. The filter has the lowest order with which it is
+    above the envelope by at most `tolerance_dB`.
 
     Parameters
     ----------
-    omega, data : (n,) rad/s and the relative spread there.
-    declared : the user's own relative uncertainty at every frequency, times `factor`; None for none.
+    omega, data : (n,) frequencies [rad/s] and relative spread.
+    declared : relative uncertainty stated by the user, multiplied by `factor`; None for none.
 
     Raises
     ------
-    InputError : data that are not positive, finite and increasing in frequency.
+    InputError : data or frequencies that are not positive and finite, frequencies that do not increase.
     """
 
     omega: np.ndarray
@@ -62,7 +62,7 @@ class IdentifiedSpread(Weight):
 
     @cached_property
     def grid(self) -> np.ndarray:
-        """Frequencies [rad/s] of the fit: the data's own, and a decade on either side, further to a crossover."""
+        """Frequencies [rad/s] of the fit: those of the data and a decade on either side, or beyond a crossover."""
         low, high = self.omega[0] / REACH, self.omega[-1] * REACH
         if self.declared is not None:
             high = max(high, 2 * np.pi * self.declared.crossover_Hz * REACH)
@@ -71,7 +71,7 @@ class IdentifiedSpread(Weight):
         return np.sort(np.concatenate([even[apart], self.omega]))
 
     def envelope(self, omega: np.ndarray) -> np.ndarray:
-        """What the filter has to cover, at any frequencies [rad/s]."""
+        """The curve that the filter has to cover, at the frequencies omega [rad/s]."""
         omega = np.asarray(omega, float)
         inside = np.log(np.clip(omega, self.omega[0], self.omega[-1]))
         fall = self.slope * np.abs(inside[:, None] - np.log(self.omega))
@@ -85,7 +85,7 @@ class IdentifiedSpread(Weight):
 
     @cached_property
     def slack_dB(self) -> float:
-        """Largest excess of the filter over the envelope."""
+        """Maximum excess of the filter over the envelope."""
         return float(20 * np.max(np.log10(self.shape.magnitude(self.grid) / self.envelope(self.grid))))
 
     @property
@@ -101,11 +101,11 @@ class IdentifiedSpread(Weight):
 
 def covering_spread(omega: np.ndarray, data: np.ndarray, declared: NeglectedDynamics | None = None,
                     factor: float = 1.0) -> IdentifiedSpread:
-    """The filter over an envelope of 40 dB a decade where order 6 follows it, otherwise over one of 20 dB a decade.
+    """Filter above an envelope with slopes of 40 dB per decade if order 6 suffices, otherwise of 20 dB per decade.
 
     Raises
     ------
-    InputError : as `IdentifiedSpread`. ComputationError : order 12 does not cover the flatter one either.
+    InputError : as `IdentifiedSpread`. ComputationError : order 12 does not suffice for the flatter envelope.
     """
     steep, flat = (IdentifiedSpread(omega, data, declared, factor, slope, max_order=order)
                    for slope, order in zip(SLOPES, ORDERS, strict=True))

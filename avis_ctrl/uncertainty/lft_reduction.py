@@ -1,10 +1,10 @@
-"""Fewer copies of each repeated scalar in an LFT, without changing it.
+"""Exact reduction of the number of copies of repeated scalars in an LFT.
 
-M with blocks delta_k I is a realisation in several parameters, delta_k in place of 1/s. Directions of a block that no
-input reaches, directly or through the other blocks, and then those that no output sees, are removed: the
-Kalman decomposition with one subspace a block (D'Andrea and Khatri 1997, Kalman decomposition of linear fractional
-transformation representations and minimality). The result is exact, and minimal as long as products of
-different parameters are not exchanged.
+M with blocks delta_k I is a multidimensional realisation, with delta_k in place of 1/s. In each block, directions that
+cannot be reached from an input (directly or through other blocks) and then directions that cannot be observed at an
+output are removed: the Kalman decomposition with one subspace per block (D'Andrea and Khatri 1997, Kalman decomposition
+of linear fractional transformation representations and minimality). The result is exact, and minimal for parameters
+that do not commute.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from avis_ctrl.lti.statespace import StateSpace
 
 
 def reduce_copies(M: np.ndarray, sizes: list[int], tolerance: float = 1e-10) -> tuple[np.ndarray, list[int]]:
-    """M (n_delta + p, n_delta + m) with leading square blocks of the given sizes -> the same LFT, smaller blocks."""
+    """M (n_delta + p, n_delta + m) with leading square blocks of these sizes -> the same LFT with smaller blocks."""
     n = sum(sizes)
     # Diagonal scalings of the copies commute with Delta.
     system = balance(StateSpace(M[:n, :n], M[:n, n:], M[n:, :n], M[n:, n:]))
     A, B, C = system.A, system.B, system.C
-    # Relative to the LFT as given: what is left of an output that sees nothing is round-off, not a direction.
+    # Limits relative to the given LFT, so that the round-off of a vanishing output is not taken for a direction.
     size = float(np.linalg.norm(A, 2)) if n else 0.0
     limits = [tolerance * max(size, float(np.linalg.norm(one, 2)) if one.size else 0.0) for one in (B, C)]
     V, reached = _reached(A, B, sizes, limits[0])
@@ -35,9 +35,9 @@ def reduce_copies(M: np.ndarray, sizes: list[int], tolerance: float = 1e-10) -> 
 
 
 def _reached(A: np.ndarray, B: np.ndarray, sizes: list[int], limit: float) -> tuple[np.ndarray, list[int]]:
-    """Orthonormal block-diagonal V, smallest with range B and A V inside, and its number of columns a block.
+    """Smallest orthonormal block-diagonal V whose range contains B and A V, and its number of columns per block.
 
-    limit : singular value up to which a direction counts as round-off.
+    limit : singular values up to this limit are round-off.
     """
     ends = [0, *np.cumsum(sizes)]
     blocks = [slice(start, stop) for start, stop in pairwise(ends)]

@@ -1,9 +1,9 @@
-"""Exact polynomial dependence of a matrix on normalised parameters, found by evaluating it.
+"""Exact polynomial dependence of a matrix on normalised parameters, found by evaluation.
 
 The matrices of a rig are polynomials of low degree in its physical parameters (stiffness enters K
-linearly, a load's position enters M quadratically, its mass multiplies both). Reading the
-coefficients off the rig's own equations keeps one source of truth: there is no second, hand-written
-list of derivatives that could disagree with the model.
+linearly, a load's position enters M quadratically, its mass multiplies both). The coefficients are
+computed from the rig's equations, so that there is no second, hand-written list of derivatives that
+could disagree with the model.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from avis_ctrl.errors import ComputationError
 
 Exponents = tuple[int, ...]
 MatrixFunction = Callable[[np.ndarray], np.ndarray]
-# Share of an entry below which a coefficient is round-off: a few hundred operations make an entry.
+# Fraction of an entry below which a coefficient is round-off, since an entry takes a few hundred operations.
 ROUND_OFF = 1e3 * np.finfo(float).eps
 
 
@@ -25,13 +25,13 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
                             seed: int = 0, cubic: bool = False) -> dict[Exponents, np.ndarray]:
     """Coefficients N_a of function(delta) = sum_a delta^a N_a, delta in [-1, 1]^n.
 
-    Exponents go up to 2 in one parameter (3 where `cubic`: one that moves a mass and its position) and to 3 in all.
-    Entries smaller than `tolerance` times the largest variation, or than the round-off of the function itself, are set
-    to zero. A fresh random sample checks the result.
+    The degree is at most 2 in one parameter (3 if `cubic`, for a parameter that moves a mass and its position) and at
+    most 3 in total. Entries smaller than `tolerance` times their largest variation, or than the round-off of the
+    function, are set to zero. The result is checked at new random samples.
 
     Raises
     ------
-    ComputationError : the function is not such a polynomial (error measured).
+    ComputationError : the function is not such a polynomial; the message states the error.
     """
     base = function(np.zeros(n))
     if n == 0:
@@ -42,9 +42,9 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
     powers = np.stack([np.prod(samples ** np.array(a), axis=1) for a in monomials], axis=1)
     values = np.stack([function(delta) - base for delta in samples])
     coefficients, *_ = np.linalg.lstsq(powers, values.reshape(len(samples), -1), rcond=None)
-    # Each entry has its own unit: compare with the largest variation of that entry's row and column kind.
+    # Each entry has its own unit, so it is compared with its own largest variation.
     size = np.max(np.abs(values), axis=0)
-    # An entry that hardly varies has the round-off of all that it is made of, which would pass for a dependence.
+    # For an entry that hardly varies, the round-off of its terms would be taken for a dependence.
     least = np.maximum(tolerance * size, ROUND_OFF * np.abs(base))
     found = {(0,) * n: base}
     for exponents, coefficient in zip(monomials, coefficients, strict=True):
@@ -58,7 +58,7 @@ def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float =
 
 def _monomials(function: MatrixFunction, n: int, base: np.ndarray, highest: int) -> list[Exponents]:
     """Exponents that may occur: single parameters, and products of those that interact."""
-    # About a generic point: at zero a product of three parameters would hide that any two of them interact.
+    # About a generic point: at zero, a product of three parameters would not show that any two of them interact.
     origin = np.random.default_rng(n).uniform(0.2, 0.6, n)
 
     def moved(*which: int) -> np.ndarray:

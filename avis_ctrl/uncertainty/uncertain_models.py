@@ -1,4 +1,4 @@
-"""What uncertain systems are made of: numbers, disks, dynamics, matrices, state space, connections by name."""
+"""Construction of uncertain systems: numbers, disks, dynamics, matrices, state space, connection by name."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from avis_ctrl.uncertainty.uncertain_system import (
 def real(name: str, nominal: float, *, percent: float | tuple[float, float] | None = None,
          plus_minus: float | tuple[float, float] | None = None, range: tuple[float, float] | None = None
          ) -> UncertainSystem:
-    """An uncertain real number: exactly one of percent, plus_minus and range.
+    """An uncertain real number, given by exactly one of percent, plus_minus and range.
 
     percent, plus_minus : half the range, relative or absolute; a pair is (below, above). range : (low, high).
-    Where the range is not symmetric about the nominal value, delta = 0 is still the nominal value.
+    If the range is not symmetric about the nominal value, delta = 0 is still the nominal value.
 
     Raises InputError for a range that does not contain the nominal value.
 
@@ -71,8 +71,8 @@ def complex_disk(name: str, centre: float = 0.0, radius: float = 1.0) -> Uncerta
 def dynamics(name: str, weight: Any = 1.0, shape: tuple[int, int] = (1, 1)) -> UncertainSystem:
     """Unknown stable dynamics W(s) Delta(s) with a Delta of H-infinity norm at most 1.
 
-    weight : W, of one output or as many as shape[0]: a number, a system, or a filter of `uncertainty_weight`.
-    shape : (outputs, inputs) of Delta. A chain with 20 % to 300 %: G * (1 + dynamics("chain", W)).
+    weight : W, scalar or square with shape[0] outputs: a number, a system, or a result of `uncertainty_weight`.
+    shape : (outputs, inputs) of Delta. A channel with 20 % to 300 % uncertainty: G * (1 + dynamics("chain", W)).
 
     Raises InputError for a weight that does not fit, or is not stable.
 
@@ -122,8 +122,8 @@ def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequen
        outputs: Sequence[str] = ()) -> Any:
     """A system x' = A x + B u, y = C x + D u whose matrices may have uncertain entries; D zero by default.
 
-    Each matrix is an array, nested lists with uncertain numbers, or of `matrix`. A StateSpace where nothing is
-    uncertain, otherwise an `UncertainSystem`. dt : sample time [s], 0 for continuous time.
+    Each matrix is an array, nested lists with uncertain numbers, or a result of `matrix`. Returns a StateSpace if
+    nothing is uncertain, otherwise an `UncertainSystem`. dt : sample time [s], 0 for continuous time.
 
     Raises InputError for shapes that do not fit.
 
@@ -154,19 +154,19 @@ def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequen
 
 
 def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], outputs: Sequence[str]) -> Any:
-    """Interconnect parts through the signals that share a name: certain, uncertain, or of python-control.
+    """Interconnect certain, uncertain or python-control systems through signals of the same name.
 
-    Returns a StateSpace, or an UncertainSystem where a part is uncertain.
+    Returns a StateSpace, or an UncertainSystem if a part is uncertain.
 
     Parameters
     ----------
     parts : systems; a dict names them in error messages.
     inputs : external signals.
-    outputs : signals to bring out.
+    outputs : signals that become outputs.
 
     Raises
     ------
-    InputError : a signal driven twice or by nothing. ComputationError : an algebraic loop.
+    InputError : a signal that is driven twice or not at all. ComputationError : an algebraic loop.
 
     Examples
     --------
@@ -202,7 +202,7 @@ def of_element(element: Element, lft: np.ndarray) -> UncertainSystem:
 
 
 def _matrix(given: Any) -> UncertainSystem:
-    """An uncertain matrix without states; two dimensions, or a single number."""
+    """An uncertain matrix without states, from a two-dimensional array or a single number."""
     if isinstance(given, np.ndarray) and given.dtype != object:
         made = as_uncertain(given) if given.ndim in (0, 2) else None
     else:

@@ -7,11 +7,11 @@ chassis motion kept) need neither a derivative nor an integral of the floor moti
     r' = v - v_f
     M(delta) v' + C(delta) (v - v_f) + K(delta) r - T(delta) u = f
 
-so that one matrix N(delta) = [M, C, K, -T], acting on s = (v', v - v_f, r, u), holds all that is uncertain.
-Each monomial delta^a of its polynomial is factored into L_a R_a of minimal rank and pulled out: z = R_a s,
-w = delta z, force -L_a w. No inverse of M is expanded, hence no approximation: closing the loop with any
-delta gives the rig rebuilt with the perturbed parameters. Floor and payload velocities have the ratio of the
-displacements, so transmissibility is read from v_f to v.
+so that one matrix N(delta) = [M, C, K, -T], acting on s = (v', v - v_f, r, u), contains all uncertainty.
+The coefficient of each monomial delta^a of its polynomial is factored into L_a R_a of minimal rank and pulled
+out: z = R_a s, w = delta z, force -L_a w. No inverse of M is expanded, so there is no approximation: the loop
+closed with any delta is the rig with the perturbed parameters. The velocities of payload and floor have the
+same ratio as the displacements, so the transmissibility is the response from v_f to v.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from avis_ctrl.uncertainty.polynomial import Exponents, polynomial_coefficients
 
 
 class Rig(Protocol):
-    """What this module needs of a rig."""
+    """Interface of a rig that this module requires."""
 
     @property
     def edge_m(self) -> float: ...
@@ -62,11 +62,11 @@ class UncertainParameter:
         return self.spread if self.absolute else self.spread * abs(nominal)
 
     def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
-        """What delta = 1 adds to each parameter that it moves, in the parameters' units."""
+        """Change of each affected parameter at delta = 1, in the parameter's unit."""
         return {self.name: self.half_range(nominal[self.name])}
 
     def describe(self, delta: float, nominal: float, unit: str = "") -> str:
-        """A value of delta in physical words: "isolator2.k_z at +15 %"."""
+        """A value of delta in physical terms: "isolator2.k_z at +15 %"."""
         if self.absolute:
             return f"{self.name} at {nominal + delta * self.spread:.4g} {unit}".rstrip()
         return f"{self.name} at {100 * delta * self.spread:+.3g} %"
@@ -76,15 +76,15 @@ class UncertainParameter:
         return self.describe(delta, nominal[self.name], units[self.name])
 
 
-# Parameters that a direction moves least are left out of its words; the numbers keep all of them.
+# Maximum number of parameters in the description of a direction; the model contains all of them.
 WORDS = 4
 
 
 @dataclass(frozen=True)
 class UncertainDirection:
-    """Several parameters that one delta in [-1, 1] moves together: a principal axis of correlated parameters.
+    """Several parameters that change together with one delta in [-1, 1]: a principal axis of correlated parameters.
 
-    changes : (parameter, half-range in its unit, with sign) of each parameter that moves.
+    changes : (parameter, half-range in its unit, with sign) of each of these parameters.
     """
 
     name: str
@@ -99,11 +99,11 @@ class UncertainDirection:
             raise InputError("expected each parameter once", field=f"direction {self.name}", value=self.changes)
 
     def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
-        """What delta = 1 adds to each parameter that it moves, in the parameters' units."""
+        """Change of each affected parameter at delta = 1, in the parameter's unit."""
         return dict(self.changes)
 
     def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
-        """Such as "identified direction 1 at +0.8: isolator1.k_z +0.3 %, mass -0.02 %, and 5 less"."""
+        """Such as "identified direction 1 at +0.8: isolator1.k_z +0.3 %, and 5 parameters by less"."""
         sizes = {name: change / abs(nominal[name]) if nominal[name] else np.inf for name, change in self.changes}
         most = sorted(self.changes, key=lambda one: -abs(sizes[one[0]]))
         told = [f"{name} {100 * delta * sizes[name]:+.2g} %" if nominal[name] else
@@ -113,16 +113,16 @@ class UncertainDirection:
         return f"{self.name} at {delta:+.2g}: {', '.join(told)}"
 
     def stretch(self, nominal: Mapping[str, float], share: float) -> float:
-        """Factor, at least 1, that makes the largest relative change `share`: tiny changes would lose digits."""
+        """Factor >= 1 that raises the largest relative change to `share`, since tiny changes would lose digits."""
         largest = max(abs(change) / (abs(nominal[name]) or 0.1) for name, change in self.changes)
         return max(1.0, share / largest)
 
 
 @dataclass(frozen=True, eq=False)
 class UncertainEquation:
-    """The equation of motion of one coordinate, known to within delta times a row: one copy of delta.
+    """Uncertain equation of motion of one coordinate: delta times a row is added to it, with one copy of delta.
 
-    change : (3 n + n_u,) what delta = 1 adds to the coordinate's row of N = [M, C, K, -T], of the kept coordinates,
+    change : (3 n + n_u,) row added at delta = 1 to the coordinate's row of N = [M, C, K, -T], for the kept coordinates,
         rotations as displacement of the edge, and all actuators.
     """
 
@@ -131,7 +131,7 @@ class UncertainEquation:
     change: np.ndarray
 
     def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
-        """Nothing: no physical parameter stands for one row alone."""
+        """Empty: no physical parameter corresponds to one row alone."""
         return {}
 
     def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
@@ -149,11 +149,10 @@ class UncertainRig:
     Attributes
     ----------
     system : inputs "w:NAME", actuators [V], "floor_COORD_dot" [m/s], "force_COORD" [N]; outputs "z:NAME",
-        "COORD_rel" relative to the floor [m], "COORD_dot" [m/s], "COORD_ddot" [m/s^2] absolute, and
-        "SENSOR_dot", "SENSOR_ddot" along each sensor.
-    blocks : one real repeated scalar a parameter or direction, in the order of w_delta.
-    parameters : what each delta means. nominal, units : of every parameter that some delta moves.
-    coordinates : names kept; rotations are displacements of the edge [m] and end in "_edge".
+        "COORD_rel" relative to the floor [m], "COORD_dot" [m/s] and "COORD_ddot" [m/s^2], both absolute.
+    blocks : one repeated real scalar per parameter, direction or equation, in the order of w_delta.
+    parameters : meaning of each delta. nominal, units : of every parameter that depends on a delta.
+    coordinates : names of the kept coordinates; rotations are displacements of the edge [m] and end in "_edge".
     """
 
     system: StateSpace
@@ -164,11 +163,11 @@ class UncertainRig:
     coordinates: tuple[str, ...]
 
     def describe(self, deltas: Sequence[float]) -> list[str]:
-        """Each perturbation in physical words."""
+        """Each perturbation in physical terms."""
         return [p.words(float(d), self.nominal, self.units) for p, d in zip(self.parameters, deltas, strict=True)]
 
     def values(self, deltas: Sequence[float]) -> dict[str, float]:
-        """Physical values at normalised deltas, for `rig.with_parameters`; what several deltas move adds up."""
+        """Physical values at normalised deltas, for `rig.with_parameters`; changes by several deltas add up."""
         return _moved(self.parameters, deltas, self.nominal)
 
 
@@ -187,16 +186,17 @@ def edge_name(coordinate: str) -> str:
 
 
 def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str] = ("z", "phi_x")) -> UncertainRig:
-    """Pull uncertain parameters out of a rig; coordinates not kept are locked at rest.
+    """LFT of a rig with its uncertain parameters pulled out; coordinates that are not kept are locked.
 
     Parameters
     ----------
-    parameters : uncertain ones and directions, by the rig's own names (`rig.parameters()`); a parameter may be both.
+    parameters : uncertain parameters, directions and equations, with the names of `rig.parameters()`; a parameter may
+        also be part of directions.
     keep : coordinates that move.
 
     Raises
     ------
-    InputError : unknown parameter or coordinate, a parameter twice.
+    InputError : unknown parameter or coordinate, a parameter twice, chassis points that differ from payload points.
     """
     known = rig.parameters()
     moved = list(dict.fromkeys(name for p in parameters for name in _names(p)))
@@ -216,7 +216,7 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
     kept = [equations.coordinates.index(name) for name in keep]
     nominal = {name: float(known[name].value) for name in moved}
     for parameter in parameters:
-        parameter.half_ranges(nominal)  # refuses a relative range about zero
+        parameter.half_ranges(nominal)  # raises for a relative range about zero
     scale = np.array([1.0 / rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
     stretch = _stretches(parameters, nominal)
 
@@ -236,7 +236,7 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
     names = tuple(edge_name(name) for name in keep)
     lft = _pull_out(coefficients, len(parameters))
     system = _realise(lft, names, equations.actuators, [p.name for p in parameters])
-    # A parameter of coordinates that are locked has no copy left.
+    # A parameter that acts only on locked coordinates has no copies.
     felt = [(p, copies) for p, copies in zip(parameters, lft.copies, strict=True) if copies]
     blocks = BlockStructure(tuple(RealScalar(copies, p.name) for p, copies in felt))
     moving = tuple(p for p, _ in felt)
@@ -250,7 +250,7 @@ def _names(parameter: Uncertain) -> list[str]:
 
 
 def _stretches(parameters: Sequence[Uncertain], nominal: Mapping[str, float]) -> np.ndarray:
-    """Factors by which each delta is enlarged while the polynomial is read off; together they stay below a half."""
+    """Factors that enlarge each delta while the polynomial is computed; their relative changes add up to 0.4."""
     share = 0.4 / max(sum(isinstance(p, UncertainDirection) for p in parameters), 1)
     return np.array([p.stretch(nominal, share) if isinstance(p, UncertainDirection) else 1.0 for p in parameters])
 
@@ -263,7 +263,7 @@ def _stacked(equations: Any, kept: list[int], scale: np.ndarray) -> np.ndarray:
 
 
 def _factor(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """L R = matrix with the fewest inner columns, evenly scaled."""
+    """L and R with L R = matrix, of minimal rank and equal norm."""
     rows = np.linalg.norm(matrix, axis=1, keepdims=True)
     rows[rows == 0] = 1.0
     U, sigma, Vt = np.linalg.svd(matrix / rows, full_matrices=False)
@@ -286,15 +286,15 @@ class _StaticLft:
 
 
 def _pull_out(coefficients: dict[Exponents, np.ndarray], n_parameters: int) -> _StaticLft:
-    """The polynomial as an LFT: each monomial a chain of links, one link a power of a parameter."""
+    """The polynomial as an LFT: each monomial is a chain of links, one link per power of a parameter."""
     N0 = coefficients[(0,) * n_parameters]
-    # The first link of a chain reads s, every further one the link before it; the last one acts on the equations.
+    # The first link of a chain reads s, each further link reads the previous one, the last one acts on the equations.
     chains = []
     for exponents, matrix in coefficients.items():
         powers = [k for k, exponent in enumerate(exponents) for _ in range(exponent)]
         if powers:
             chains.append((powers, *_factor(matrix)))
-    # Links of one parameter stand together, so that its delta is one repeated scalar.
+    # Links of the same parameter are adjacent, so that its delta is one repeated scalar.
     links = sorted((parameter, chain, position) for chain, (powers, _, _) in enumerate(chains)
                    for position, parameter in enumerate(powers))
     widths = [chains[chain][1].shape[1] for _, chain, _ in links]

@@ -1,11 +1,11 @@
-"""Uncertain numbers, matrices and systems with arithmetic: linear fractional transformations, exact.
+"""Arithmetic of uncertain numbers, matrices and systems, as exact linear fractional transformations.
 
     i_out = a i_in + b u        i_in = diag(1/s I, delta_1 I, ..., Delta_k) i_out
     y     = c i_in + d u
 
-States and uncertain elements are treated alike, as blocks that close i_out onto i_in (Zhou, Doyle and Glover, Robust
-and Optimal Control, 1996, chapter 10). Sum, product, inverse and connection of such transformations are again some;
-copies of one element are gathered into one block, and those that no input reaches or no output sees are removed.
+States and uncertain elements are treated alike, as blocks from i_out to i_in (Zhou, Doyle and Glover, Robust and
+Optimal Control, 1996, chapter 10). Sums, products, inverses and connections have the same form. Copies of one element
+are gathered into one block; copies that no input can reach or no output can observe are removed.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
 from avis_ctrl.uncertainty.lft_reduction import reduce_copies
 
-# The states among the elements: a block 1/s I (or z^-1 I). Equal to no uncertain element: these are of other classes.
+# Element for the states: a block 1/s I (or z^-1 I). No uncertain element equals it, since these are of other classes.
 STATES = Element("states")
 
 
 @dataclass(frozen=True)
 class UncertainSettings:
-    """singular : condition number from which on a matrix to invert counts as singular: round-off alone makes 1e15.
-    same : difference of two LFTs, relative to the size of their entries, up to which a reduction of copies is accepted:
-    a few hundred operations make as much.
-    inside : deltas at which they are compared, as a fraction of the range: away from a pole at its ends."""
+    """singular : condition number above which a matrix is not inverted; round-off alone gives 1e15.
+    same : maximum difference of two LFTs, relative to the size of their entries, at which a reduction of copies is
+    accepted; the round-off of a few hundred operations.
+    inside : range of the deltas at which they are compared, as a fraction of the full range, away from a pole at its
+    ends."""
 
     singular: float = 1e13
     same: float = 1e-12
@@ -47,13 +48,13 @@ SETTINGS = UncertainSettings()
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainSystem:
-    """An uncertain system; without states an uncertain matrix, of one entry an uncertain number.
+    """An uncertain system; an uncertain matrix if it has no states, an uncertain number if it has one entry.
 
-    Made by the functions of `uncertain_models` and by arithmetic: + - and whole powers; * and / by anything of one
-    entry multiply entries; @ (and * between matrices) is the product, or series connection. Numbers, arrays,
-    StateSpace and python-control systems may stand beside it.
+    Created by the functions of `uncertain_models` and by arithmetic: + - and integer powers; * and / by a scalar act on
+    each entry; @ (and * between matrices) is the product, or series connection. The other operand may be a number, an
+    array, a StateSpace or a python-control system.
 
-    a, b, c, d : the matrices above. elements, copies : the blocks in order, the states first where there are any.
+    a, b, c, d : the matrices above. elements, copies : the blocks in order, the states first if there are any.
     """
 
     a: np.ndarray
@@ -66,7 +67,7 @@ class UncertainSystem:
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
 
-    # NumPy leaves `array * system` to this class.
+    # NumPy defers `array * system` to this class.
     __array_ufunc__ = None
 
     def __post_init__(self) -> None:
@@ -75,7 +76,7 @@ class UncertainSystem:
             if len(names) != count or len(set(names)) != count:
                 object.__setattr__(self, which, tuple(f"{letter}{k}" for k in range(count)))
 
-    # -- what it is --------------------------------------------------------------------------
+    # -- properties --------------------------------------------------------------------------
     @property
     def shape(self) -> tuple[int, int]:
         """(outputs, inputs)."""
@@ -96,7 +97,7 @@ class UncertainSystem:
         return {one.name: one for one in self.elements if one != STATES}
 
     def _slices(self) -> list[tuple[Element, int, slice, slice]]:
-        """(element, copies, its place in i_in, its place in i_out)."""
+        """(element, copies, slice of i_in, slice of i_out) of each block."""
         places, w, z = [], 0, 0
         for one, n in zip(self.elements, self.copies, strict=True):
             places.append((one, n, slice(w, w + n * one.rows), slice(z, z + n * one.cols)))
@@ -104,13 +105,13 @@ class UncertainSystem:
         return places
 
     def lft(self) -> tuple[StateSpace, BlockStructure]:
-        """(P, blocks): P with inputs (w_delta, u) and outputs (z_delta, y); what `mu_peak`, `musyn` and
-        `worst_case_gain` take. InputError for dynamics of several channels that appear more than once."""
+        """(P, blocks) as required by `mu_peak`, `musyn` and `worst_case_gain`: P has inputs (w_delta, u) and outputs
+        (z_delta, y). InputError for dynamics with several channels that appear more than once."""
         blocks = BlockStructure(tuple(one.block(n) for one, n, _, _ in self._slices() if one != STATES))
         return self.opened()[0], blocks
 
     def opened(self) -> tuple[StateSpace, int, int]:
-        """P as in `lft`, and the numbers of its w_delta and z_delta."""
+        """P as in `lft`, and the lengths of its w_delta and z_delta."""
         n = self.nstates
         w, z = list[str](), list[str]()
         for one, copies, _, _ in self._slices():
@@ -123,21 +124,21 @@ class UncertainSystem:
                        (*w, *self.inputs), (*z, *self.outputs))
         return P, len(w), len(z)
 
-    # -- one system of the set ---------------------------------------------------------------
+    # -- members of the set ------------------------------------------------------------------
     @property
     def nominal(self) -> Any:
-        """Every element at its nominal value (dynamics zero): a StateSpace, an array (n_y, n_u) without states."""
+        """Every element at its nominal value (dynamics zero): a StateSpace, or an array (n_y, n_u) without states."""
         return self._closed({name: 0.0 for name in self.uncertain})
 
     def substitute(self, values: Mapping[str, Any] | None = None, **more: Any) -> Any:
-        """The same with some elements at given values; a StateSpace or an array once none is left.
+        """The system with some elements at given values; a StateSpace or an array if no uncertain element remains.
 
         A real parameter takes a number; a complex one a real number or a stable system (its value over frequency);
         dynamics take a number, a matrix or a stable system in place of Delta, of norm at most 1.
 
         Raises
         ------
-        InputError : a name that is not there, a value of the wrong kind. ComputationError : a division by zero.
+        InputError : an unknown name, a value of the wrong kind. ComputationError : a division by zero.
         """
         given = {**(values or {}), **more}
         known = self.uncertain
@@ -159,8 +160,8 @@ class UncertainSystem:
         return self._closed(deltas)
 
     def values(self, n: int = 1, seed: int = 0) -> list[dict[str, Any]]:
-        """n random sets of values for `substitute`: real ones uniform over their range; complex ones and dynamics an
-        all-pass of first order times a gain of at most 1, with a corner among the system's own frequencies."""
+        """n random sets of values for `substitute`: real parameters are uniform over their range; complex ones and
+        dynamics are a first-order all-pass times a gain of at most 1, with a corner in the system's frequency range."""
         rng = np.random.default_rng(seed)
         grid = np.array([0.1, 10.0])
         if self.nstates:
@@ -180,11 +181,11 @@ class UncertainSystem:
         return found
 
     def sample(self, n: int = 1, seed: int = 0) -> list[Any]:
-        """n random systems of the set, see `values`."""
+        """n random systems of the set; see `values`."""
         return [self.substitute(one) for one in self.values(n, seed)]
 
     def _closed(self, deltas: Mapping[str, Any]) -> Any:
-        """The elements named closed by their normalised deltas (numbers, or systems)."""
+        """The system with the named elements closed by their normalised deltas (numbers or systems)."""
         system = self
         for name, delta in deltas.items():
             place = next(k for k, one in enumerate(system.elements) if one.name == name and one != STATES)
@@ -228,8 +229,8 @@ class UncertainSystem:
         X, Y = self, as_uncertain(other)
         inputs, outputs = Y.inputs, X.outputs
         if X.shape == Y.shape == (1, 1) and not (X.nstates or Y.nstates):
-            # Numbers commute. Divisors act last, as a mass does on a sum of forces, so that entries of one row share
-            # them; and equal products of parameters come in one order.
+            # Numbers commute. Divisors act last, as a mass divides a sum of forces, so that the entries of a row share
+            # them; and equal products of parameters get the same order.
             X, Y = sorted((X, Y), key=lambda one: (not np.any(one.a), sorted(one.uncertain)))
         if X.shape[1] != Y.shape[0]:
             raise InputError(f"product of shapes {X.shape} and {Y.shape}")
@@ -248,7 +249,7 @@ class UncertainSystem:
         return as_uncertain(other) * self
 
     def inverse(self) -> UncertainSystem:
-        """The inverse. ComputationError where the nominal value has none."""
+        """The inverse. ComputationError if the nominal value is not invertible."""
         if self.shape[0] != self.shape[1]:
             raise InputError("expected as many inputs as outputs", field="inverse", value=self.shape)
         if np.linalg.cond(self.d) > SETTINGS.singular:
@@ -276,7 +277,7 @@ class UncertainSystem:
 
     # -- connection --------------------------------------------------------------------------
     def feedback(self, other: Any = 1.0, sign: int = -1) -> UncertainSystem:
-        """The loop closed by `other` from the outputs to the inputs, negative by default: (I + X Y)^-1 X."""
+        """Closed loop with `other` from outputs to inputs, negative feedback by default: (I + X Y)^-1 X."""
         X, Y = self, as_uncertain(other)
         if Y.shape == (1, 1) and X.shape[0] == X.shape[1]:
             Y = _repeated(Y, X.shape[0])
@@ -289,7 +290,7 @@ class UncertainSystem:
         return _of_both(feedback(X.matrices, Y.matrices, sign), X, Y, X.inputs, X.outputs)
 
     def select(self, outputs: Any = None, inputs: Any = None) -> UncertainSystem:
-        """Some outputs and inputs, by name or position."""
+        """The system with some of its outputs and inputs, by name or position."""
         rows, cols = positions(self.outputs, outputs, "output"), positions(self.inputs, inputs, "input")
         return reduced(replace(self, b=self.b[:, cols], c=self.c[rows], d=self.d[np.ix_(rows, cols)],
                                 inputs=tuple(self.inputs[k] for k in cols),
@@ -300,14 +301,14 @@ class UncertainSystem:
         return self.select(rows, cols)
 
     def renamed(self, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> UncertainSystem:
-        """The same under other signal names."""
+        """The same system with other signal names."""
         given = {"inputs": tuple(inputs or self.inputs), "outputs": tuple(outputs or self.outputs)}
         for which, count in (("inputs", self.shape[1]), ("outputs", self.shape[0])):
             if len(given[which]) != count or len(set(given[which])) != count:
                 raise InputError(f"expected {count} different names", field=which, value=given[which])
         return replace(self, inputs=given["inputs"], outputs=given["outputs"])
 
-    # -- words -------------------------------------------------------------------------------
+    # -- display -----------------------------------------------------------------------------
     def _rows(self) -> list[tuple[str, str]]:
         return [(str(one), f"{n} {'copy' if n == 1 else 'copies'}") for one, n, _, _ in self._slices()
                 if one != STATES]
@@ -325,9 +326,9 @@ class UncertainSystem:
         return html_table(self._rows(), ("uncertain", "copies"), f"uncertain system, {size}")
 
 
-# -- how it is done ------------------------------------------------------------------------------
+# -- implementation ------------------------------------------------------------------------------
 def as_uncertain(given: Any) -> UncertainSystem:
-    """Anything that may stand beside an uncertain system."""
+    """A number, array or system as an uncertain system."""
     if isinstance(given, UncertainSystem):
         return given
     P = as_system(given)
@@ -349,7 +350,7 @@ def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
 
 
 def beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
-    """[X Y ...]: the sum of outputs, each with inputs of its own."""
+    """[X Y ...]: outputs added, separate inputs."""
     result = systems[0]
     for X in systems[1:]:
         if X.shape[0] != result.shape[0]:
@@ -361,7 +362,7 @@ def beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
 
 
 def above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
-    """[X; Y; ...]: outputs under each other, of the same inputs."""
+    """[X; Y; ...]: outputs stacked, common inputs."""
     result = systems[0]
     for X in systems[1:]:
         if X.shape[1] != result.shape[1]:
@@ -390,11 +391,11 @@ def _of_both(parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: S
 
 def gathered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
             outputs: tuple[str, ...]) -> UncertainSystem:
-    """States first, then one block for each element, in the order in which they come."""
+    """System with the states first, then one block per element, in order of first occurrence."""
     places: dict[str, tuple[Element, list[int], list[int]]] = {}
     w = z = 0
     for one, n in kinds:
-        # No element may have the empty name.
+        # No uncertain element has an empty name.
         key = "" if one == STATES else one.name
         known, ws, zs = places.setdefault(key, (one, [], []))
         if known != one:
@@ -410,7 +411,7 @@ def gathered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs
 
 
 def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice, z: slice) -> UncertainSystem:
-    """The block at `place` closed by i_in = inner(i_out); the states of `inner` join those of the system."""
+    """The system with the block at `place` closed by i_in = inner(i_out); states of `inner` become states of it."""
     rest_w = [k for k in range(system.a.shape[1]) if not w.start <= k < w.stop]
     rest_z = [k for k in range(system.a.shape[0]) if not z.start <= k < z.stop]
     loop = np.eye(z.stop - z.start) - system.a[z, w] @ inner.d
@@ -418,7 +419,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
         element = system.elements[place]
         raise ComputationError("the system has no value here", measured=f"I - M Delta is singular at {element}",
                                cause="a division by zero", next_step="choose a value inside the range")
-    # Everything from the remaining internal signals, the states of `inner` and the inputs: (i_r, i_s, u).
+    # All signals as functions of (i_r, i_s, u): remaining internal signals, states of `inner` and inputs.
     a, b, c, d = system.a, system.b, system.c, system.d
     n, m = len(rest_w), inner.a.shape[1]
     seen = np.linalg.solve(loop, np.hstack([a[z][:, rest_w], a[z, w] @ inner.c, b[z]]))
@@ -434,7 +435,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
 
 
 def reduced(system: UncertainSystem) -> UncertainSystem:
-    """The same with fewer copies of scalar elements, by `reduce_copies`, each channel scaled to size one before."""
+    """The same system with fewer copies of scalar elements (`reduce_copies`, with each channel scaled to size one)."""
     slices = system._slices()
     scalar = [k for k, (one, *_) in enumerate(slices) if one.scalar and one != STATES]
     if not scalar:
@@ -470,7 +471,7 @@ def _power_of_two(size: np.ndarray) -> np.ndarray:
 
 
 def _same(M: Quadruple, sizes: Sequence[int], small: Quadruple, kept: Sequence[int]) -> bool:
-    """Whether two LFTs agree at random deltas to round-off; a rank decided wrongly would show here."""
+    """Whether two LFTs agree to round-off at random deltas; this detects wrong rank decisions."""
     rng = np.random.default_rng(0)
 
     def value(parts: Quadruple, counts: Sequence[int], delta: np.ndarray) -> np.ndarray:
@@ -481,7 +482,7 @@ def _same(M: Quadruple, sizes: Sequence[int], small: Quadruple, kept: Sequence[i
         delta = SETTINGS.inside * rng.uniform(-1, 1, len(sizes))
         one, other = value(M, sizes, delta), value(small, kept, delta)
         size = np.maximum(np.abs(one), np.abs(M[3]))
-        # An entry that is the difference of larger ones has their round-off.
+        # An entry that is a difference of larger terms has their round-off.
         largest = np.outer(np.max(np.abs(M[2]), axis=1, initial=0.0), np.max(np.abs(M[1]), axis=0, initial=0.0))
         if np.any(np.abs(one - other) > SETTINGS.same * np.maximum(size, largest)):
             return False

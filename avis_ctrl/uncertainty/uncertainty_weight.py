@@ -1,7 +1,7 @@
-"""A filter that covers what a set of responses differs by from a nominal one.
+"""A filter that covers the differences of a set of responses from a nominal one.
 
-G_k = G (1 + W Delta) for every response, with |Delta| <= 1 at the frequencies given: W is stable, minimum phase and at
-or above the largest relative error (Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, section 7.4).
+Every response is G_k = G (1 + W Delta) with |Delta| <= 1 at the given frequencies: W is stable, minimum phase and at or
+above the largest relative error (Skogestad and Postlethwaite, Multivariable Feedback Control, 2005, section 7.4).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Kind = Literal["output", "input", "additive"]
 
 @dataclass(frozen=True)
 class CoverSettings:
-    """round_off : relative size below which what the nominal system cannot make of an error is round-off.
-    followed : errors below this fraction of the largest are covered, not followed closely."""
+    """round_off : relative size below which the part of an error outside the range of the nominal system is round-off.
+    followed : errors below this fraction of the largest are covered, but not followed closely."""
 
     round_off: float = 1e-8
     followed: float = 1e-4
@@ -39,7 +39,7 @@ class UncertaintyWeight(Shown, Weight):
     """The filter W and the error that it covers.
 
     omega, error : (n,) [rad/s] and the largest error of all responses there. order : states of W.
-    `system()` is W as a StateSpace, `magnitude(omega)` its size; `dynamics(name, weight)` takes it as it is.
+    `system()` is W as a StateSpace, `magnitude(omega)` its size; `dynamics(name, weight)` accepts it directly.
     """
 
     omega: np.ndarray
@@ -72,21 +72,21 @@ class UncertaintyWeight(Shown, Weight):
 def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Kind = "output",
                        omega: np.ndarray | None = None, tolerance_dB: float = 2.0, max_order: int = 8
                        ) -> UncertaintyWeight:
-    """The filter of lowest order that covers the error of every response about a nominal one, at the frequencies given.
+    """Filter of lowest order that covers the errors of all responses relative to a nominal one, at given frequencies.
 
     Parameters
     ----------
     nominal, responses : systems, python-control FRDs, or an `UncertainSystem`'s `sample`; one response or a list.
-    kind : "output" (G_k - G) G^+ , "input" G^+ (G_k - G), both largest singular values, "additive" G_k - G.
+    kind : "output" (G_k - G) G^+, "input" G^+ (G_k - G) or "additive" G_k - G; the error is the largest singular value.
     omega : (n,) frequencies [rad/s]; by default those of the first FRD, or around the poles of the nominal system.
-    tolerance_dB : how far W may lie above the error.
-    max_order : most states.
+    tolerance_dB : maximum excess of W over the error.
+    max_order : maximum number of states.
 
     Raises
     ------
     InputError : no responses, responses of another shape, a nominal response that is zero or not finite, an error that
-        the nominal system cannot make from this side (fewer inputs than outputs, say).
-    ComputationError : no filter of this order within the tolerance.
+        cannot be referred to this side of the nominal system (for example, with fewer inputs than outputs).
+    ComputationError : no filter up to this order is within the tolerance.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What every weighting filter has: a rational shape, a physical unit, a bound, and its meaning in words."""
+"""Base class of weighting filters: a rational shape, a physical unit, a bound, and a description."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Role = Literal["limit", "level"]
 class Weight(ABC):
     """A scalar weighting filter: stable, minimum phase, proper.
 
-    A weight with role "limit" multiplies an output that is to stay below `bound`: W = 1/bound. A weight with role
-    "level" multiplies a normalised input to make it as large as `bound` says it can be: W = bound.
+    A weight with role "limit" multiplies an output that must stay below `bound`: W = 1/bound. A weight with role
+    "level" multiplies a normalised input to scale it to its maximum size `bound`: W = bound.
     """
 
     role: ClassVar[Role]
@@ -33,7 +33,7 @@ class Weight(ABC):
     @property
     @abstractmethod
     def meaning(self) -> str:
-        """What the weight stands for, in words and numbers."""
+        """Description of the weight in words and numbers."""
 
     def system(self, input: str = "u", output: str = "y") -> StateSpace:
         """The filter as a system with those signal names."""
@@ -44,7 +44,7 @@ class Weight(ABC):
         return self.shape.magnitude(omega)
 
     def bound(self, omega: np.ndarray) -> np.ndarray:
-        """What the filter bounds, as realised, in `unit`, at the frequencies omega [rad/s]."""
+        """Bound realised by the filter, in `unit`, at the frequencies omega [rad/s]."""
         magnitude = self.magnitude(omega)
         return 1.0 / magnitude if self.role == "limit" else magnitude
 
@@ -53,7 +53,7 @@ def smallest_cover(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, tole
                    what: str, target: np.ndarray | None = None) -> Rational:
     """The filter of lowest order with |W| >= lower and at most tolerance_dB above upper.
 
-    Raises ComputationError with the excess reached where `max_order` is too low.
+    Raises ComputationError, with the excess reached, if `max_order` is too low.
     """
     excess = np.inf
     for fit in covering_fits(omega, lower, upper, range(max_order + 1), target):

@@ -1,5 +1,4 @@
-"""Weighting filters with a physical meaning: transmissibility, compliance, control effort, neglected dynamics, 1/f
-noise."""
+"""Physical weighting filters: transmissibility, compliance, control effort, neglected dynamics, 1/f noise."""
 
 from __future__ import annotations
 
@@ -34,16 +33,16 @@ class Band:
 class TransmissibilityBound(Weight):
     """Payload motion over floor motion: at most `overall_dB`, and in each band at most that band's limit.
 
-    A rational filter cannot step. It is never laxer than what is asked anywhere on the grid; within
-    `transition_octaves` outside a stricter band it may be stricter than asked, elsewhere by at most
-    `tolerance_dB`. The order is the smallest that does this.
+    A rational filter has no steps. On the grid it is nowhere less strict than specified. Within `transition_octaves`
+    outside a stricter band it may be stricter than specified, elsewhere by at most `tolerance_dB`. It has the lowest
+    order that achieves this.
 
     Parameters
     ----------
     overall_dB : limit outside the bands.
     bands : they must not overlap.
-    relaxed_below_Hz, relaxed_above_Hz : nothing is asked beyond (None: asked from a hundredth of the lowest to a
-        hundred times the highest frequency named, and the filter is flat outside).
+    relaxed_below_Hz, relaxed_above_Hz : no limit beyond (None: the limit applies from a hundredth of the lowest to a
+        hundred times the highest specified frequency, and the filter is flat outside).
     """
 
     overall_dB: float = 4.0
@@ -71,8 +70,8 @@ class TransmissibilityBound(Weight):
                 require(getattr(self, field), field)
 
     def asked(self, omega: np.ndarray) -> np.ndarray:
-        """The limit as specified, with its steps; inf where nothing is asked."""
-        # A band owns its edges in spite of the rounding of 2 pi f.
+        """The limit as specified, with its steps; inf where there is no limit."""
+        # A band includes its edges in spite of the rounding of 2 pi f.
         f, slack = np.asarray(omega, float) / (2 * np.pi), 1e-12
         limit = np.full(f.shape, 10 ** (self.overall_dB / 20))
         for band in self.bands:
@@ -91,7 +90,7 @@ class TransmissibilityBound(Weight):
         first = np.searchsorted(omega, omega / window * (1 - 1e-9))
         last = np.searchsorted(omega, omega * window * (1 + 1e-9))
         upper = np.array([np.max(lower[i:j]) for i, j in zip(first, last, strict=True)])
-        # Where nothing is asked the filter may fall as it likes, but not rise.
+        # Where there is no limit the filter may fall freely, but not rise.
         usual = 10 ** (-self.overall_dB / 20)
         upper = np.where(upper > 0, upper, usual)
         level = np.log(np.where(lower > 0, lower, usual))
@@ -103,7 +102,7 @@ class TransmissibilityBound(Weight):
         shape = smallest_cover(omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound",
                                target)
         dense = 2 * np.pi * self._grid(4000, 400)
-        # 1e-4 covers what may hide between the dense points.
+        # 1e-4 covers violations between the dense points.
         return shape.scaled(max(1.0, float(np.max(1.0 / (self.asked(dense) * shape.magnitude(dense)))) * (1 + 1e-4)))
 
     def _grid(self, points: int, fine_points: int) -> np.ndarray:
@@ -131,9 +130,9 @@ class ComplianceBound(Weight):
     Parameters
     ----------
     limit_m_per_N : limit in the middle band.
-    static_limit_m_per_N, corner_Hz : below the corner the limit rises to this (a velocity sensor cannot stiffen the rig
-        at rest); both or neither.
-    relaxed_above_Hz : above it the limit rises as frequency (the payload's mass takes over).
+    static_limit_m_per_N, corner_Hz : below the corner the limit rises to the static limit (velocity feedback cannot
+        stiffen the rig at zero frequency); both or neither.
+    relaxed_above_Hz : above it the limit rises in proportion to frequency (the payload's mass dominates).
     """
 
     limit_m_per_N: float
@@ -176,21 +175,21 @@ class ComplianceBound(Weight):
 
 @dataclass(frozen=True)
 class ControlEffort(Weight):
-    """Voltage of an actuator: at most its limit when the normalised disturbance has the level expected.
+    """Voltage of an actuator: at most its limit if the disturbance has the expected level.
 
-    W = (level / limit) ((s/wb + 1)/(s/(R wb) + 1))^order: up to wb the whole limit may be used, far above it only
-    a share 1/R^order, which rolls the controller off. Below a corner w0 it is larger by the factor (s + k w0)/(s + w0),
-    k = sqrt(1 + offset^2), which rolls the controller off towards zero frequency.
+    W = (level / limit) ((s/wb + 1)/(s/(R wb) + 1))^order: up to wb the full limit may be used, far above it only
+    the fraction 1/R^order, so that the controller rolls off. Below a corner w0, W is larger by the factor
+    (s + k w0)/(s + w0), k = sqrt(1 + offset^2), so that the controller also rolls off towards zero frequency.
 
     Parameters
     ----------
     limit_V : actuator limit.
-    disturbance_level : size of the disturbance, in the unit of the plant's disturbance input, that may use it all.
+    disturbance_level : disturbance, in the unit of the plant's disturbance input, that may use the full limit.
     bandwidth_Hz : wb; None for a constant weight.
-    reduction : R > 1, how much less is allowed per order far above wb.
+    reduction : R > 1, factor per order by which the allowed voltage is smaller far above wb.
     order : 1 or 2.
-    offset, offset_corner_Hz : at rest, of the same input, an offset that large over its unit; up to the corner it may
-        drift. 0 for none.
+    offset, offset_corner_Hz : constant offset of the same input, relative to its unit, 0 for none; it may drift with
+        frequencies up to the corner.
     """
 
     limit_V: float
@@ -239,11 +238,11 @@ class ControlEffort(Weight):
 
 @dataclass(frozen=True)
 class FlickerNoise(Weight):
-    """1/f noise of a sensor's electronics: sqrt(1 + flicker^2 / f) over its white noise.
+    """1/f noise of a sensor's electronics: density sqrt(1 + flicker^2 / f) relative to its white noise.
 
     Parameters
     ----------
-    flicker : density of the 1/f noise at 1 Hz over that of the white noise; its square is the corner [Hz].
+    flicker : density of the 1/f noise at 1 Hz relative to that of the white noise; its square is the corner [Hz].
     lowest_Hz : below it the weight is constant.
     """
 
@@ -260,7 +259,7 @@ class FlickerNoise(Weight):
         require_positive(self.flicker, "flicker", zero_allowed=True)
 
     def asked(self, omega: np.ndarray) -> np.ndarray:
-        """The density over that of the white noise, at omega > 0 [rad/s]."""
+        """Noise density relative to that of the white noise, at omega > 0 [rad/s]."""
         return np.sqrt(1 + self.flicker ** 2 / (np.asarray(omega, float) / (2 * np.pi)))
 
     @cached_property
@@ -268,7 +267,7 @@ class FlickerNoise(Weight):
         if not self.flicker:
             return Rational(1.0)
         corner = self.flicker ** 2
-        # Far below and above, where the weight is constant, it must cover, too.
+        # The filter must also cover far below and far above, where the weight is constant.
         omega = 2 * np.pi * np.geomspace(self.lowest_Hz / 100, 1000 * max(corner, self.lowest_Hz), 120)
         level = self.asked(np.maximum(omega, 2 * np.pi * self.lowest_Hz))
         return smallest_cover(omega, level, level, self.tolerance_dB, self.max_order, "the 1/f noise")
@@ -281,11 +280,11 @@ class FlickerNoise(Weight):
 
 @dataclass(frozen=True)
 class NeglectedDynamics(Weight):
-    """Relative uncertainty of a chain: `low` at rest, 1 at crossover_Hz exactly, `high` at high frequency.
+    """Relative uncertainty of a channel: `low` at low frequency, exactly 1 at crossover_Hz, `high` at high frequency.
 
     First order, W = (tau s + low)/(tau s/high + 1) (Skogestad and Postlethwaite, Multivariable Feedback Control,
-    section 7.4), or the square of such a factor, which rises twice as fast. tau is solved so that |W| is 1 at the
-    crossover, not only asymptotically.
+    section 7.4), or the square of such a factor, which rises twice as fast. tau is computed so that |W| = 1
+    exactly at the crossover, not only asymptotically.
 
     Raises InputError unless 0 < low < 1 < high.
     """

@@ -1,4 +1,4 @@
-"""What a model of one axis lacks: see `find`."""
+"""Search for the effects that a single-axis model lacks: see `find`."""
 
 from avis_ctrl.gap.axis.find import find_axis_gap, find_axis_gap_in
 from avis_ctrl.gap.axis.records import Signals

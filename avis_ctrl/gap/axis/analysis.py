@@ -1,4 +1,4 @@
-"""From a problem to a verdict: search, names, shares, words.
+"""Gap analysis of one axis, from a problem to a verdict: search, names, contributions, sentences.
 
     Problem -> base fit -> search -> names (rivals, halves, held-out data) -> stages and sentences
 """
@@ -38,11 +38,12 @@ Ratios = Callable[[Mapping[str, float]], Mapping[str, tuple[float, str]]]
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A base model at its start, with what may be missing.
+    """A base model at its initial values, with the effects that it may lack.
 
-    positive : which of the base's parameters are. noise : power of the measured noise of held-out lines over that of
-    the response; None where nothing tells it. units : of {F} and {x}. ratios : of values by name, with units.
-    notes : sentences on the data. plain : the base as a simulation needs it.
+    positive : which of the base parameters are positive. noise : noise power on the held-out lines over that of the
+    response; None if it cannot be estimated. units : of {F} and {x}, and names of input and output. ratios : function
+    from values by name to derived quantities with units. notes : sentences on the data. plain : base model data that a
+    simulation needs.
     """
 
     kind: str
@@ -58,7 +59,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Name:
-    """What is known of an effect that was found. refused : why it is not named; empty where it is."""
+    """An effect that was found. refused : why it is not named, empty if it is. widened : see `_widening`."""
 
     effect: Effect
     probability: float
@@ -68,11 +69,11 @@ class Name:
 
 
 def analyse(problem: Problem, progress: Progress = lambda text: None, settings: AxisSettings = SETTINGS) -> AxisGap:
-    """What a model lacks, with probabilities.
+    """Find the effects that a model lacks, with their probabilities.
 
     Raises
     ------
-    InputError, ComputationError : as the fit of the base model.
+    InputError, ComputationError : as in the fit of the base model.
     """
     explored = Explored(problem.model.lines.fitted, settings)
     progress("base model")
@@ -112,8 +113,8 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
 
 def _better_shape(best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
                   ) -> tuple[Fitted, str] | None:
-    """With a free function of what a named force is a function of, where that leaves far less: a neighbour of the truth
-    is not the truth."""
+    """The model with a free function of the variable of a named effect, and that variable, if its residual is much
+    smaller; else None. A law that is only close to the true one must not be named."""
     known = {one.variable for one in best.model.effects if one.outside}
     for variable in sorted({one.variable for one in best.model.effects if one.variable} - known):
         free = unnamed(best, explored, [one for one in problem.effects if one.outside and one.variable == variable])
@@ -123,7 +124,7 @@ def _better_shape(best: Fitted, explored: Explored, problem: Problem, settings: 
 
 
 def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitted:
-    """Of effects that predict the same, the one that the library has first."""
+    """Replace each effect by the first one in the library that predicts the same."""
     place = {one.key: k for k, one in reversed(list(enumerate(problem.effects)))}
     for label in best.labels:
         own = next(one for one in best.model.effects if one.label == label)
@@ -144,7 +145,7 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
             by_key[other.effect.key] = max(by_key.get(other.effect.key, 0.0), other.odds)
     probability = min(1 / (1 + nothing + sum(by_key.values())), settings.most_sure)
     near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
-    # What shapes a force is often known from a part of the data alone.
+    # Only linear parameters are compared: a shape parameter is often determined by a part of the data alone.
     parameters = _sizes(one)
     found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
     return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
@@ -153,13 +154,13 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
 
 
 def _sizes(one: Effect) -> list[str]:
-    """Names in a model of the parameters in which an effect is linear."""
+    """Names, as in the model, of the parameters in which an effect is linear."""
     return [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
 
 
 def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
-    """Factor on the standard deviations of an effect's parameters, 1 or more: where halves of the data differ by more
-    than noise, they are known no better than the halves agree (R. T. Birge, Phys. Rev. 40 (1932) 207-227)."""
+    """Factor on the standard deviations of an effect's parameters, 1 or more. If halves of the data differ by more than
+    noise, the parameters are known only as well as the halves agree (R. T. Birge, Phys. Rev. 40 (1932) 207-227)."""
     return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
 
 
@@ -178,22 +179,22 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
 
 
 def power(fitted: Fitted | AxisModel) -> float:
-    """What a model leaves of the power of held-out data."""
+    """Residual power of a model on held-out data over the power of the data."""
     left, whole = _power(fitted.model if isinstance(fitted, Fitted) else fitted)
     return float(sum(map(np.sum, left)) / whole)
 
 
 def power_by_line(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) each: frequency [Hz], and the power that a model leaves there of held-out data, over the whole's."""
+    """(n,) each: frequency [Hz], and residual power of held-out data on that line over the total power of the data."""
     left, whole = _power(fitted.model)
-    # The mean of a window stands at a thousandth of the distance between lines (`records`).
+    # `records` puts the mean of a window at a thousandth of the bin spacing.
     f = [np.where(omega < 0.01 * np.unique(omega)[:2][-1], 0.0, omega / (2 * np.pi))
          for omega in (block.omega for block in fitted.model.lines.held.blocks)]
     return np.concatenate(f), np.concatenate(left) / whole
 
 
 def _power(model: AxisModel) -> tuple[list[np.ndarray], float]:
-    """Power on each line (n,) of each held-out block that a model leaves, and the whole power of the data."""
+    """Residual power on each line (n,) of each held-out block, and the total power of the data."""
     blocks = model.lines.held.blocks
     left = [np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2)) for block in blocks]
     return left, sum(float(np.sum(np.abs(block.Y) ** 2)) for block in blocks)
@@ -201,12 +202,12 @@ def _power(model: AxisModel) -> tuple[list[np.ndarray], float]:
 
 @dataclass(frozen=True, eq=False)
 class Shares:
-    """What each effect takes of the gap on held-out data, and how well its parameters are known.
+    """Contribution of each effect to the gap on held-out data, and the covariance of the parameters.
 
-    floor : power that noise or the best free function leaves. after : power that the model leaves, without functions
-    that have no name. left : share of the gap that remains. alone : power left without an effect, nothing refitted;
-    of_effect : share of the gap that it takes and the others, refitted, could not; both by label. covariance : of all
-    parameters.
+    floor : power of the noise, or of the residual of the best free function. after : residual power of the model
+    without unnamed functions. left : fraction of the gap that remains. alone : residual power without an effect, no
+    refit; of_effect : fraction of the gap that the effect explains and the other effects, refitted, cannot; both by
+    label. covariance : of all parameters.
     """
 
     floor: float
@@ -236,15 +237,15 @@ class Shares:
         return Shares(floor, after, left, alone, shares, _widened(best, names, shares, left))
 
     def certain(self, best: Fitted, one: Effect, settings: AxisSettings) -> bool:
-        """Whether the size of an effect differs from zero by enough of its standard deviations."""
+        """Whether an effect's size differs from zero by at least `apart` standard deviations."""
         at, std = [best.model.names.index(name) for name in _sizes(one)], np.sqrt(np.diag(self.covariance))
         return any(abs(best.model.values[k]) >= settings.apart * std[k] for k in at)
 
 
 def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], left: float) -> np.ndarray:
-    """Covariance of all parameters. No law is quite that of the real element: those of an effect are known no better
-    than halves of the data agree, and what remains beyond noise may point along the effect, with a correlation of
-    anything from -1 to 1 (its variance is 1/3)."""
+    """Covariance of all parameters, widened because no law describes the real element exactly. The parameters of an
+    effect are known only as well as halves of the data agree. The residual beyond noise may have any correlation from
+    -1 to 1 with the effect (variance 1/3)."""
     factor, beside = np.ones(len(best.model.names)), np.zeros(len(best.model.names))
     for one in names:
         for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
@@ -297,7 +298,7 @@ def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, pro
 
 def _propagated(function: Callable[[np.ndarray], Mapping[str, tuple[float, str]]], values: np.ndarray,
                 covariance: np.ndarray, problem: Problem) -> dict[str, Reported]:
-    """With standard deviations to first order."""
+    """Function values with standard deviations to first order."""
     found = {}
     for name, (value, unit) in function(values).items():
         slope = np.zeros(len(values))
@@ -311,7 +312,7 @@ def _propagated(function: Callable[[np.ndarray], Mapping[str, tuple[float, str]]
 
 
 def _stages(base: Fitted, best: Fitted, labels: Sequence[str], explored: Explored, problem: Problem) -> list[AxisStage]:
-    """Base, then one effect more each, the largest share first."""
+    """Base model, then one more effect per stage, the largest contribution first."""
     models, one = [("base", base)], best
     chain: list[tuple[str, Fitted]] = []
     for label in reversed(labels):
@@ -338,7 +339,7 @@ def _plain(fitted: Fitted) -> dict[str, Any]:
 
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
-    """The octaves that together hold at least half of what remains, largest first; the mean in the lowest."""
+    """The fewest octaves that contain at least half of the residual power, largest first; the mean is in the lowest."""
     f, left = power_by_line(best)
     octave = np.floor(np.log2(np.maximum(f, np.min(f[f > 0])))).astype(int)
     found: list[dict[str, Any]] = []

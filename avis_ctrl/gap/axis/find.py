@@ -1,6 +1,6 @@
-"""Name what a model of one axis lacks, from arrays or from files.
+"""Find the effects that a single-axis model lacks, from arrays or from files.
 
-    find_axis_gap("drive", records=[Signals("a", force, position)], sample_rate_Hz=1000.0)
+    find_axis_gap("drive", records=[Signals("a", force, position)], rate=1000.0)
     find_axis_gap("seismometer", responses=responses, distortion=distortion)
     find_axis_gap("levels", campaign=campaign)
     find_axis_gap_in("drive", file, {"force": "vir", "position": "qm", "t": "t"}, scale={"force": 35.15})
@@ -34,23 +34,23 @@ from avis_ctrl.measurement.formats.reader import read_measurements
 
 PROBLEMS: dict[str, Callable[..., Problem]] = {"drive": drive, "oscillator": oscillator, "seismometer": seismometer,
                                                "levels": levels}
-# What the numbers of each role are taken for.
+# Units assumed for the numbers of each role.
 UNITS = {"force": "N", "position": "m", "drive": "N", "coil": "V", "displacement": "m"}
 
 
 def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress | None = None, **data: Any) -> AxisGap:
-    """What a model of one axis lacks, with a probability, or that nothing of the library explains it.
+    """Name the effects that a single-axis model lacks, with probabilities, or report that the library explains nothing.
 
     Parameters
     ----------
-    kind : "drive", "oscillator", "seismometer", or "levels": a mode at several levels. data : of `mass.drive`,
-    `mass.oscillator`, `seismometer.seismometer`, `levels.levels`. own : effects of the user's own, beside those of the
-    library.
+    kind : "drive", "oscillator", "seismometer", or "levels" (a mode at several levels). data : arguments of
+    `mass.drive`, `mass.oscillator`, `seismometer.seismometer`, `levels.levels`. own : user-defined effects in addition
+    to the library.
 
     Raises
     ------
-    InputError : an unknown kind, an own effect without words or with a name and place of the library, missing or
-    unknown data, arrays that do not fit. ComputationError : data that no model of this kind fits.
+    InputError : an unknown kind; an own effect with missing texts, or with the name and place of another one; missing
+    or unknown data; arrays that do not fit. ComputationError : no model of this kind fits the data.
     """
     if kind not in PROBLEMS:
         raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)
@@ -74,10 +74,10 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
 
 @dataclass(frozen=True)
 class Reading:
-    """How the columns of a file become signals.
+    """Conversion of file columns into signals.
 
-    columns, scale : by role. sample_rate_Hz : where the file has no time. output : what y or position of the file is,
-    "position", "velocity" or "acceleration". range_s : part of each record. resample_Hz : new sample rate.
+    columns, scale : by role. sample_rate_Hz : for files without time. output : quantity of y or position in the file,
+    "position", "velocity" or "acceleration". range_s : part of each record that is used. resample_Hz : new sample rate.
     """
 
     columns: Mapping[str, str]
@@ -95,9 +95,9 @@ def find_axis_gap_in(kind: str, path: str | Path | Sequence[str | Path], columns
                      scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None,
                      output: str = "position", range_s: tuple[float, float] | None = None,
                      resample_Hz: float | None = None, progress: Progress | None = None, **options: Any) -> AxisGap:
-    """The same from files: records (drive, oscillator; of several, whole ones are held out), a folder of sine records
-    (seismometer: drive, coil, displacement), or a folder of u_*.npy and y_*.npy (levels: samples x channels x
-    realisations x periods, the level in mV in the name).
+    """`find_axis_gap` from files: records (drive, oscillator; of several records, whole ones are held out), a folder of
+    sine records (seismometer: drive, coil, displacement), or a folder of u_*.npy and y_*.npy (levels: samples x
+    channels x realisations x periods, with the level in mV in the file name).
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def find_axis_gap_in(kind: str, path: str | Path | Sequence[str | Path], columns
 
     Raises
     ------
-    InputError : files, roles, columns that do not fit. ComputationError : as `find_axis_gap`.
+    InputError : files, roles or columns that do not fit. ComputationError : as in `find_axis_gap`.
     """
     paths = [path] if isinstance(path, (str, Path)) else list(path)
     if kind not in PROBLEMS:
@@ -140,7 +140,7 @@ def signals_in(kind: str, paths: Sequence[str | Path], reading: Reading, band_Hz
 
     Raises
     ------
-    InputError : files, roles, columns, options that do not fit.
+    InputError : files, roles, columns or options that do not fit.
     """
     driven, measured = _roles(kind, reading)
     found, rates = [], set()
@@ -178,7 +178,7 @@ def _resampled(x: np.ndarray, rate: float, wanted: float) -> np.ndarray:
 
 
 def assumed(kind: str, reading: Reading, rate: float | None = None) -> tuple[str, ...]:
-    """What each column was taken for."""
+    """Sentence on the units that were assumed for the columns."""
     said = [f"{role} = {name}{f' times {reading.scale[role]:g}' if role in reading.scale else ''}"
             + (f" in {UNITS[role]}" if role in UNITS else "") for role, name in reading.columns.items() if role != "t"]
     bare = [role for role in reading.columns if role in UNITS and role not in reading.scale]

@@ -1,11 +1,11 @@
-"""What the level does to one mode: one linear model of a mode at two levels, and what may differ between them.
+"""Effect of the level on one mode: a linear model of the mode at two levels, and the differences between them.
 
     H(s) = r/(s^2 + 2 zeta w s + w^2 + change) + b0 + b1 s,    change = 0 at the lower level
 
-The responses are best linear approximations at each level; their variances hold noise and the scatter of distortion
-(`measurement.frequency_response.best_linear`). A spring that softens changes the stiffness alone. Hysteresis of
-Rayleigh's kind (Lord Rayleigh, Phil. Mag. 23 (1887) 225) takes stiffness in proportion to the amplitude, and adds a
-loss of 4/(3 pi) of what it takes, whatever the frequency. Friction has less damping at a higher level.
+The responses are best linear approximations at each level; their variances include noise and the scatter of nonlinear
+distortion (`measurement.frequency_response.best_linear`). A softening spring changes the stiffness alone. Rayleigh
+hysteresis (Lord Rayleigh, Phil. Mag. 23 (1887) 225) reduces the stiffness in proportion to the amplitude and adds a
+loss of 4/(3 pi) times that reduction, at any frequency. Friction provides less damping at a higher level.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ REST = ("r", "b0", "b1")
 
 @dataclass(frozen=True, eq=False)
 class TwoLevels:
-    """Lines of both levels. f : (n,) Hz by block; high : blocks of the higher level. middle, width : of the band, in
-    rad/s; size : of the response."""
+    """Lines of both levels. high : names of the blocks of the higher level. middle : centre of the band [rad/s]; size :
+    r.m.s. response at the lower level."""
 
     fitted: Data
     held: Data
@@ -46,7 +46,7 @@ class TwoLevels:
     settings: AxisSettings
 
     def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) number of a group of neighbouring lines, and place along the band."""
+        """(n,) number of a group of neighbouring lines, and position within the band."""
         block = next(one for data in (self.fitted, self.held) for one in data.blocks if one.name == name)
         order = np.arange(len(block.omega))
         return order // 4 + 1000 * (name in self.high), order.astype(float)
@@ -54,7 +54,7 @@ class TwoLevels:
 
 @dataclass(frozen=True, eq=False)
 class ModeModel(AxisModel):
-    """See the module. Parameters: frequency_Hz, damping, then real and imaginary parts of r, b0 and b1."""
+    """Mode at two levels. Parameters: frequency_Hz, damping, then real and imaginary parts of r, b0 and b1."""
 
     lines: TwoLevels
 
@@ -81,9 +81,9 @@ class ModeModel(AxisModel):
 
 
 def level_effects(scatters: bool) -> list[Effect]:
-    """What a level may do to a mode. Values are of the higher level less the lower, over the stiffness. scatters : the
-    response scatters from one realisation to the next as much as a static law of the drive makes it; a gain that
-    follows the level does not."""
+    """Effects of the level on a mode. The parameters are changes from the lower to the higher level: of stiffness and
+    gain as fractions, of damping as a damping ratio. scatters : the response scatters between realisations as much as a
+    static nonlinearity of the drive predicts; a gain that follows the level adds no scatter."""
     sweep = "a sine swept slowly up and down about the mode at several levels"
     return [
         Effect("hysteresis", "mode", "hysteresis, which softens the mode and adds loss as the level rises",
@@ -114,10 +114,10 @@ def level_effects(scatters: bool) -> list[Effect]:
 
 def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, transient: Transient = "auto",
            settings: AxisSettings = SETTINGS) -> Problem:
-    """The mode that changes most between the lowest and the highest level of a campaign of periodic records.
+    """Problem for the mode that changes most between the lowest and highest level of a campaign of periodic records.
 
-    band_Hz : around one mode; by default around the one that moves most. transient : as in
-    `best_linear_approximations`; "none" for records of the steady state.
+    band_Hz : around one mode; by default around the one that changes most. transient : as in
+    `best_linear_approximations`; "none" for steady-state records.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
         raise InputError("expected records at two levels at least", field="level_V", value=known)
     found = []
     for level in (known[0], known[-1]):
-        # Where a line is too weak for some of the inputs, it is left out.
+        # Lines that are too weak for some of the inputs form smaller sets, which are not used.
         one = max(best_linear_approximations(campaign, level_V=level, transient=transient),
                   key=lambda r: len(r.inputs) * len(r.frequency_Hz))
         if one.distortion is None or one.measurement_noise is None:
@@ -169,8 +169,8 @@ def _common(a: FrequencyResponse, b: FrequencyResponse) -> tuple[FrequencyRespon
 
 def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, float] | None, settings: AxisSettings
           ) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Frequency [Hz] and damping of the mode of the lower level about which the responses change most, in words too.
-    A mode of another shape is another mode, and has not moved."""
+    """Frequency [Hz] and damping ratio of the lower-level mode near which the responses change most, and a sentence on
+    modes that move. A mode whose shape differs is another mode and has not moved."""
     f = low.frequency_Hz
     loud = 20 * np.log10(np.maximum(np.sqrt(np.sum(np.abs(high.value) ** 2, axis=(1, 2))), 1e-300))
     smooth = signal.savgol_filter(loud, 5, 2)
@@ -217,7 +217,7 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
             if out:
                 noise.append(variance[at])
     change = float(np.sqrt(np.mean(np.abs(high.value[:, i, j] - low.value[:, i, j]) ** 2)))
-    # Of one realisation: the response is the mean of them.
+    # Scatter of one realisation; the response is the mean of all.
     scatter = float(np.sqrt(np.mean(np.maximum(high.variance("distortion")[:, i, j], 0.0)) * realisations))
     data = {out: Data(tuple(several), (1.0, 2.0)) for out, several in blocks.items()}
     middle = float(np.sqrt(omega[0] * omega[-1]))
@@ -240,12 +240,12 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
 
 
 def read_levels(folder: str | Path, sample_rate_Hz: float | None, y_unit: str = "m") -> Campaign:
-    """Records from u_*.npy and y_*.npy, samples of a period x channels x realisations x periods; the level in mV is in
-    the name (u_100mV_train.npy). The records are taken to be in the steady state.
+    """Read records from u_*.npy and y_*.npy, samples of a period x channels x realisations x periods. The file name
+    contains the level in mV (u_100mV_train.npy). The records are assumed to be in steady state.
 
     Raises
     ------
-    InputError : a missing folder, partner or level, arrays that do not fit, no sample rate.
+    InputError : a missing folder, partner file or level; arrays that do not fit; no sample rate.
     """
     folder = Path(folder)
     files = sorted(folder.glob("u_*.npy")) if folder.is_dir() else []

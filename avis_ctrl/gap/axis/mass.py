@@ -1,4 +1,4 @@
-"""Problems of one mass: a drive F = M a + Fv v, and an oscillator m y'' + d y' + k y = u."""
+"""Single-mass problems: a drive F = M a + Fv v, and an oscillator m y'' + d y' + k y = u."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 
 def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = None,
           band_Hz: tuple[float, float] | None = None, settings: AxisSettings = SETTINGS) -> Problem:
-    """A drive. Its lines run as far up as force and motion are coherent, for only there a delay and a lag part.
+    """Problem of a drive. Its band extends to where force and motion are coherent: only there do delay and lag differ.
 
     Parameters
     ----------
-    cutoff_Hz : low-pass of the motion of which friction is formed; by default the end of the lines. band_Hz : of the
-    lines.
+    cutoff_Hz : low-pass filter of the motion from which friction is computed; by default the upper end of the band.
+    band_Hz : of the lines.
 
     Raises
     ------
-    InputError : shapes, a record too short, an axis at rest, exchanged columns, a flipped sign.
+    InputError : wrong shapes, a record that is too short, an axis at rest, exchanged columns, a flipped sign.
     """
     _check(records, rate, ("force", "position"))
     high = coherent_to(records[0], rate, settings) if band_Hz is None else band_Hz[1]
@@ -38,7 +38,7 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
 
     def fitted(some: Sequence[Signals]) -> tuple[float, bool]:
         lines = Lines(some, rate, "force", band, cutoff_Hz, settings)
-        # A spring or a stop acts as a mass of the other sign.
+        # Free functions of position are included, because a spring or a stop acts like a negative mass.
         places = next(one for one in unnamed_forces(lines) if one.variable == "position").shapes
         x, left = _least_squares(_flat(lines.A, lines.V, *map(lines.of, (lambda m: m.sign, *places))), *_flat(lines.F))
         return left, bool(x[0] > 0)
@@ -57,12 +57,12 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
 
 def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, float] | None = None,
                units: Mapping[str, str] | None = None, settings: AxisSettings = SETTINGS) -> Problem:
-    """An oscillator, or one mode of a structure in a band around it; force and position of the record are u and y.
+    """Problem of an oscillator, or of one mode of a structure in a band around it; u and y are force and position.
 
     Raises
     ------
-    InputError : shapes, band, a record too short, exchanged columns, a flipped sign. ComputationError : no oscillator
-    fits.
+    InputError : wrong shapes or band, a record that is too short, exchanged columns, a flipped sign. ComputationError :
+    no oscillator fits.
     """
     _check(records, rate, ("u", "y"))
     band = (0.005 * rate, 0.4 * rate) if band_Hz is None else band_Hz
@@ -98,7 +98,7 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
 
 def _least_squares(columns: Sequence[np.ndarray], y: np.ndarray, weight: np.ndarray | float = 1.0
                    ) -> tuple[np.ndarray, float]:
-    """Coefficients, and the part of y that is left."""
+    """Coefficients, and the norm of the residual over that of y."""
     X = np.column_stack(columns) * np.broadcast_to(weight, y.shape)[:, None]
     y = y * weight
     size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
@@ -107,13 +107,13 @@ def _least_squares(columns: Sequence[np.ndarray], y: np.ndarray, weight: np.ndar
 
 
 def _flat(*columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """(n,) lines of all records, of each column."""
+    """(n,) lines of all records for each column."""
     return [np.concatenate([one.sum(axis=2).ravel() for one in several]) for several in columns]
 
 
 def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
-    """m, d, k by iterated weights 1/|D| (C. Sanathanan, J. Koerner, IEEE T-AC 8 (1963) 56), and the part of y that the
-    oscillator leaves."""
+    """m, d and k by iterative reweighting with 1/|D| (C. Sanathanan, J. Koerner, IEEE T-AC 8 (1963) 56), and the norm
+    of the residual over that of y."""
     A, V, Q, F = _flat(lines.A, lines.V, lines.Q, lines.F)
     s = np.concatenate([np.tile(lines.s, len(one)) for one in lines.Q])
     weight = 1 / np.abs(s) ** 2
@@ -126,8 +126,8 @@ def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
 
 
 def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str], settings: AxisSettings) -> None:
-    """Refuse exchanged columns and a flipped sign: a mass is positive. Where the model fits with the input's sign
-    turned, or with input and output exchanged, and not as the columns are, the columns are wrong and not the model.
+    """Refuse exchanged columns and a flipped sign; a mass must be positive. If the model fits with the sign of the
+    input reversed, or with input and output exchanged, but not with the columns as given, the columns are wrong.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str],
 
 
 def coherent_to(one: Signals, rate: float, settings: AxisSettings) -> float:
-    """Hz, upper end of the last third of an octave in which acceleration and force are coherent."""
+    """Upper end [Hz] of the last third-octave band in which acceleration and force are coherent."""
     with np.errstate(divide="ignore", invalid="ignore"):  # no acceleration at all: coherent nowhere
         f, coherence = signal.coherence(np.diff(one.position, 2), one.force[1:-1], rate,
                                         nperseg=max(len(one.force) // 16, 8))
@@ -164,8 +164,8 @@ def coherent_to(one: Signals, rate: float, settings: AxisSettings) -> float:
 
 
 def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[float | None, tuple[str, ...]]:
-    """Power of the noise of held-out lines over that of the response, where the signal that drives the model repeats,
-    and a sentence. A reference that repeats tells nothing where forces are added that do not."""
+    """Noise power of held-out lines over the power of the response, and a sentence, where the signal that drives the
+    model repeats; else None. A repeating reference is no evidence, because added forces need not repeat."""
     one, settings = records[0], lines.settings
     x = getattr(one, guide) - np.mean(getattr(one, guide))
     n, least = len(x), len(x) // 32
@@ -183,7 +183,7 @@ def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[floa
     inside = np.array([start + lines.length <= n - lag for start in lines.starts[0]])
     if not inside.any():
         return None, ()
-    # The middle one of the segments: a start or a single disturbance is no noise.
+    # The median over the segments: a start or a single disturbance is not noise.
     noise = float(np.median(np.mean(np.abs(lines.transform(change, 0).sum(axis=2)[inside]) ** 2, axis=1)))
     whole = float(np.mean([np.mean(np.abs(block.Y) ** 2) for block in lines.held.blocks]))
     return noise / whole, (f"The {guide} repeats every {lag / lines.rate:.4g} s; from one repetition to the next the "
@@ -191,7 +191,7 @@ def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[floa
 
 
 def position_of(x: np.ndarray, rate: float, output: str, low_Hz: float) -> np.ndarray:
-    """Displacement from displacement, velocity or acceleration, without what is slower than low_Hz."""
+    """Displacement from displacement, or from velocity or acceleration with a high-pass filter at low_Hz."""
     order = {"position": 0, "velocity": 1, "acceleration": 2}
     if output not in order:
         raise InputError(f"expected one of {', '.join(order)}", field="output", value=output)
@@ -199,7 +199,7 @@ def position_of(x: np.ndarray, rate: float, output: str, low_Hz: float) -> np.nd
         return x
     n = len(x)
     f = np.fft.rfftfreq(2 * n, 1 / rate)
-    # The record and its mirror image have no step at the ends.
+    # The record followed by its mirror image has no step at the ends.
     X = np.fft.rfft(np.r_[x, x[::-1]])
     s = 2j * np.pi * np.maximum(f, 1e-12)
     smooth = (f / low_Hz) ** 4 / (1 + (f / low_Hz) ** 4)

@@ -1,4 +1,4 @@
-"""What a drive or an oscillator may lack: forces of the motion, inner dynamics, and the path from force to mass."""
+"""Effects that a drive or oscillator model may lack: forces of the motion, inner dynamics, path from force to mass."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ RELEASED = "the force at rest, released and unloaded: a constant force stays, fr
 
 @dataclass(frozen=True)
 class Scale:
-    """What the library takes from the data: travel, largest speed, displacement and force, the lines' band [Hz], the
-    periods a unit of position of a force that may be periodic, and the travel from which a position may be an angle."""
+    """Scales of the data that the library needs: travel, largest speed, displacement and force, band of the lines [Hz],
+    spatial frequencies at which a force may be periodic [1/{x}], and the travel from which a position may be an
+    angle."""
 
     travel: float
     speed: float
@@ -47,7 +48,7 @@ class Scale:
 def _force(name: str, title: str, separated_by: str, *columns: tuple[str, str, Shape], low: float = -np.inf,
            location: str = "", law: str = "", variable: str = "", shaped_by: Parameter | None = None,
            seeds: Sequence[float] | np.ndarray = ()) -> Effect:
-    """A force that is linear in all of its parameters but one, which shapes it and has seeds of its own."""
+    """A force that is linear in all parameters except an optional one that shapes it, which has its own seeds."""
     linear = tuple(Parameter(symbol, unit, low) for symbol, unit, _ in columns)
     return Effect(name, location, title, linear if shaped_by is None else (*linear, shaped_by), separated_by,
                   tuple(shape for *_, shape in columns), law=law, variable=variable,
@@ -101,7 +102,7 @@ def _free(name: str, title: str, shapes: Sequence[Shape], variable: str = "") ->
 
 
 def _once(make: Callable[[Motion], list[np.ndarray]], count: int) -> list[Shape]:
-    """Shapes of a function that makes all of them at once."""
+    """Shapes of a function that computes all of them at once."""
     kept: dict[int, tuple[Motion, list[np.ndarray]]] = {}
 
     def one(k: int, m: Motion) -> np.ndarray:
@@ -112,9 +113,9 @@ def _once(make: Callable[[Motion], list[np.ndarray]], count: int) -> list[Shape]
 
 
 def unnamed_forces(lines: Lines) -> list[Effect]:
-    """Functions of any shape of the motion and, of an oscillator, of its input."""
+    """Free functions of the motion and, for an oscillator, of its input."""
     count = lines.settings.bumps
-    # One scale for all records, so that a shape is the same function in each.
+    # Common knots for all records, so that a shape is the same function in each.
     q, v, u = (np.concatenate([getattr(m, name) for m in lines.motion]) for name in ("q", "v", "u"))
     knots_q, knots_v, knots_u = (np.quantile(x, np.linspace(0, 1, 4096)) for x in (q, np.abs(v), u))
 
@@ -150,14 +151,14 @@ def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def drive_effects(scale: Scale) -> list[Effect]:
-    """The library of a drive."""
+    """Library of effects for a drive."""
     at = partial(_force, location="drive")
     friction = partial(at, "coulomb_friction", "Coulomb friction, a force of constant size against the motion", SLOW,
                        low=0.0, variable="velocity")
     rounded, creeping = _shape("v_rounded", "{x}/s", scale.speed), _falling(scale.speed, 10)[1::2]
     found = [
         friction(("Fc", "{F}", lambda m: m.sign)),
-        # Creeping through rest, where no friction jumps.
+        # For slow motion through rest, where no real friction jumps.
         friction(("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)), law="rounded",
                  shaped_by=rounded, seeds=creeping),
         at("force_offset", "a constant force (weight on an inclined axis, or an offset of the current sensor)",
@@ -193,14 +194,14 @@ def drive_effects(scale: Scale) -> list[Effect]:
         found.append(at("cogging", "a force that is periodic in the position (cogging, pitch of a screw)",
                         "slow motion over the whole travel", ("sine", "{F}", partial(_wave, np.sin)),
                         ("cosine", "{F}", partial(_wave, np.cos)), variable="position",
-                        # A step of a thousandth of a turn over the whole travel.
+                        # A derivative step of at most a thousandth of a period over the whole travel.
                         shaped_by=_shape("periods", "1/{x}", top, 0.01, step=1e-5), seeds=scale.pitches))
     return [*found, *_path(scale, "drive"),
             _attached_to(scale, "two_mass_flexibility", "a second mass behind a flexible coupling", "drive")]
 
 
 def _stops(reach: float, location: str, place: Shape) -> list[Effect]:
-    """Springs behind a gap: on both sides, above, below."""
+    """Springs that engage beyond a gap: on both sides, above, below."""
     def below(m: Motion, gap: float) -> np.ndarray:
         return np.minimum(place(m) + gap, 0.0)
 
@@ -221,7 +222,7 @@ def _wave(function: Callable[[np.ndarray], np.ndarray], m: Motion, n: float) -> 
 
 
 def _pitches(lines: Lines, few: int = 2) -> list[float]:
-    """Periods a unit of position at which what friction and inertia leave is strongest, in the time domain."""
+    """Spatial frequencies [1/{x}] at which the residual of friction and inertia is strongest, from the time domain."""
     m, one = lines.motion[0], lines.records[0]
     step = lines.over * max(1, len(one.force) // 20_000)
     q, v = m.q[::step], m.v[::step]
@@ -234,7 +235,7 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
 
 
 def oscillator_effects(scale: Scale) -> list[Effect]:
-    """The library of an oscillator."""
+    """Library of effects for an oscillator."""
     at, drive = partial(_force, location="oscillator"), partial(_force, location="input", variable="input")
     far = "the response far above the resonance at several levels"
     level = _shape("level", "{F}", scale.force, 0.01)

@@ -1,13 +1,12 @@
-"""A mass with what may be missing from it, as the likelihood of the table takes a model.
+"""A mass with the effects that may be missing, in the form that the likelihood of the table requires.
 
-With R = M s^2 q + d s q + k q + forces and Z = M s^2 + d s + k + inner dynamics, P the path from force to mass:
+Let R = M s^2 q + d s q + k q + forces, Z = M s^2 + d s + k + inner dynamics, and P the path from force to mass:
 
     drive:  F = F_measured - (P F - R)/P       oscillator:  q = q_measured + (P F - R)/Z
 
-This is R / P and P F / Z but for what a window spills, which P F - R holds exactly. Both are linear in the forces'
-coefficients.
-The linear part of a force, alpha q + beta v at the level of the record, belongs to Z as well: without it the force
-would predict the noise of the very q that it is computed from.
+These equal R / P and P F / Z except for window leakage, which P F - R takes into account exactly. Both are linear in
+the coefficients of the forces. The linear part of a force, alpha q + beta v at the level of the record, is included in
+Z as well. Otherwise the force would predict the noise of the same q from which it is computed.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Parameter:
-    """unit : with {F} and {x} for those of force and position. A linear one begins at zero; another one, positive,
-    where the effect's seeds begin, within its range. step : relative, of the derivative by one that shapes a force: a
-    force with an edge changes evenly over it."""
+    """unit : with {F} and {x} for the units of force and position. A linear parameter starts at zero. Any other is
+    positive and starts at the effect's seeds, within its range. step : relative step of the derivative with respect to
+    a shape parameter, large enough to smooth the edges of a force."""
 
     name: str
     unit: str
@@ -43,16 +42,16 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What a model of one axis may lack.
+    """An effect that a single-axis model may lack.
 
-    name, location : as reported. title : what is missing, in words. separated_by : the measurement that tells it from
-    effects that predict the same. shapes : forces, functions of the motion, one for each of the first parameters; the
-    others, which are not linear, shape all of them. variable : "position", "velocity" or "input", where the force is a
-    function of it alone: a free function of the same then judges its shape.
-    dynamics : (s, p) added to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one
-    channel of a sensor. seeds : values where a fit may begin. law : variant of the effect. outside : a function without
-    a name, which stands for whatever the library does not hold. derived : what is reported in the place of the
-    parameters. implausible : (p) why physics forbids values; empty where it does not.
+    name, location : as reported. title : what is missing, in words. separated_by : the measurement that distinguishes
+    it from effects with the same prediction. shapes : forces as functions of the motion, one for each of the first
+    parameters; the remaining, nonlinear parameters shape all of them. variable : "position", "velocity" or "input" if
+    the force is a function of this variable alone: a free function of it then tests its shape. dynamics : (s, p) added
+    to Z. path : (s, p) factor of the path from force to mass. channel : (s, p) factor of one sensor channel. seeds :
+    initial values of fits. law : variant of the effect. outside : an unnamed function, which represents whatever the
+    library lacks. derived : quantities reported instead of the parameters. implausible : (p) why the values are not
+    physical; empty if they are plausible.
     """
 
     name: str
@@ -85,14 +84,14 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
+    """Predicted Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
 
     Y: np.ndarray
     dY: np.ndarray
 
 
 def split(values: np.ndarray, effects: Sequence[Effect], base: int) -> list[np.ndarray]:
-    """Values of each effect."""
+    """Parameter values of each effect."""
     found, at = [], base
     for one in effects:
         found.append(values[at:at + len(one.parameters)])
@@ -101,7 +100,7 @@ def split(values: np.ndarray, effects: Sequence[Effect], base: int) -> list[np.n
 
 
 def slopes(curve: Curve, s: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
-    """Derivative of a curve by each of its parameters, by central differences."""
+    """Derivatives of a curve with respect to each of its parameters, by central differences."""
     found = []
     for j in range(len(p)):
         h = np.zeros(len(p))
@@ -111,13 +110,13 @@ def slopes(curve: Curve, s: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
 
 
 def summed(parts: np.ndarray) -> np.ndarray:
-    """(n,) of the three summands of a line (n, 3): many times as fast as `np.sum` along so short an axis."""
+    """(n,) sum of the three terms of each line (n, 3); much faster than `np.sum` along so short an axis."""
     return parts[:, 0] + parts[:, 1] + parts[:, 2]
 
 
 @dataclass(frozen=True, eq=False)
 class AxisModel:
-    """base : names and units of the base model's parameters, the first one positive."""
+    """A base model with effects. base : names and units of the base parameters; the first one is positive."""
 
     lines: Any
     base: tuple[tuple[str, str], ...]
@@ -138,7 +137,7 @@ class AxisModel:
         return tuple(one.label for one in self.effects)
 
     def of(self, effect: Effect) -> np.ndarray:
-        """Values of an effect."""
+        """Parameter values of an effect."""
         return split(self.values, self.effects, len(self.base))[self.effects.index(effect)]
 
     def at(self, values: np.ndarray) -> AxisModel:
@@ -159,8 +158,8 @@ class AxisModel:
         raise NotImplementedError
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
-        """(n, n_y, 1): what may have a relative error that is constant over a band: the whole prediction. What no law
-        of a force holds exactly is distortion."""
+        """(n, n_y, 1) part of the prediction that may have a relative error, constant over a band: all of it.
+        Departures of a real force from its law are distortion."""
         return self.answer(block, None, False).Y
 
     def columns(self, block: SpectralBlock, derivative: bool = True) -> np.ndarray:
@@ -169,12 +168,12 @@ class AxisModel:
 
 @dataclass(frozen=True, eq=False)
 class MassModel(AxisModel):
-    """M, d and, of an oscillator, k; see the module."""
+    """Model with M, d and, for an oscillator, k; see the module."""
 
     lines: Lines
 
     def _force(self, one: Effect, p: np.ndarray, block: SpectralBlock) -> tuple[np.ndarray, np.ndarray]:
-        """(shapes, n, 3) of an effect on the lines of a block, and their linear parts (shapes, n)."""
+        """(shapes, n, 3) forces of an effect on the lines of a block, and their linear parts (shapes, n)."""
         by = tuple(map(float, p[len(one.shapes):]))
         own = np.array([self.lines.pick(self.lines.of(shape, by), block.name) for shape in one.shapes])
         if self.lines.solves_for == "force" or one.location == "input":
@@ -224,7 +223,7 @@ class MassModel(AxisModel):
 
 
 def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:
-    """Of the base model's parameters, so wide that they bend nothing: a factor of e, or as much as the whole
+    """Priors of the base parameters, wide enough to have no influence: a factor of e, or as much as the whole
     response."""
     v = model.values[:len(model.base)]
     size = sizes(model, list(range(len(v))))
@@ -234,7 +233,7 @@ def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettin
 
 
 def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
-    """Values of parameters that change the prediction by as much as the whole response, r.m.s. over fitted lines."""
+    """Parameter values that change the prediction by as much as the whole response, r.m.s. over the fitted lines."""
     power, total = np.zeros(len(at)), 0
     for block in model.lines.fitted.blocks:
         dY = model.columns(block)[list(at)]
@@ -245,7 +244,7 @@ def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
 
 
 def effect_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
-    """Of the last effect of a model, at its start."""
+    """Priors of the parameters of a model's last effect, at its initial values."""
     one = model.effects[-1]
     n = len(one.parameters)
     start, linear = model.values[-n:], np.array([p.linear for p in one.parameters], bool)

@@ -1,13 +1,14 @@
-"""Records of one mass, force and position, as lines of Hann windows that hold no transients.
+"""Force and position records of one mass as spectral lines of Hann windows, free of transients.
 
-With w(t) a Hann window and its derivative zero at both ends, integration by parts gives the transform of a derivative
-from that of the signal itself (M. Shinbrot, NACA TN 3288, 1954),
+A Hann window w(t) and its derivative are zero at both ends. Integration by parts then gives the transform of a
+derivative from that of the signal itself (M. Shinbrot, NACA TN 3288, 1954),
 
     F{w x'}(omega_k) = sum_l c_l j omega_(k+l) X_(k+l),    c = (-1/4, 1/2, -1/4)
 
-so that M F{w x''} + d F{w x'} + k F{w x} = F{w F} on every line exactly, whatever the state at the ends. The three
-summands are kept apart: a response (a delay, a sprung mass) acts on each at its own frequency, for on their sum it
-would move the window too. Of neighbouring lines, whose noise is correlated by 2/3, every other one is taken.
+so that M F{w x''} + d F{w x'} + k F{w x} = F{w F} holds exactly on every line, whatever the state at the ends. The
+three terms are kept separate, because a response (a delay, a sprung mass) acts on each at its own frequency; applied to
+their sum it would also shift the window. Every other line is used, because the noise of neighbouring lines has a
+correlation of 2/3.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from avis_ctrl.identification.weights import bands
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A record: force and position (n,), and the position that was asked for, where known."""
+    """A record: force and position (n,), and the commanded position where known."""
 
     name: str
     force: np.ndarray
@@ -40,7 +41,7 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Signals of a record at a finer sample rate: q, v, and u; middle and r.m.s. of q, r.m.s. of v."""
+    """Signals of a record at a finer sample rate: q, v and u; mid-range and standard deviation of q, r.m.s. of v."""
 
     q: np.ndarray
     v: np.ndarray
@@ -54,14 +55,14 @@ class Motion:
         return np.sign(self.v)
 
     def dahl(self, distance: float) -> np.ndarray:
-        """(n,) friction of size one that is a spring before it slips."""
+        """(n,) Dahl friction of unit size: a spring before it slips."""
         return dahl(self.q[:, None], self.q[:1], distance, np.zeros(1))[:, 0] / distance
 
 
 def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """(over n,) a band-limited signal at `over` times its rate, and its derivative. Without the line between its ends
-    it is turned about them, so that it goes on without a step. A filter for each phase would add a ripple at the old
-    rate: a velocity that friction takes for a reversal."""
+    """(over n,) a band-limited signal at `over` times its rate, and its derivative. The line between its ends is
+    subtracted and the rest is extended by odd reflection, without a step. A polyphase filter would add a ripple at the
+    old rate, a velocity that friction would take for a reversal."""
     n = len(x)
     slope, t = (x[-1] - x[0]) / (n - 1), np.arange(over * n) / over
     bent = x - x[0] - slope * np.arange(n)
@@ -74,30 +75,30 @@ def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarra
 
 
 def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
-    """Quadratic splines over quantiles of x; any shape of x."""
+    """Quadratic B-splines over the quantiles of x, which represent a function of x of any shape."""
     inner = np.unique(np.quantile(x, np.linspace(0, 1, count - 1)))
     knots = np.r_[[inner[0]] * 2, inner, [inner[-1]] * 2]
     flat = BSpline.design_matrix(np.clip(x.ravel(), inner[0], inner[-1]), knots, 2).toarray()
     return list(flat.T)
 
 
-# A force of size one by the motion, and by what shapes it.
+# Force of unit size as a function of the motion and of shape parameters.
 Shape = Callable[..., np.ndarray]
 
 
 class Lines:
-    """Transforms of records of one axis.
+    """Windowed transforms of the records of one axis.
 
     Parameters
     ----------
-    records : at one sample rate. solves_for : "force" or "position", the signal that the model predicts. band_Hz : of
-    the lines. smooth_Hz : to which the motion is low-passed before functions of it are formed; None for not at all.
+    records : all at one sample rate. solves_for : "force" or "position", the signal that the model predicts. band_Hz :
+    of the lines. smooth_Hz : low-pass cutoff of the motion from which functions are computed; None for no filter.
 
     Attributes
     ----------
-    s : (k,) rad/s, times j. fitted, held : data for the likelihood; the blocks' U hold nothing, the model keeps its own
-    inputs by the name of a block. rows : by block, record and segment of each of its lines. over : samples of the
-    motion for each measured one.
+    s : (k,) j omega [rad/s]. fitted, held : data for the likelihood; U of the blocks is empty, because the model keeps
+    its own inputs by block name. rows : by block, record and number of each of its segments. over : samples of the
+    motion per measured sample.
 
     Raises
     ------
@@ -108,7 +109,7 @@ class Lines:
                  smooth_Hz: float | None = None, settings: AxisSettings = SETTINGS):
         self.rate, self.solves_for, self.settings, self.smooth_Hz = rate, solves_for, settings, smooth_Hz
         self.records = list(records)
-        # Whole records are held out where there are several.
+        # With several records, whole records are held out.
         whole = len(self.records) > 1
         shortest = min(len(one.force) for one in self.records)
         self.length = shortest // (2 if whole else settings.spans) * 2 // (settings.segments + 1)
@@ -121,7 +122,7 @@ class Lines:
             raise InputError(f"expected at least {settings.fewest_lines // 4} lines of the band in each of "
                              f"{settings.spans * settings.segments} segments: a longer record or a wider band",
                              field="samples", value=shortest)
-        # The mean of a window is a line too, at a frequency that is nearly none.
+        # The mean of a window is a line too, at a frequency close to zero.
         self.s = 2j * np.pi * np.maximum(self.k, 1e-3) * rate / self.length
         self.starts: list[np.ndarray] = []
         self.held_out: list[np.ndarray] = []
@@ -167,7 +168,7 @@ class Lines:
                       float(np.sqrt(np.mean(v ** 2))))
 
     def transform(self, x: np.ndarray, record: int, order: int = 0) -> np.ndarray:
-        """(segments, k, 3) summands of the windowed derivative of a signal at the sample rate, or at the finer one
+        """(segments, k, 3) terms of the windowed derivative of a signal, given at the sample rate or at the finer rate
         of the motion."""
         over = round(len(x) / len(self.records[record].force))
         starts, length = self.starts[record] * over, self.length * over
@@ -177,11 +178,11 @@ class Lines:
         return np.array([-0.25, 0.5, -0.25]) * (2j * np.pi * at * self.rate / self.length) ** order * lines
 
     def around(self, omega: np.ndarray) -> np.ndarray:
-        """(n, 3) rad/s, times j, of the summands of lines (n,)."""
+        """(n, 3) j omega [rad/s] of the three terms of lines (n,)."""
         return 1j * (omega[:, None] + 2 * np.pi * self.rate / self.length * np.array([-1, 0, 1]))
 
     def of(self, shape: Shape, by: tuple[float, ...] = ()) -> list[np.ndarray]:
-        """(segments, k, 3) of a function of the motion, shaped by some parameters, by record; computed once."""
+        """(segments, k, 3) by record: a function of the motion with shape parameters `by`; computed once."""
         key = id(shape), by
         if key not in self.kept:
             self.kept[key] = shape, [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i)
@@ -207,14 +208,14 @@ class Lines:
         return m, np.linalg.pinv(X / size) / size[:, None], step
 
     def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) number of the segment of each line of a block, and when it begins [s]."""
+        """(n,) segment number of each line of a block, and the start time of that segment [s]."""
         record, segment = self.rows[name]
         many = max(len(starts) for starts in self.starts)
         when = [self.starts[i][j] / self.rate for i, j in zip(record, segment, strict=True)]
         return np.repeat(record * many + segment, len(self.k)), np.repeat(when, len(self.k))
 
     def pick(self, columns: Sequence[np.ndarray], name: str) -> np.ndarray:
-        """(n,) or (n, 3) of a block; picked once."""
+        """(n,) or (n, 3) values on the lines of a block; computed once."""
         key = id(columns), name
         if key not in self.picked:
             record, segment = self.rows[name]
@@ -222,7 +223,7 @@ class Lines:
         return self.picked[key][1]
 
     def _data(self, held: bool) -> Data:
-        """A block for each octave of loudness, which share a discrepancy."""
+        """One block per octave of signal level; the blocks share one discrepancy."""
         at = [(i, j) for i, flags in enumerate(self.held_out) for j in np.flatnonzero(flags == held)]
         loud = np.array([np.sqrt(np.mean(np.abs(self.Y[i][j]) ** 2)) for i, j in at])
         level = np.round(np.log2(loud / loud.max()))
@@ -240,7 +241,7 @@ class Lines:
 
 
 def floor_of(omega: np.ndarray, Y: np.ndarray, settings: AxisSettings) -> np.ndarray:
-    """(n, 1, 1) the least noise of every line."""
+    """(n, 1, 1) minimum noise variance of every line."""
     return np.full((len(omega), 1, 1), settings.floor ** 2 * float(np.mean(np.abs(Y) ** 2)))
 
 

@@ -1,4 +1,4 @@
-"""What the search for a gap of one axis returns, and its JSON in the contract's form."""
+"""Result of the gap search for one axis, and its JSON form as the contract of `avis gap` requires."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from avis_ctrl.measurement.gates.finding import Picture
 
 @dataclass(frozen=True)
 class AxisStage:
-    """A model on data that no fit has seen. nrmse : norm of the error over that of what was measured. chi2_per_dof :
-    mean square of the error over the measured noise; None where nothing in the data tells the noise."""
+    """A model on data that no fit has used. nrmse : norm of the error over that of the measured response.
+    chi2_per_dof : mean square of the error over that of the measured noise; None if the noise is unknown."""
 
     name: str
     nrmse: float
@@ -25,7 +25,7 @@ class AxisStage:
 
 @dataclass(frozen=True)
 class RunnerUp:
-    """A candidate in the place of a named effect, and its probability."""
+    """A candidate that could replace a named effect, and its probability."""
 
     name: str
     instead_of: str
@@ -36,11 +36,11 @@ class RunnerUp:
 class AxisGap:
     """What is missing from a model of one axis.
 
-    verdict : "none", "explained", "partly explained" or "unexplained" (contract of `avis gap`). effects : named, by
-    their share; traces : those that take next to nothing. stages : base model, then one effect more each. where : bands
-    that hold most of what the last stage leaves. sentences : the first one says all. parameters : of the updated
-    model's
-    base. model : the updated and the base model as plain data, which `simulation` reads.
+    verdict : "none", "explained", "partly explained" or "unexplained" (contract of `avis gap`). effects : the named
+    ones, largest contribution first; traces : those with a negligible contribution. stages : base model, then one more
+    effect each. where : bands with most of the residual of the last stage. sentences : the first is the summary.
+    parameters : base parameters of the updated model. model : the updated and the base model as plain data, as read by
+    `simulation`.
     """
 
     kind: str
@@ -79,5 +79,5 @@ def _plain(several: Mapping[str, Reported]) -> dict[str, Any]:
 
 
 def number(value: float | None) -> float | None:
-    """None where it is not finite."""
+    """The value as a float; None if it is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)

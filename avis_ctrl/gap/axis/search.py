@@ -1,8 +1,8 @@
-"""Which effects the data ask for: score tests of single effects and pairs, refits, evidence; then each is left out and
-replaced by every other.
+"""Selection of the effects that the data support: score tests of single effects and pairs, fits, model evidence. Each
+selected effect is then removed and replaced by every other one.
 
-Every set of effects is fitted once (`Explored`), by the likelihood of the table. The order in which effects are found
-has no influence on what is named.
+Every set of effects is fitted once (`Explored`), with the likelihood of the table. The order in which effects are found
+does not influence which ones are named.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Effects with the values where a fit begins, what the score test says they take off the sum of squares, and their
-    whitened directions (k, N) that the present model lacks."""
+    """Effects with initial values for a fit, the reduction of the sum of squares that the score test predicts, and
+    their whitened directions (k, N), orthogonal to those of the current model."""
 
     effects: tuple[tuple[Effect, np.ndarray], ...]
     fall: float
@@ -38,7 +38,7 @@ class Candidate:
 
 @dataclass(eq=False)
 class Explored:
-    """Fits by the set of their effects' labels; the order in which effects are found has no influence."""
+    """Fits by the set of their effects' labels, so that the order in which effects are found has no influence."""
 
     data: Data
     settings: AxisSettings
@@ -51,7 +51,7 @@ class Explored:
         return found
 
     def with_effects(self, now: Fitted, added: Sequence[tuple[Effect, np.ndarray]]) -> Fitted | None:
-        """The fit with some effects more; None where it came to no end."""
+        """The fit with additional effects; None if it did not converge."""
         labels = frozenset((*now.labels, *(one.label for one, _ in added)))
         if labels not in self.fits:
             model, priors, z = now.model, now.priors, now.z
@@ -79,7 +79,7 @@ class Explored:
 
 
 def candidates(now: Fitted, data: Data, effects: Sequence[Effect], settings: AxisSettings) -> list[Candidate]:
-    """Every effect that the model has not, at its best seed, the largest fall first."""
+    """Every effect that the model does not contain, at its best seed, the largest reduction first."""
     J, e = now.J, now.e
     Q = np.linalg.qr(J.T)[0]
     left, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
@@ -99,7 +99,8 @@ def candidates(now: Fitted, data: Data, effects: Sequence[Effect], settings: Axi
 
 
 def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.ndarray:
-    """(k, N) whitened changes of the prediction by an effect's parameters at its seed."""
+    """(k, N) whitened derivatives of the prediction with respect to an effect's parameters at its seed; only those of
+    linear parameters, if there are any."""
     model = now.model.with_effect(one, seed)
     rows = []
     for block, L in zip(data.blocks, now.weights.L, strict=True):
@@ -111,7 +112,7 @@ def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.nda
 
 
 def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettings) -> list[Candidate]:
-    """The best single effects, and the best pairs that take more than their parts."""
+    """The best single effects, and the best pairs whose joint reduction exceeds the sum of the single ones."""
     singles = [c for c in found if c.fall > 2 * settings.certain]
     one_law: dict[str, Candidate] = {}
     for c in found:
@@ -127,11 +128,11 @@ def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettin
 
 
 def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
-    """The model with effects that the data ask for.
+    """The model with the effects that the data support.
 
-    An effect is added where the score rises by more than the number of candidates explains and held-out data bear it
-    out, and dropped where others have made it idle. Where none is left, each is compared with every other in its place,
-    and the search continues if one is better.
+    An effect is added if the score rises by more than the number of candidates explains and held-out data confirm it.
+    It is dropped if other effects have made it redundant. When no more effects are added, each is compared with every
+    other one in its place, and the search continues if one is better.
     """
     settings, now, revisions = explored.settings, base, 0
     effects = [one for one in effects if not one.outside]
@@ -156,17 +157,17 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
 
 
 def score(one: Fitted, settings: AxisSettings) -> float:
-    """Evidence of what was fitted, and log-likelihood of what was held out."""
+    """Evidence of the fitted data plus log-likelihood of the held-out data."""
     return one.log_evidence + sum(cells(one, True, settings).values())
 
 
 def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
-    """Whether held-out data are more probable by one model than by another."""
+    """Whether held-out data are more probable under one model than under another."""
     return sum(cells(one, True, settings).values()) > sum(cells(other, True, settings).values())
 
 
 def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
-    """Each effect replaced by another law of it, or by any other, where the score rises."""
+    """Replace each effect by another law of the same effect, or by any other effect, if the score rises."""
     settings = explored.settings
     for label in now.labels:
         own, rest = next(one for one in now.model.effects if one.label == label), explored.without(now, label)
@@ -197,8 +198,7 @@ def _without_idle(now: Fitted, explored: Explored) -> Fitted:
 
 
 def at_an_edge(fitted: Fitted) -> str:
-    """In words, a parameter of an effect at the end of its range, or beyond what physics allows; empty where none
-    is."""
+    """Message on a parameter of an effect at the end of its range, or beyond what physics allows; empty if none is."""
     for one in fitted.model.effects:
         if one.implausible and (reason := one.implausible(fitted.model.of(one))):
             return reason
@@ -209,7 +209,7 @@ def at_an_edge(fitted: Fitted) -> str:
 
 
 def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitted | None:
-    """The best model with a function that has no name beside what is named; None where none is called for."""
+    """The best model with an additional unnamed function; None if the data do not support one."""
     settings, tried = explored.settings, []
     others = [one for one in effects if one.outside]
     for c in candidates(now, explored.data, others, settings):
@@ -223,7 +223,7 @@ def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitte
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """Another effect in the place of one: the fit, its odds, and whether it predicts the same."""
+    """Another effect in place of a given one: the fit, its odds, and whether it predicts the same."""
 
     effect: Effect
     fitted: Fitted
@@ -232,7 +232,7 @@ class Rival:
 
 
 def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effect]) -> list[Rival]:
-    """What could stand in the place of an effect, beside all others."""
+    """Effects that could replace a given one while all others are kept."""
     settings = explored.settings
     rest = explored.without(best, label)
     if rest is None:
@@ -254,24 +254,24 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
 
 
 def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
-    """Whether two models predict the same within the data: were one of them true, the other would be behind by less
-    than `alike` in log-likelihood [nats] on average."""
+    """Whether two models predict the same within the data: if one were true, the log-likelihood of the other would be
+    lower by less than `alike` [nats] on average."""
     left = one.white.e - other.white.e
     return bool(0.5 * left @ left < settings.alike)
 
 
 def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> float:
-    """Of another fit against one: by the evidence of what was fitted and the likelihood of what was held out, or by how
-    evenly both are spread over segments and octaves, whichever is larger: what is left of a real record is no white
-    noise."""
+    """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out data,
+    or by how evenly their difference is spread over segments and octaves, whichever is larger: the residual of a real
+    record is not white noise."""
     mine, theirs = cells(one, False, settings), cells(other, False, settings)
     beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
     return larger_odds(mine | cells(one, True, settings), theirs | cells(other, True, settings), beside)
 
 
 def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
-    """Log-likelihood of what was fitted, by segment and octave, or of what was held out, by segment, each of which may
-    be louder than what was fitted: one disturbance decides nothing."""
+    """Log-likelihood of the fitted data by segment and octave, or of the held-out data by segment. Each held-out
+    segment may have a larger variance than the fitted data, so that a single disturbance decides nothing."""
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
     weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
     rows, determinant = row_table(fitted, data), np.zeros(len(e))
@@ -287,7 +287,7 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int,
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Of each real number of the stacked residual: frequency [rad/s], segment, begin [s], loudness."""
+    """Frequency [rad/s], segment, its start time [s], and level of each real number of the stacked residual."""
 
     frequency: np.ndarray
     segment: np.ndarray
@@ -305,7 +305,7 @@ def row_table(fitted: Fitted, data: Data) -> Rows:
 
 
 def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
-    """Halves of the data by band, time and level, each with half of the information on some parameters."""
+    """Halves of the data by band, time and level, each with half of the information on the given parameters."""
     rows = row_table(fitted, fitted.model.lines.fitted)
     information = np.sum(fitted.J[[fitted.priors.names.index(name) for name in names]] ** 2, axis=0)
     found = []
@@ -321,8 +321,8 @@ def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
 
 
 def robust(fitted: Fitted) -> np.ndarray:
-    """Covariance of the values of all parameters, with the scores summed over each segment (K. Liang, S. Zeger,
-    Biometrika 73 (1986) 13): whatever correlation there is inside a segment counts. Not below that of the fit."""
+    """Covariance of all parameter values, with the scores summed over each segment (K. Liang, S. Zeger, Biometrika 73
+    (1986) 13), which allows any correlation within a segment. No variance is below that of the fit."""
     segment, slope = row_table(fitted, fitted.model.lines.fitted).segment, fitted.priors.slopes(fitted.z)
     groups = np.unique(segment)
     scores = np.array([fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups)

@@ -1,9 +1,10 @@
-"""A seismometer channel: coil and displacement of one second-order mass, and what one of them may lack.
+"""A seismometer channel: coil and displacement of a second-order mass, and effects that one of them may lack.
 
-The data are the first channel over the drive, and the second channel over the first, in which the mass itself cancels:
-a fault of one channel shows there far below what the mass's own nonlinearity leaves in each response. Logarithms of
-magnitudes and phases are apart, each with its own discrepancy: a laser that counts too little leaves the phase alone.
-They are real; two neighbouring frequencies make one complex number for the likelihood.
+The data are the first channel over the drive, and the second channel over the first. In the second ratio the mass
+cancels: a fault of one channel shows there far below the residual that the nonlinearity of the mass causes in each
+response. Logarithms of magnitudes and phases are separate outputs, each with its own discrepancy: a laser that misses
+counts does not affect the phase. They are real; two neighbouring frequencies form one complex number for the
+likelihood.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 @dataclass(frozen=True, eq=False)
 class Channels:
     """Responses as blocks for the likelihood. Outputs are magnitude and phase of each response: Y is 1 + j, and the
-    model predicts Y and the logarithm of its own response over the measured one.
+    model predicts Y plus the logarithm of its own response over the measured one.
 
-    f : (n,) Hz, n even. measured : (n, responses). spread : (pairs,) what the discrepancy is expected to be
-    proportional to, by which all outputs are divided. names : of the channels, one or two. rows : pairs by block.
+    f : (n,) Hz; an odd last one is not used. measured : (n, responses). spread : (pairs,) scale to which the
+    discrepancy is expected to be proportional; all outputs are divided by it. names : of the channels, one or two.
+    rows : pairs by block.
     """
 
     f: np.ndarray
@@ -43,13 +45,13 @@ class Channels:
     settings: AxisSettings
 
     def of_lines(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) number of a pair, and its place in the order of frequencies."""
+        """(n,) pair number, and its position in the order of frequencies."""
         return self.rows[name], self.rows[name].astype(float)
 
 
 @dataclass(frozen=True, eq=False)
 class SensorModel(AxisModel):
-    """A mass on a spring, read by its coil and by a displacement sensor."""
+    """A mass on a spring, measured by its coil and by a displacement sensor."""
 
     lines: Channels
 
@@ -69,7 +71,7 @@ class SensorModel(AxisModel):
         return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
-        return np.zeros((*block.Y.shape[:2], 1))  # what is constant over the band is a gain, which is free
+        return np.zeros((*block.Y.shape[:2], 1))  # an error that is constant over the band is a gain, which is free
 
     def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
         rows = self.lines.rows[block.name]
@@ -86,17 +88,17 @@ class SensorModel(AxisModel):
 
 def seismometer(responses: Responses, distortion: np.ndarray | None = None, ratio_variance: np.ndarray | None = None,
                 settings: AxisSettings = SETTINGS) -> Problem:
-    """A seismometer on a calibration coil.
+    """Problem of a seismometer driven by its calibration coil.
 
     Parameters
     ----------
-    responses : coil, displacement or both over the drive. distortion : (n,) r.m.s. of harmonics over the first, of the
-    motion itself; zero where it is not known: what they carry, the fundamental lacks. ratio_variance : (n,) relative
-    E|error|^2 of the second channel over the first; the sum of both variances where it is not known.
+    responses : coil, displacement or both over the drive. distortion : (n,) r.m.s. of the harmonics of the motion
+    itself over its fundamental, which lacks what they contain; zero where unknown. ratio_variance : (n,) relative
+    E|error|^2 of the second channel over the first; by default the sum of both variances.
 
     Raises
     ------
-    InputError : shapes, few frequencies, a ground response. ComputationError : no seismometer fits.
+    InputError : wrong shapes, too few frequencies, a ground response. ComputationError : no seismometer fits.
     """
     f = np.asarray(responses.frequency_Hz, float)
     n, least = len(f), settings.frequencies
@@ -116,11 +118,11 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     measured_noise, noise = (np.repeat(np.maximum(one[::2] + one[1::2], settings.floor ** 2), 2, axis=1)
                              for one in (np.stack([relative[names[0]] + harmonic, *([both] if len(H) > 1 else [])],
                                                   axis=1)[:n] / 2 for harmonic in (0.0, h ** 2)))
-    # A mass that is not linear scatters by as much as its harmonics carry, beside what is alike at all frequencies.
+    # A nonlinear mass scatters by as much as its harmonics contain, in addition to the scatter at all frequencies.
     spread = np.sqrt(1 + (h[:n] / max(float(np.median(h)), 1e-12)) ** 2)
     spread = np.sqrt(spread[::2] * spread[1::2])
     measured_noise, noise = measured_noise / spread[:, None] ** 2, noise / spread[:, None] ** 2
-    # The least of all pairs: what else there is, the estimated discrepancy holds, which is alike in all of them.
+    # The minimum over all pairs; the rest is part of the estimated discrepancy, which is equal in all of them.
     noise = np.broadcast_to(noise.min(axis=0), noise.shape)
     pairs, rows, data = np.arange(n // 2), {}, {}
     inner = (pairs % 3 == 1) & (pairs < n // 2 - 1)  # the ends, where effects show most, are fitted
@@ -148,7 +150,7 @@ HIGHER = "higher frequencies: the phase of a delay stays proportional to them, t
 
 
 def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
-    """The library: a delay, a lag, a mode, a high-pass of one channel or of all, and crosstalk."""
+    """The library: delay, lag, mode and high-pass of one channel or of all, and crosstalk."""
     top, low, found = float(f[-1]), float(f[0]), []
     longest = 0.45 / top
 
@@ -157,13 +159,13 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
         return {"frequency_Hz": (w / (2 * np.pi), "Hz"), "damping": (p[0] * w / 2, "1")}
 
     def heavy(p: np.ndarray) -> str:
-        # A mode of damping 0.87 has the phase of a delay to fourth order, and a mount has not.
+        # A mode of damping ratio 0.87 has the phase of a delay to fourth order; a real mount does not.
         damping = mode(p)["damping"][0]
         return f"a mount with a damping of {damping:.2g} is none" if damping > LARGEST_MODE_DAMPING else ""
     for place in ("drive", *reversed(channels)) if len(channels) > 1 else channels:
         what = f"of the {place}"
         found += [
-            # No channel is early; the drive's column may have been logged late.
+            # No channel can lead; the drive's column may have been logged late.
             Effect("delay", place, f"a pure delay {what}", (
                 Parameter("delay_s", "s", -longest if place == "drive" else 0.0, longest),), HIGHER,
                    channel=lambda s, p: np.exp(-s * p[0])),
@@ -189,7 +191,7 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
 
 
 def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str) -> dict[str, Any]:
-    """Arguments of `seismometer` from sine records by frequency.
+    """Arguments of `seismometer` from sine records in order of frequency.
 
     Raises
     ------
@@ -205,7 +207,7 @@ def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str
                           {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
                           {role: np.array([v for _, v in pair]) for role, pair in pairs.items()})
     at = [used[0].channels.index(role) for role in measured]
-    # What every channel shows is the motion's; what one alone shows is its own noise or hum.
+    # Distortion in every channel is that of the motion; in one channel alone it is its own noise or hum.
     seen = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
     found: dict[str, Any] = {"responses": responses, "distortion": seen}
     if {"coil", "displacement"} <= set(measured):

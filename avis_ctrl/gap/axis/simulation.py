@@ -1,5 +1,5 @@
-"""What an identified axis does in another record: the motion of an oscillator by its input alone, integrated in time;
-the force of a drive by its motion."""
+"""Prediction of another record by an identified axis: the motion of an oscillator from its input alone, integrated in
+time, or the force of a drive from its motion."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from avis_ctrl.gap.axis.settings import SETTINGS
 
 
 def predicted(model: Mapping[str, Any], which: str, record: Signals, rate: float) -> np.ndarray:
-    """(n,) force of a drive, or position of an oscillator, by the model "baseline" or "updated".
+    """(n,) force of a drive, or position of an oscillator, predicted by the model "baseline" or "updated".
 
     Raises
     ------
-    InputError : a kind that has no simulation. ComputationError : a motion that diverges.
+    InputError : a kind without simulation, an effect outside the library. ComputationError : the motion diverges.
     """
     kind, own = str(model["kind"]), model[which]
     if kind not in ("drive", "oscillator"):
@@ -41,7 +41,7 @@ def predicted(model: Mapping[str, Any], which: str, record: Signals, rate: float
 
 
 def _filtered(x: np.ndarray, curve, rate: float) -> np.ndarray:
-    """A signal through a response of s, without the step from its end to its begin."""
+    """Filter a signal by a response in s; its mirror image is appended to avoid a step from end to start."""
     n = len(x)
     s = 2j * np.pi * np.fft.rfftfreq(2 * n, 1 / rate)
     return np.fft.irfft(np.fft.rfft(np.r_[x, x[::-1]]) * curve(s), 2 * n)[:n]
@@ -71,7 +71,7 @@ def _force(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray
 
 def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray]], record: Signals, rate: float,
             scale: Scale) -> np.ndarray:
-    """From the measured state at the begin, by Runge-Kutta. Static forces of position and velocity are a table."""
+    """Runge-Kutta integration from the measured initial state; static forces are interpolated from a table."""
     over, u = 2 * SETTINGS.oversampled, record.force
     for one, p in effects:
         if one.location == "input" and one.shapes:
@@ -101,7 +101,7 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
 
 @numba.njit(cache=True)
 def _integrated(u, over, n, h, m, d, k, table, reach, speed, slip, sprung, start):  # pragma: no cover
-    x = np.zeros(5)  # q, v, displacement and velocity of the sprung mass, friction's state
+    x = np.zeros(5)  # q, v, displacement and velocity of the sprung mass, state of the friction
     x[0], x[1], x[2], x[3] = start[0], start[1], start[0], start[1]
     found = np.empty(n)
     last, rates, half = table.shape[0] - 1, np.zeros((4, 5)), np.array([0.0, 0.5, 0.5, 1.0])

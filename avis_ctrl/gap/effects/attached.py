@@ -1,4 +1,4 @@
-"""A sprung mass on the payload: along one direction, or along three axes with a frequency each."""
+"""A sprung mass on the payload: along one direction, or along three axes with a separate frequency for each."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ THREE_AXES = ("axes", "turned")
 
 @register
 class AttachedOscillator(AtPoint):
-    """A mass m on a spring and damper at a point: m s^2 (2 z w s + w^2)/(s^2 + 2 z w s + w^2) along its directions.
+    """A mass m on a spring and damper at a point: m s^2 (2 z w s + w^2)/(s^2 + 2 z w s + w^2) along each direction.
 
-    oblique : one direction d; the parameters are d sqrt(m), of either sign. axes : the same mass along x, y and z, each
-    with its own frequency. turned : the same along three axes at right angles that are turned against x, y and z. "z",
-    "xy" .. : the same mass and frequency along these axes, for values given by hand.
+    oblique : one direction d; the parameters are d sqrt(m), of either sign. axes : the same mass along x, y and z, with
+    a separate frequency for each. turned : the same along three orthogonal axes that are rotated relative to x, y and
+    z. "z", "xy" .. : the same mass and frequency along these axes, for values specified by hand.
     """
 
     name = "attached_oscillator"
@@ -51,7 +51,7 @@ class AttachedOscillator(AtPoint):
             most = float(np.sqrt(mass))
             along = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
                                      -most, most, 0.1 * most) for axis in "xyz"]
-            # Along the line of action a place makes no difference and may end anywhere.
+            # The position along the line of action has no effect, so it may end at a bound.
             return (*along, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant in THREE_AXES:
             each = [replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
@@ -67,12 +67,12 @@ class AttachedOscillator(AtPoint):
         for row, mass, frequency in elements(place, values):
             Z = mass * sprung(ops.s, frequency, values["damping"])
             ops.add_impedance(Z[:, None], row[None])
-            # What each mass starts with rings at its own frequency.
+            # The initial state of each mass rings at the mass's own frequency.
             ops.inner.append(row[:, None] / second_order(ops.s, frequency, values["damping"])[:, None, None])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over frequencies, damping ratios, places and directions; the mass follows from the score test. Turned axes
-        begin at those along x, y and z (`richer`)."""
+        """Seeds over frequencies, damping ratios, places and directions; the mass follows from the score test. Turned
+        axes start from axes along x, y and z (`richer`)."""
         if place.endswith("turned"):
             return []
         parameters = self.parameters(score.model, place)
@@ -80,8 +80,8 @@ class AttachedOscillator(AtPoint):
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """Along three axes, from a fit along one direction: the nearest axis keeps its frequency, and along the others
-        a resonance is searched at each frequency, anywhere on the line of action. Along turned ones, from these."""
+        """From a fit along one direction: three axes, of which the nearest keeps its frequency; along the others, a
+        resonance is searched at each frequency, anywhere on the line of action. From three axes: turned ones."""
         if one.place.endswith("axes"):
             return [("payload/turned", (*one.values, 0.0, 0.0, 0.0))]
         if not one.place.endswith("oblique"):
@@ -90,7 +90,7 @@ class AttachedOscillator(AtPoint):
         a = np.array([values[f"along_{axis}"] for axis in "xyz"])
         mass, first = float(a @ a), int(np.argmax(np.abs(a)))
         parameters = self.parameters(score.model, "payload/axes")
-        # Resonances of a damping ratio zeta are 2 zeta wide: a step of zeta misses none.
+        # A resonance with damping ratio zeta has a relative width of 2 zeta, so a step of zeta misses none.
         grid, damping = parameters[1].grid, max(values["damping"], SETTINGS.narrowest)
         count = 2 + int(np.log(grid[-1] / grid[0]) / damping)
         frequencies = (*np.geomspace(grid[0], grid[-1], count), SETTINGS.stiff_Hz)
@@ -111,8 +111,8 @@ class AttachedOscillator(AtPoint):
         return ""
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """Of one direction: mass, direction, and the point nearest to the geometric centre on the line of action, for
-        along that line a place makes no difference."""
+        """For one direction: mass, direction, and the point on the line of action nearest to the geometric centre,
+        because the position along that line has no effect."""
         found = super().reported(model, place, values, covariance)
         a = np.array([values.get(f"along_{axis}", 0.0) for axis in "xyz"])
         if not np.any(a):
@@ -123,7 +123,7 @@ class AttachedOscillator(AtPoint):
 
 
 def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]]:
-    """(row over q (6,), mass, frequency in Hz) along each direction in which the mass can move."""
+    """(row over q (6,), mass, frequency [Hz]) for each direction in which the mass can move."""
     variant, rows = place.partition("/")[2], point_map(place_of(values))
     if variant == "oblique":
         a = np.array([values[f"along_{axis}"] for axis in "xyz"])
@@ -137,7 +137,7 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
-    """Best place and direction at each frequency of the grid and of the residual's peaks; finer about the best."""
+    """Best place and direction at each frequency of the grid and each peak of the residual, refined near the best."""
     every = positions(parameters)
     most, looks = parameters[0].high, len(parameters[3].grid) * len(SETTINGS.dampings)
 
@@ -163,7 +163,7 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
 
 
 def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
-    """Three frequencies at once: all triples at every place of the grid, then finer about the best places."""
+    """Three frequencies at once: all triples at every place of the grid, then refined near the best places."""
     points, zeta = positions(parameters), 0.05
     frequencies = np.array([f for f in sorted({*parameters[1].grid, *peaks(score)}) if f > 2.0])
     G, b = _at_frequencies(score, frequencies, zeta)
@@ -188,8 +188,8 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
 
 def _along_the_others(score: Score, damping: float, frequencies: Sequence[float], points: np.ndarray, axes: str
                       ) -> tuple[tuple[float, float], np.ndarray]:
-    """Frequencies along two axes, and the point (3,), that take most together. Their masses are left free: effects
-    without a name have taken part of their response."""
+    """Frequencies along two axes, and the point (3,), with the largest joint reduction of chi-square. The two masses
+    are free, because unnamed effects have absorbed part of their response."""
     G, b = _at_frequencies(score, frequencies, damping)
     best = -np.inf, (0, 0), points[0]
     for rows, point in zip(at_points(points, axes), points, strict=True):
@@ -205,7 +205,7 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
 
 def _at_frequencies(score: Score, frequencies: Sequence[float] | np.ndarray, damping: float
                     ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 21, n, 21) and (n, 21): Gram matrix of the unit matrices at each frequency, and product with the residual."""
+    """(n, 21, n, 21) Gram matrix of the unit matrices at each frequency, and (n, 21) product with the residual."""
     kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
                           dtype=np.float32)
     n = len(frequencies)
@@ -213,7 +213,7 @@ def _at_frequencies(score: Score, frequencies: Sequence[float] | np.ndarray, dam
 
 
 def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:
-    """(chi2, mass, index of the frequency along x, y, z) at one place; G (n, 3, n, 3), b (n, 3)."""
+    """(chi2, mass, frequency index along x, y, z) of the best triple at one place; G (n, 3, n, 3), b (n, 3)."""
     own = np.einsum("fafa->af", G)
     x, y, z = np.ix_(*(range(len(b)),) * 3)
     along = b[x, 0] + b[y, 1] + b[z, 2]
@@ -224,7 +224,7 @@ def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]
 
 
 def _best_point(G: np.ndarray, b: np.ndarray, axes: np.ndarray, triple: Sequence[int]) -> int:
-    """Place at which three frequencies take most; axes (places, 3, 21)."""
+    """Index of the place at which the three frequencies reduce chi-square most; axes (places, 3, 21)."""
     rows, own = axes.reshape(len(axes), -1), list(triple)
     A = G[own][:, :, own].reshape(63, 63)
     along = rows @ b[own].reshape(63)

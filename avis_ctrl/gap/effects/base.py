@@ -1,4 +1,4 @@
-"""What an effect is: a named piece of physics with a place, parameters, and a way to act on the table.
+"""Base class of effects. An effect is a named piece of physics with a place, parameters, and an action on the table.
 
 To add one, write a class and register it:
 
@@ -7,9 +7,10 @@ To add one, write a class and register it:
         name = "eddy_brake"
         ...
 
-`change` acts on the table line by line; an effect that depends on amplitude or time gives `volts`, `force` or `reading`
-instead, from the record's motion in time. Parameters marked `linear` vanish at `none`: the effect is nearly linear
-in them there, which the score test and the starting values use; the others shape it (a frequency, a damping).
+`change` acts on the table line by line. An effect that depends on amplitude or time implements `volts`, `force` or
+`reading` instead, from the record's motion in time. A parameter marked `linear` has no effect at the value `none`. Near
+that value the effect is almost linear in it, which the score test and the starting values use. The other parameters
+shape the effect (a frequency, a damping).
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ from avis_ctrl.rigs.rig import Rig
 class LibrarySettings:
     """Assumptions of the library of effects.
 
-    tilted_rad : tilt up to which a sensor counts as lying along an earth axis [rad]: far more than one is mounted by.
-    tried_Hz : frequencies at which an effect of the user's own is tried out [Hz]: below, at and above the suspension.
-    reach_m : largest distance along each axis from the geometric centre at which something can be fixed to a payload
-        [m].
-    most_turned : largest angle about each axis by which the axes of a sprung mass may be turned against x, y, z [rad]:
-        every three axes at right angles are at most 1.1 rad from some order of these.
+    tilted_rad : tilt up to which a sensor counts as aligned with an earth axis [rad]: far more than a mounting error.
+    tried_Hz : frequencies at which a user-defined effect is tested [Hz]: below, at and above the suspension resonances.
+    reach_m : largest distance from the geometric centre, along each axis, at which something can be attached to a
+        payload [m].
+    most_turned : largest rotation about each axis of the axes of a sprung mass relative to x, y, z [rad]: any three
+        orthogonal axes are at most 1.1 rad from some permutation of x, y, z.
     loss_Hz : frequency at which the stiffness of a mount with structural damping equals that of the rig file [Hz]: near
-        the suspension's own resonances.
-    leveled : mounts with a leveling valve, the first ones; three points determine a plane.
+        the suspension resonances.
+    leveled : number of mounts with a leveling valve, the first ones; three points determine a plane.
     valve_Hz : lowest and highest corner frequency of a leveling valve [Hz]: at the lower one the valve hardly acts, at
         the upper one it acts without lag.
     """
@@ -56,14 +57,14 @@ class LibrarySettings:
 
 
 SETTINGS = LibrarySettings()
-# Of parameters by name.
+# Parameter values by name.
 Values = Mapping[str, float]
 
 
 class Table(Protocol):
-    """What an effect uses of the table that it acts on: the model without it (`gap.table_model.TableModel`).
+    """What an effect uses of the table that it acts on: the model without the effect (`gap.table_model.TableModel`).
 
-    base : the rig and its free parameters. effective : the same with what other effects set of the rig's parameters.
+    base : the rig and its free parameters. effective : the same, with the rig parameters as other effects set them.
     motion : records in time, by name.
     """
 
@@ -93,9 +94,9 @@ class Table(Protocol):
 class EffectParameter:
     """A parameter of an effect.
 
-    none : value without the effect. low, high : what physics allows. size : one unit of it in a fit.
-    linear : the effect vanishes as this goes to `none`, at first in proportion.
-    grid : for one that is not linear, values of the search. optional : one that may end at its bounds.
+    none : value without the effect. low, high : physical limits. size : unit of the parameter in a fit.
+    linear : the effect vanishes in proportion as the parameter approaches `none`.
+    grid : values of the search, for a nonlinear parameter. optional : whether it may end at its bounds.
     """
 
     name: str
@@ -112,7 +113,7 @@ class EffectParameter:
 
 @dataclass(frozen=True)
 class Reported:
-    """A parameter as the report gives it: value, standard deviation, unit."""
+    """A parameter as reported: value, standard deviation, unit."""
 
     value: float
     std: float
@@ -123,10 +124,10 @@ class Reported:
 
 
 class Added(NamedTuple):
-    """What an effect adds to a record on its lines, (n, channels) each, None for nothing.
+    """Contribution of an effect to a record on its lines, (n, channels) each; None for none.
 
-    volts : beside the commanded ones. force : generalised, on the payload. reading : acceleration along the sensors
-    beside the payload's own. output : beside what the sensors read, in the unit of y.
+    volts : added to the commanded volts. force : generalised, on the payload. reading : acceleration along the sensors,
+    added to that of the payload. output : added to the sensor outputs, in the unit of y.
     """
 
     volts: np.ndarray | None = None
@@ -136,18 +137,18 @@ class Added(NamedTuple):
 
 
 def differs_from_zero(values: Values, std: Values, names: Iterable[str]) -> bool:
-    """Whether any of these parameters is more than three of its standard deviations from zero."""
+    """Whether any of these parameters is more than three standard deviations from zero."""
     return any(abs(values[name]) > 3 * std[name] for name in names)
 
 
 def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
-    """Of mounts, contacts or drives that differ from their mean; words with {} for the name."""
+    """Parameters of mounts, contacts or drives that differ from their mean; words has {} for the name."""
     return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
             for one in names)
 
 
 def shares(values: Values) -> np.ndarray:
-    """(m,) of each mount, contact or drive over their mean, from the values uneven_ .. of all but the last."""
+    """(m,) value of each mount, contact or drive over their mean, from the values uneven_ .. of all but the last."""
     given = [value for name, value in values.items() if name.startswith("uneven_")]
     return 1 + np.array([*given, -sum(given)])
 
@@ -157,13 +158,13 @@ class Effect(ABC):
 
     Attributes
     ----------
-    name : of the contract. title : in words, for a sentence. looks_like : what it does to responses.
-    at : where it can act, for one whose `places` do not depend on the table.
-    nonlinear : depends on amplitude or time; acts through `volts` or `force`.
-    strength : the parameter to which `force` is in proportion, empty where to none.
-    holds_states : has resonances of its own, whose states at the ends of a record are to be found with its transient.
-    resonant : adds resonances of many parameters, of which a mode of any shape is a first description.
-    outside : of `effects.unnamed`, refitted beside the library and never named.
+    name : as in the contract. title : in words, for a sentence. looks_like : its signature in the responses.
+    at : where it can act, if its `places` do not depend on the table.
+    nonlinear : depends on amplitude or time; acts through `volts`, `force` or `reading`.
+    strength : parameter to which `force` is proportional; empty if there is none.
+    holds_states : has states of its own; their values at the ends of a record are estimated with its transient.
+    resonant : adds resonances with many parameters, which a mode of any shape describes approximately.
+    outside : an effect of `effects.unnamed`, fitted in competition with the library and never named.
     """
 
     name: str
@@ -177,23 +178,23 @@ class Effect(ABC):
     outside: bool = False
 
     def places(self, model: Table) -> tuple[str, ...]:
-        """Where it can act on this table; empty where it cannot."""
+        """Where the effect can act on this table; empty if nowhere."""
         return self.at
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        """Its parameters there."""
+        """Parameters of the effect at a place."""
         raise NotImplementedError
 
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
-        """Parameters of the rig that it sets."""
+        """Parameters of the rig that the effect sets."""
         return {}
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        """Act on the table line by line."""
+        """Modify the table line by line."""
         return None
 
     def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        """(samples, n_u) commanded volts that act, None where they are as commanded."""
+        """(samples, n_u) volts that act in place of the commanded ones; None if they are unchanged."""
         return None
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
@@ -201,15 +202,15 @@ class Effect(ABC):
         return None
 
     def reading(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
-        """(samples, n_y) acceleration along the sensors beside the payload's own, None for none."""
+        """(samples, n_y) acceleration along the sensors, added to that of the payload; None for none."""
         return None
 
     def said(self, place: str, values: Values) -> str:
-        """In words, with its place, for a sentence."""
+        """Description with its place, for a sentence."""
         return f"{self.title} ({place})"
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
-        """What it adds to a record on lines omega; of a force in proportion to `strength`, that of a unit is kept."""
+        """Contribution to a record on lines omega; for a force proportional to `strength`, the unit force is cached."""
         def on_lines(act: Callable[..., np.ndarray | None], values: Values) -> np.ndarray | None:
             if getattr(Effect, act.__name__) is getattr(type(self), act.__name__):
                 return None
@@ -230,7 +231,7 @@ class Effect(ABC):
         return Added(volts, force, on_lines(self.reading, values))
 
     def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
-        """Starts of the search: (n_parameters,) each, shape parameters on their grid and the linear ones at none."""
+        """Initial points of the search, (n_parameters,) each: shape parameters on their grid, linear ones at none."""
         parameters = self.parameters(model, place)
         points = [np.array([])]
         for one in parameters:
@@ -239,15 +240,15 @@ class Effect(ABC):
         return points
 
     def implausible(self, values: Values, std: Values) -> str:
-        """Why physics forbids these values, empty where it does not."""
+        """Why these values are not physical; empty if they are plausible."""
         return ""
 
     def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
-        """(mean, standard deviation) by name of parameters that records need not determine, from values near by."""
+        """(mean, standard deviation) by name of parameters that records need not determine, from approximate values."""
         return {}
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """Parameters as a person reads them; by default as they are."""
+        """Parameters as the report shows them; by default unchanged."""
         return {one.name: Reported(values[one.name], float(np.sqrt(max(covariance[k, k], 0.0))), one.unit)
                 for k, one in enumerate(self.parameters(model, place))}
 
@@ -256,11 +257,11 @@ _registry: dict[str, Effect] = {}
 
 
 def register(effect: type[Effect]) -> type[Effect]:
-    """Put an effect into the library (as a class decorator).
+    """Add an effect to the library (class decorator).
 
     Raises
     ------
-    InputError : a name that is taken by another class, or none.
+    InputError : no name, or a name that another class uses.
     """
     name = getattr(effect, "name", "")
     if not name:
@@ -274,11 +275,11 @@ def register(effect: type[Effect]) -> type[Effect]:
 
 
 def registered() -> dict[str, Effect]:
-    """What has been registered so far, by name."""
+    """All registered effects by name."""
     return dict(_registry)
 
 
 def restore(known: dict[str, Effect]) -> None:
-    """Make the library what it was, as `registered` gave it."""
+    """Reset the library to a state that `registered` returned."""
     _registry.clear()
     _registry.update(known)

@@ -18,9 +18,9 @@ from avis_ctrl.rigs.rigid_body import point_map
 
 @register
 class CableStiffness(AtPoint):
-    """A spring, with a little damping, from a point of the payload to ground.
+    """A spring with a little damping, from a point of the payload to ground.
 
-    axes : a stiffness along each of x, y and z. oblique : one direction d; the parameters are d sqrt(k).
+    axes : one stiffness along each of x, y and z. oblique : one direction d; the parameters are d sqrt(k).
     """
 
     name = "cable_stiffness"
@@ -29,7 +29,7 @@ class CableStiffness(AtPoint):
     at = ("payload/axes", "payload/oblique")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # of one mount of four, on any rig
+        size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # 2 % of one mount of four, on any rig
         most = 200 * size
         if place.endswith("oblique"):
             own = [EffectParameter(f"along_{axis}", "sqrt(N/m)", f"root of the stiffness times its direction's {axis}",
@@ -49,8 +49,8 @@ class CableStiffness(AtPoint):
         ops.add_impedance(Z, rows, Z)
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over a grid of places, finer about the best: the direction and stiffness that take most, or those along the
-        axes, none negative."""
+        """Seeds over a grid of places, refined near the best: the direction and stiffness that reduce chi-square most,
+        or the non-negative stiffnesses along the axes."""
         parameters = self.parameters(score.model, place)
         G, b = project(score, np.ones_like, "spring")
         of = _along_one if place.endswith("oblique") else _along_axes
@@ -66,8 +66,8 @@ class CableStiffness(AtPoint):
             "a cable whose stiffness the data do not distinguish from zero")
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """Of one direction: stiffness, direction, and the foot of the line of action; else the largest stiffness before
-        all others."""
+        """For one direction: stiffness, direction, and the foot of the line of action. Otherwise all stiffnesses,
+        preceded by the largest."""
         found = super().reported(model, place, values, covariance)
         if "along_x" in values:
             return {**told(values, covariance, "stiffness_N_per_m", "N/m"), "damping_s": found["damping_s"]}
@@ -92,7 +92,7 @@ def _along_axes(G: np.ndarray, b: np.ndarray, points: np.ndarray, most: float) -
 
 
 def tie(values: Values) -> np.ndarray:
-    """(3, 3) N/m: stiffness of a cable from its values by name."""
+    """(3, 3) stiffness of a cable [N/m] from its values by name."""
     if "along_x" in values:
         a = np.array([values[f"along_{axis}"] for axis in "xyz"])
         return np.outer(a, a)

@@ -1,4 +1,4 @@
-"""What the mounts stand on: a chassis that recoils."""
+"""The chassis under the mounts: it recoils."""
 
 from __future__ import annotations
 
@@ -26,47 +26,50 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
 WAYS = ("x", "y", "z", "rx", "ry", "rz")
-# Coordinates that the low mass of a frame couples, so that one can compensate for the other.
+# Coordinates that the low centre of mass of a frame couples, so that one can compensate for the other.
 TOGETHER = (("x", "ry"), ("y", "rx"), ("z",), ("rz",))
 
 
 @dataclass(frozen=True)
 class ChassisSettings:
-    """Of the search for the starting values of a chassis.
+    """Settings of the search for the starting values of a chassis.
 
-    A coordinate is one of x, y, z, rx, ry, rz of the chassis. The gap is chi-square less its degrees of freedom.
-    Weights relative to the response stand for noise of that fraction of the response, added to the measured noise.
+    A coordinate is one of x, y, z, rx, ry, rz of the chassis. The gap is chi-square minus its degrees of freedom.
+    Weights relative to the response mean noise of a given fraction of the response, added to the measured noise.
 
-    own_Hz : lowest and highest frequency [Hz] of the resonance of one coordinate, and number of those searched; below
-        the lowest the suspension's own modes dominate.
+    own_Hz : lowest and highest resonance frequency [Hz] of a single coordinate, and number of frequencies searched;
+        below the lowest, the suspension modes dominate.
     stiff_Hz : frequency of a coordinate in which no resonance was found [Hz]: near the end of the band.
-    first_damping : damping ratio of that search [1]: broad enough that no step of the grid passes by a resonance.
-    least_gain : ratio of the falls of chi-square with one more coordinate and without it, below which that coordinate
+    first_damping : damping ratio of that search [1]: large enough that the grid misses no resonance.
+    least_gain : reduction of chi-square with one more coordinate over that without it, below which that coordinate
         counts as stiff [1].
-    mass_ratio : ratio of the masses of two coordinates, up to which both can be of one chassis [1].
-    alike_Hz : lowest and highest frequency [Hz] of starts with one frequency for all coordinates, and their number.
-    alike_mass : mass of these starts over that of the payload [1].
-    alike_shape : their radii of gyration about x, y, z, height of the mass and height of the springs over the mass [m]:
-        of a frame as large as a table.
-    lines, more_lines : lines of a record for short fits, and for the last one: more lines separate minima that few do
-        not.
-    wide : chi-square per degree of freedom above which starts with one frequency are tried, and coordinates one by one.
-    steep : the same above which fits begin with weights relative to the response.
-    fractions : of the response, for these weights, one after the other; the last fit uses the measured noise.
-    tried : (number of starts, iterations of each fit) of successive rounds, each with the best of the one before.
-    tried_by_fractions : the same with weights relative to the response, which need one round only: the first-order
-        prediction is good there.
-    later_iterations : iterations of a fit that continues from an earlier one.
-    converged : chi-square per degree of freedom up to which the fits with relative weights have led to the minimum.
-    promising : fraction of the gap that may remain after a start or a step for it to be followed.
+    mass_ratio : ratio of the masses of two coordinates, up to which both can belong to one chassis [1].
+    alike_Hz : lowest and highest frequency [Hz] of initial points with one frequency for all coordinates, and their
+        number.
+    alike_mass : mass at these points over that of the payload [1].
+    alike_shape : radii of gyration about x, y, z, height of the mass, and height of the springs above the mass [m] at
+        these points: for a frame as large as a table.
+    lines, more_lines : lines of a record for short fits, and for the last one: more lines separate minima that few
+        lines do not.
+    wide : chi-square per degree of freedom above which initial points with one frequency are tried, and coordinates are
+        refined one by one.
+    steep : chi-square per degree of freedom above which fits start with weights relative to the response.
+    fractions : of the response, for these weights, in this order; the last fit uses the measured noise.
+    tried : (number of starts, iterations of each fit) of successive rounds; each round continues the best fits of the
+        previous one.
+    tried_by_fractions : the same with weights relative to the response, which need only one round: the first-order
+        prediction is accurate there.
+    later_iterations : iterations of a fit that continues an earlier one.
+    converged : chi-square per degree of freedom up to which the fits with relative weights have reached the minimum.
+    promising : fraction of the gap that may remain after a start or a step for it to be continued.
     followed : fraction of the gap up to which a fit is refined one coordinate after the other.
     followed_fits : number of fits refined in this way, the best first.
-    negligible : fraction of the gap below which nothing is left to explain with relative weights.
-    explained : chi-square per degree of freedom below which nothing is left to explain with the measured noise.
+    negligible : fraction of the gap below which relative weights have nothing more to explain.
+    explained : chi-square per degree of freedom below which the measured noise explains the residual.
     elsewhere : other frequencies of a coordinate, over the median of all coordinates [1].
-    rounds : most coordinates that are changed one after the other.
-    followed_groups : groups of coupled coordinates with which a fit of all parameters begins once more, the most
-        promising first.
+    rounds : maximum number of coordinates that are changed one after the other.
+    followed_groups : groups of coupled coordinates from which a fit of all parameters is repeated, the most promising
+        first.
     """
 
     own_Hz: tuple[float, float, int] = (7.0, 90.0, 26)
@@ -101,10 +104,10 @@ SETTINGS = ChassisSettings()
 
 @register
 class BaseCompliance(OfMounts):
-    """The chassis, a rigid body on something soft: it recoils from mounts and motors, and filters the floor.
+    """The chassis, a rigid body on a soft base: it recoils from mounts and motors, and filters the floor motion.
 
-    c = B (f_mounts + (s C_b + K_b) w), B = inv(s^2 M_c + s C_b + K_b), each along its own axis (translation), or with
-    rotation too, the mass at its own height and the springs of the base at theirs.
+    c = B (f_mounts + (s C_b + K_b) w), B = inv(s^2 M_c + s C_b + K_b). translation : each axis by itself. rocking :
+    with rotations; the mass and the springs of the base have their own heights.
     """
 
     name = "base_compliance"
@@ -135,13 +138,13 @@ class BaseCompliance(OfMounts):
                                 (0.0,), True))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Short fits to few lines: from the best resonance of each coordinate by itself, and from one frequency for all
-        coordinates, the best by the score test with all parameters. The best fit is then refined with other
-        frequencies of one coordinate after the other.
+        """Short fits to few lines, from the best resonance of each coordinate by itself, and from points with one
+        frequency for all coordinates, the best by the score test with all parameters. The best fit is then refined with
+        other frequencies of one coordinate after the other.
 
-        With six resonances of one per cent of damping, each some half widths off, a fit by the measured noise stops in
-        a local minimum. Weights relative to the response, as in a Bode plot, widen the minimum; the last fit is by the
-        measured noise.
+        With six resonances of 1 % damping, each off by several half-widths, a fit weighted by the measured noise stops
+        in a local minimum. Weights relative to the response, as in a Bode plot, widen the minimum; the last fit uses
+        the measured noise.
         """
         blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
         own = self._by_coordinate(score, place)
@@ -163,7 +166,7 @@ class BaseCompliance(OfMounts):
                 few = Score(score.model, more).chi2
                 near = made.chi2 - made.dof < SETTINGS.followed * (few - made.dof)
                 reached = self._one_by_one(made, place, more, made.dof, SETTINGS.explained * made.dof) if near else made
-        # The rig's parameters fit a part of the noise with and without the chassis, so that only its own ones count.
+        # The rig's parameters fit part of the noise with and without the chassis, so only those of the chassis count.
         # The frequency of each coordinate was chosen from a grid: any combination could have been the best.
         values = _effect(reached).values
         found = Seed(values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2, len(values),
@@ -182,11 +185,11 @@ class BaseCompliance(OfMounts):
 
     def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
                   weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit[TableModel] | None:
-        """The best fit from these starts by the first weights, continued with the later ones; None where all fail.
-        wide : starts with one frequency for all coordinates too, and refinement one coordinate after the other."""
+        """The best fit from these starts with the first weights, continued with the later ones; None if all fail.
+        wide : also start from one frequency for all coordinates, and refine one coordinate after the other."""
         first, *later = weights
         start = Score(model, first)
-        # Relative weights are no noise: all of chi-square counts as the gap.
+        # Relative weights are not noise: all of chi-square counts as the gap.
         noise = 0 if later else start.dof
         gap = start.chi2 - noise
         alike = [values for left, values in (self._alike(model, place, first) if wide else [])
@@ -219,8 +222,8 @@ class BaseCompliance(OfMounts):
 
     def _one_by_one(self, reached: LikelihoodFit[TableModel], place: str, blocks: Sequence[SpectralBlock],
                     noise: float, enough: float) -> LikelihoodFit[TableModel]:
-        """A fit refined with other frequencies of coupled coordinates, while chi-square comes nearer to `noise`, that
-        of an exact model, and until it is below `enough`."""
+        """Refine a fit with other frequencies of coupled coordinates while chi-square comes closer to `noise`, its
+        value for an exact model, and until it is below `enough`."""
         for _ in range(SETTINGS.rounds):
             if reached.chi2 < enough:
                 return reached
@@ -238,14 +241,14 @@ class BaseCompliance(OfMounts):
     def _best_elsewhere(self, rest: TableModel, one: ActiveEffect, blocks: Sequence[SpectralBlock]
                         ) -> list[tuple[float, tuple[float, ...]]]:
         """(expected chi-square, values) of the best start with other frequencies in each group of coupled coordinates,
-        the best first. The parameters of the other coordinates can compensate for a wrong frequency: a local minimum,
-        out of which no descent leads."""
+        the best first. The parameters of the other coordinates can compensate for a wrong frequency, which makes a
+        local minimum that no descent can escape."""
         return sorted(min((self._expected(rest, one.place, moved, blocks), moved) for moved in group)
                       for group in _elsewhere(one))
 
     def _expected(self, model: TableModel, place: str, values: tuple[float, ...], blocks: Sequence[SpectralBlock]
                   ) -> float:
-        """Chi-square expected after one step of all parameters from a start; infinite where the step fails."""
+        """Chi-square expected after one step of all parameters from a start; infinite if the step fails."""
         try:
             return Score(self._standing(model, place, values), blocks).chi2
         except (AvisError, np.linalg.LinAlgError):
@@ -255,7 +258,7 @@ class BaseCompliance(OfMounts):
         return model.with_effect(ActiveEffect(self, place, self.parameters(model, place), values))
 
     def _by_coordinate(self, score: Score, place: str) -> list[Seed]:
-        """From the best resonance of each coordinate by itself; the masses are estimated together."""
+        """Seeds from the best resonance of each coordinate by itself; the masses are estimated together."""
         ways = _ways(place)
         zeta, grid = SETTINGS.first_damping, np.geomspace(*SETTINGS.own_Hz)
         rows, labels = [], []
@@ -274,7 +277,7 @@ class BaseCompliance(OfMounts):
         chosen = [labels.index((way, f)) for way, f in best.items()]
         took = reduction(gram[np.ix_(chosen, chosen)], fall[chosen])
         inverse = dict(zip(best, took.coefficients, strict=True))
-        # The first coordinate found determines the mass best; one that needs another mass is no recoil.
+        # The first coordinate found determines the mass best; one with a different mass is not a recoil of the chassis.
         leader = inverse[moving[0]]
         if leader <= 0:
             return []
@@ -315,7 +318,7 @@ def _ways(place: str) -> tuple[str, ...]:
 
 def of_chassis(values: Values) -> np.ndarray:
     """(3, 6, 6) mass, damping and stiffness of a chassis on its base, in the payload's coordinates about the table's
-    centre; nothing in those in which it does not move."""
+    centre; zero in the coordinates in which it does not move."""
     radii = [1.0, 1.0, 1.0, *(values.get(f"gyration_{axis}_m", 0.0) for axis in "xyz")]
     inertia = values["mass_kg"] * np.square(radii)
     w = 2 * np.pi * np.array([values.get(f"{way}_Hz", 0.0) for way in WAYS])
@@ -330,15 +333,15 @@ def of_chassis(values: Values) -> np.ndarray:
 
 
 def _with_relative_noise(block: SpectralBlock, fraction: float) -> SpectralBlock:
-    """The block with noise of this fraction of its response added to its own."""
+    """The block with noise of this fraction of its response added to its noise."""
     relative, = relative_noise([block], fraction)
     assert block.noise is not None and relative.noise is not None
     return block.with_noise(block.noise + relative.noise, block.dof)
 
 
 def _elsewhere(one: ActiveEffect) -> list[list[tuple[float, ...]]]:
-    """Values of a chassis with other frequencies, about the median of all coordinates; a list for each group of coupled
-    coordinates that it has."""
+    """Values of a chassis with other frequencies, relative to the median of all coordinates; one list for each group of
+    coupled coordinates."""
     names = [parameter.name for parameter in one.parameters]
     free = [way for way in WAYS if f"{way}_Hz" in names]
     middle = np.median([one.by_name[f"{way}_Hz"] for way in free])
@@ -354,7 +357,7 @@ def _elsewhere(one: ActiveEffect) -> list[list[tuple[float, ...]]]:
                 values[names.index(f"gyration_{way[1]}_m")] = SETTINGS.alike_shape[0]
         return tuple(values)
     groups = [[way for way in together if way in free] for together in TOGETHER]
-    # One of two may be right as it is.
+    # The frequency of one of two coordinates may be right.
     return [[moved(ways, factors) for factors in product((None, *SETTINGS.elsewhere), repeat=len(ways)) if any(factors)]
             for ways in groups if ways]
 
@@ -371,9 +374,9 @@ def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: i
 
 
 def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]]) -> dict[str, float]:
-    """Coordinates and their frequencies, chosen one after the other, each the best beside those before it.
+    """Greedy selection of coordinates and their frequencies; each adds the largest reduction to the previous ones.
 
-    A coordinate that adds little, or would need a negative mass, is taken as stiff.
+    A coordinate that adds little, or would need a negative mass, counts as stiff.
     """
     best: dict[str, float] = {}
     took = 0.0

@@ -1,4 +1,4 @@
-"""What a model may lack of the drives and of the loop: force constant, lag, delay, limit."""
+"""Effects of the drives and of the loop that a model may lack: force constant, lag, delay, limit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from avis_ctrl.gap.record_motion import RecordMotion
 
 @register
 class ActuatorGain(Effect):
-    """One force constant times a factor (Rademakers, eqs. 2.17-2.18)."""
+    """One force constant multiplied by a factor (Rademakers, eqs. 2.17-2.18)."""
 
     name = "actuator_gain"
     title = "an actuator's force constant is not the one of the rig file"
@@ -39,10 +39,11 @@ class ActuatorGain(Effect):
 
 @register
 class ActuatorLag(Effect):
-    """Every amplifier 1/(1 + s tau), corner 1/(2 pi tau): one tau for all, or each its own about their mean.
+    """First-order lag 1/(1 + s tau) of every amplifier, corner 1/(2 pi tau): one tau for all, or different ones about
+    their mean.
 
-    What the sample rate folds back passes the mean corner: with corners that differ by a factor of two this is wrong by
-    0.1 % of the response at a tenth of the sample rate, and by 1 % at a fifth.
+    Aliased components pass the mean corner. With corners that differ by a factor of two, the error is 0.1 % of the
+    response at a tenth of the sample rate, and 1 % at a fifth.
     """
 
     name = "actuator_lag"
@@ -59,7 +60,7 @@ class ActuatorLag(Effect):
         if tau <= 1e-9:
             return
         common: np.ndarray | float = 1.0
-        if ops.amplifier_corner_Hz is None:  # else behind the lag that the model has already
+        if ops.amplifier_corner_Hz is None:  # otherwise in series with the lag that the model already has
             ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau)
             common = 1 + ops.s[:, None] * tau
         ops.drive = ops.drive * common / (1 + ops.s[:, None] * each)
@@ -73,13 +74,13 @@ class ActuatorLag(Effect):
 
 
 def time_constants(values: Values) -> np.ndarray:
-    """(n_u,) s of the amplifiers, or (1,) where all have the same."""
+    """(n_u,) time constants of the amplifiers [s], or (1,) if all are equal."""
     return values["time_constant_s"] * shares(values)
 
 
 @register
 class LoopDelay(Effect):
-    """exp(-s tau) beyond the rig file's delay, between samples as well as at them."""
+    """exp(-s tau) beyond the rig file's delay, not only in whole samples."""
 
     name = "loop_delay"
     title = "a delay of transport or computing beyond the nominal one"
@@ -99,7 +100,7 @@ class LoopDelay(Effect):
 
 @register
 class ActuatorSaturation(Effect):
-    """Volts clipped at a limit below the rig file's, one for all drives or each at its own about their mean."""
+    """Volts clipped at a limit below that of the rig file, one for all drives or different ones about their mean."""
 
     name = "actuator_saturation"
     title = "the drives clip below their nominal limit"
@@ -121,7 +122,7 @@ class ActuatorSaturation(Effect):
         return np.clip(record.volts, -limits, limits)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
-        """As `volts`, drive by drive: most keep their limit where that of one is changed."""
+        """As `volts`, drive by drive: most drives keep their limit when one limit changes."""
         limits = np.broadcast_to(voltage_limits(values), record.volts.shape[1])
 
         def clipped(k: int, limit: float) -> np.ndarray:
@@ -131,5 +132,5 @@ class ActuatorSaturation(Effect):
 
 
 def voltage_limits(values: Values) -> np.ndarray:
-    """(n_u,) V at which the drives clip, or (1,) where all have the same."""
+    """(n_u,) clipping voltages of the drives [V], or (1,) if all are equal."""
     return values["limit_V"] * shares(values)

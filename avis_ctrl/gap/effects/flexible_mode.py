@@ -1,4 +1,4 @@
-"""Modes of a payload that bends: one, two or three beside its rigid motion."""
+"""Flexible modes of the payload: one, two or three in addition to its rigid-body motion."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from avis_ctrl.gap.score import Score, reduction
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 
-# Variants by number of modes.
+# Number of modes by variant.
 COUNTS = {"": 1, "two": 2, "three": 3}
 
 
 @register
 class PayloadFlexibleMode(Effect):
-    """Modes of the payload beside its rigid motion, mass-normalised shapes over the mounts' points.
+    """Modes of the payload in addition to its rigid-body motion, with mass-normalised shapes at the mount points.
 
-    Motors and sensors sit in the isolators and move with these points. Each mode's own coordinate e obeys
-    e'' + 2 z w e' + w^2 e = sum of shape times force, the forces of the mounts included.
+    Motors and sensors sit in the isolators and move with these points. The modal coordinate e of each mode obeys e'' +
+    2 z w e' + w^2 e = sum of shape times force, including the forces of the mounts.
     """
 
     name = "payload_flexible_mode"
@@ -52,10 +52,10 @@ class PayloadFlexibleMode(Effect):
         return tuple(found)
 
     def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
-        """Where no motor pushes, a shape is of the size that it has elsewhere.
+        """Where no motor acts, a shape has the size that it has elsewhere.
 
-        A mode is held by the mounts' stiffness at these points, too: what they add to w^2 and 2 z w cannot be
-        separated from the mode's own, and forces on the payload do not show one combination of them.
+        The mounts' stiffness at these points also acts on the mode: its contribution to w^2 and 2 z w cannot be
+        separated from the mode's own values, and forces on the payload do not reveal one combination of these shapes.
         """
         found: dict[str, tuple[float, float]] = {}
         parameters = self.parameters(model, place)
@@ -74,19 +74,19 @@ class PayloadFlexibleMode(Effect):
                                                  at_sensors @ shape))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Residues over all paths at the frequencies that take most, of which the symmetric part of rank one is the
-        mode's shape. Further modes begin beside fitted ones (`richer`)."""
+        """Residues over all paths at the frequencies that reduce chi-square most; the shape is their symmetric part of
+        rank one. Further modes start from the fitted ones (`richer`)."""
         return _one_mode(score, ()) if COUNTS[place.partition("/")[2]] == 1 else []
 
     def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """One mode more, where the residual of the fitted ones is largest."""
+        """Add one mode where the residual of the fitted ones is largest."""
         more = {count: place for place in self.places(score.model) for count in [COUNTS[place.partition("/")[2]]]}
         place = more.get(COUNTS[one.place.partition("/")[2]] + 1)
         found = _one_mode(score, [frequency for frequency, *_ in modes(one.by_name)]) if place else []
         return [(place, (*one.values, *found[0].values))] if place and found else []
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """The modes in the order of their frequencies."""
+        """The modes in order of frequency."""
         found = list(super().reported(model, place, values, covariance).items())
         own = len(found) // COUNTS[place.partition("/")[2]]
         each = sorted((found[k:k + own] for k in range(0, len(found), own)), key=lambda mode: mode[0][1].value)
@@ -94,19 +94,19 @@ class PayloadFlexibleMode(Effect):
 
 
 def modes(values: Values) -> list[tuple[float, float, np.ndarray]]:
-    """(frequency in Hz, damping ratio, shape (n_g,)) of each mode."""
+    """(frequency [Hz], damping ratio, shape (n_g,)) of each mode."""
     numbers, count = np.array(list(values.values())), sum(name.startswith("frequency") for name in values)
     return [(float(own[0]), float(own[1]), own[2:]) for own in np.split(numbers, count)]
 
 
 def shape_points(model: Table) -> bool:
-    """Whether every motor and sensor sits in a mount, along an earth axis."""
+    """Whether every motor and sensor sits in a mount, aligned with an earth axis."""
     find = getattr(model.rig, "mount_of", None)
     return find is not None and all(find(name) for name in (*model.actuators, *model.sensors.names))
 
 
 def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """(n_u, n_g) and (n_y, n_g): which mount and axis each motor and each sensor sits in, with its sign."""
+    """(n_u, n_g) and (n_y, n_g): mount and axis of each motor and of each sensor, with its sign."""
     return _shape_rows(tuple(map(rig.nearest_mount, actuators)), tuple(map(rig.nearest_mount, sensors)),
                        mount_geometry(rig).names)
 
@@ -122,13 +122,13 @@ def _shape_rows(actuators: tuple[tuple[str, float], ...], sensors: tuple[tuple[s
 
 
 def resonance(score: Score) -> float:
-    """Fall of chi-square by one mode whose residues are free on every path."""
+    """Reduction of chi-square by one mode with free residues on every path."""
     return max(reduction(G, b).chi2 for G, b in _looks(score)[1])
 
 
 def _looks(score: Score) -> tuple[list[tuple[float, float]], list[tuple[np.ndarray, np.ndarray]]]:
-    """Frequency and damping ratio of every mode that is searched, and the Gram matrix of its paths with their product
-    with the residual."""
+    """Frequency and damping ratio of every mode searched, with the Gram matrix of its paths and their product with the
+    residual."""
     if "looks" not in score.kept:
         frequencies = np.geomspace(*SETTINGS.mode_Hz).tolist()
         tried = [(f, 0.02) for f in frequencies]
@@ -139,7 +139,7 @@ def _looks(score: Score) -> tuple[list[tuple[float, float]], list[tuple[np.ndarr
 
 
 def _one_mode(score: Score, beside: Sequence[float]) -> list[Seed]:
-    """A mode away from the frequencies [Hz] of others, the best first."""
+    """Single modes away from the given frequencies [Hz], the best first."""
     at, products = _looks(score)
     found = []
     for (f, zeta), (G, b) in zip(at, products, strict=True):
@@ -151,9 +151,9 @@ def _one_mode(score: Score, beside: Sequence[float]) -> list[Seed]:
 
 
 def _seed(model: TableModel, f: float, zeta: float, residues: np.ndarray, chi2: float, looks: int) -> Seed | None:
-    """Shape from residues (n_y n_u,); None where it would be negative."""
+    """Seed of a mode from residues (n_y n_u,); None if their sign allows no real shape."""
     at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
-    # Q = a_s a_u^T with both from one shape: the size by the best of rank one.
+    # Q = a_s a_u^T with both from one shape; its size is that of the best rank-one approximation.
     U, sigma, Vt = np.linalg.svd(residues.reshape(len(at_sensors), -1))
     shape = at_actuators.T @ Vt[0]
     sign, size = float(U[:, 0] @ (at_sensors @ shape)), float(np.sum((at_sensors @ shape) ** 2))

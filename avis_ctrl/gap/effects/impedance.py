@@ -1,8 +1,8 @@
-"""First looks at what acts on the payload at a point that is not known: all places at once.
+"""Score tests of elements that act on the payload at an unknown point: all places at once.
 
-Whatever is tied to the payload at p along an axis a adds the dynamic stiffness f(s) g g^T with g = e_a^T [I, -S(p)]: a
-combination of the 21 symmetric unit matrices. Their directions are projected once for each f; any place is then a
-product with a 21 x 21 matrix.
+An element attached to the payload at p along an axis a adds the dynamic stiffness f(s) g g^T with g = e_a^T [I, -S(p)]:
+a combination of the 21 symmetric unit matrices. The directions of these are projected once for each f; any place then
+costs one product with a 21 x 21 matrix.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from avis_ctrl.rigs.rigid_body import point_map
 
 
 def place_grid() -> tuple[np.ndarray, ...]:
-    """Places looked at along x, y, z [m]."""
+    """Places searched along x, y, z [m]."""
     return tuple(np.linspace(*one) for one in SETTINGS.places_m)
 
 
 def positions(parameters: Sequence[EffectParameter]) -> np.ndarray:
-    """(n, 3) m; a coordinate that is no parameter stays zero."""
+    """Grid of places (n, 3) [m]; coordinates without a parameter are zero."""
     free = {one.name for one in parameters}
     axes = [grid if f"{axis}_m" in free else np.zeros(1) for axis, grid in zip("xyz", place_grid(), strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
 def about(point: np.ndarray, share: float) -> np.ndarray:
-    """(27, 3) m: places about one, that share of the grid's step away along each axis, within the grid."""
+    """(27, 3) places around a point [m], this fraction of the grid step away along each axis, within the grid."""
     grids = place_grid()
     steps = [share * (grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]) for grid in grids]
     near = point + np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3)
@@ -39,7 +39,7 @@ def about(point: np.ndarray, share: float) -> np.ndarray:
 
 
 def at_points(points: np.ndarray, axes: str, oblique: bool = False) -> np.ndarray:
-    """(n, len(axes) or 6, 21): unit springs at each place along each axis, with oblique between the axes too."""
+    """(n, len(axes) or 6, 21): unit springs at each place along each axis; with oblique, between the axes too."""
     return _at_points(points.tobytes(), axes, oblique)
 
 
@@ -55,9 +55,9 @@ def _at_points(points: bytes, axes: str, oblique: bool) -> np.ndarray:
 
 
 def project(score: Score, dynamic: Callable[[np.ndarray], np.ndarray], key: Hashable) -> tuple[np.ndarray, np.ndarray]:
-    """Gram matrix (21, 21) and product with the residual (21,) of the unit matrices times dynamic(s).
+    """Gram matrix (21, 21) of the unit matrices times dynamic(s), and their product with the residual (21,).
 
-    key : under which the score keeps them.
+    key : under which the score caches them.
     """
     if key not in score.kept:
         A = unit_matrices(score, dynamic)
@@ -66,14 +66,14 @@ def project(score: Score, dynamic: Callable[[np.ndarray], np.ndarray], key: Hash
 
 
 def unit_matrices(score: Score, dynamic: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """(21, N): by each symmetric unit matrix times dynamic(s)."""
+    """(21, N): directions of each symmetric unit matrix times dynamic(s)."""
     return score.directions([part.by_impedance(dynamic(part.s[:, 0, 0])) for part in score.parts])
 
 
 def peaks(score: Score) -> tuple[float, ...]:
-    """Frequencies [Hz] at which the residual's power stands out most of its neighbourhood, strongest first.
+    """Frequencies [Hz] at which the residual power exceeds that of its neighbourhood most, strongest first.
 
-    A lightly damped resonance that the model lacks leaves its peak there, narrower than any grid.
+    A lightly damped resonance that the model lacks causes a peak there, narrower than any grid.
     """
     if "peaks" in score.kept:
         return score.kept["peaks"]
@@ -85,7 +85,7 @@ def peaks(score: Score) -> tuple[float, ...]:
         omega.append(part.block.omega)
         power.append(np.mean(e ** 2, axis=(0, 2)))
     f, P = np.concatenate(omega) / (2 * np.pi), np.concatenate(power)
-    # Mean power in steps of frequency, against the median about it.
+    # Mean power in steps of frequency, relative to the median around each step.
     reach = SETTINGS.peak_reach
     step = np.floor(np.log(f) / SETTINGS.peak_step).astype(int)
     step -= step.min()
@@ -104,7 +104,7 @@ def peaks(score: Score) -> tuple[float, ...]:
 
 
 def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """(6, N): by each way in which a chassis can recoil, receptance (n,) [1/mass times displacement per force]."""
+    """(6, N): directions of each recoil coordinate of a chassis; receptance of s (n,) is that of unit mass."""
     columns = []
     for part in score.parts:
         made, response = part.made, part.response
@@ -116,7 +116,7 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
 
 
 def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """(n_y n_u, N): by the residue of each path, displacement per newton."""
+    """(n_y n_u, N): directions of the residue of each path, displacement per newton."""
     columns = []
     for part in score.parts:
         ops, response = part.made.ops, part.response

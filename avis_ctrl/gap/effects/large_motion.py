@@ -1,6 +1,7 @@
-"""What large rotations add to the linear table: second-order terms that are there on any table, and named by nobody.
+"""Second-order terms of large rotations, which every table has; they are never named as a missing effect.
 
-As `identification.large_motion`; motors and sensors, and the whole of it, enter with factors that the data choose.
+As in `identification.large_motion`, with three factors that the data determine: for all terms of mounts and inertia,
+for the motors, and for the sensors.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from avis_ctrl.gap.record_motion import RecordMotion
 
 
 class LargeMotion(Effect):
-    """Part of every model whose records are known in time; not one of the library."""
+    """Part of every model whose records are known in time; not in the library."""
 
     name = "large_motion"
     title = "second-order terms of large rotations"
@@ -21,7 +22,7 @@ class LargeMotion(Effect):
     nonlinear = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        # Little room beyond 0 and 1, and a size above it: a gap of another origin must not lead a fit astray here.
+        # Little room beyond 0 and 1, and a larger size: a gap with another cause must not affect the fit here.
         return tuple(EffectParameter(name, "1", text, 0.0, -0.5, 1.5, 4.0) for name, text in (
             ("mounts", "second-order terms of mounts and inertia, 1 by Newton and Euler"),
             ("motors_turn", "fraction of the payload's rotation that turns the motors' axes"),

@@ -1,4 +1,4 @@
-"""The library of effects: those that come with the product, and those that a user has registered beside them."""
+"""The library of effects: those supplied with the product, and those that a user has registered."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ FILES = (attached, cable, chassis, drives, flexible_mode, mounts, payload, senso
 
 
 def library() -> dict[str, Effect]:
-    """Every effect by name."""
+    """All effects by name."""
     return registered()

@@ -1,8 +1,8 @@
-"""What acts along one direction at a point of the payload: the best direction, and how it is told.
+"""Elements along one direction at a point of the payload: the best direction, and the reported quantities.
 
-The parameters are a = d sqrt(size), d the direction and size a mass or a stiffness, so that no size is negative; and a
-point. Along the line of action a place makes no difference: the foot of the line is told, its point nearest to the
-geometric centre.
+The parameters are a point and a = d sqrt(size), with the direction d and a size (mass or stiffness) that cannot be
+negative. The position along the line of action has no effect; its foot is reported, the point nearest to the geometric
+centre.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from avis_ctrl.gap.starting_values import SETTINGS
 
 @cache
 def directions() -> np.ndarray:
-    """(n, 3) over a half-sphere."""
+    """(n, 3) directions over a hemisphere."""
     polar, around = np.meshgrid(np.linspace(0, np.pi / 2, SETTINGS.polar),
                                 np.linspace(0, 2 * np.pi, SETTINGS.around, endpoint=False), indexing="ij")
     every = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
@@ -26,7 +26,7 @@ def directions() -> np.ndarray:
 
 
 def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[float, int, np.ndarray, float]:
-    """(chi2, point, direction (3,), size) of what takes most, along one direction; points (n, 3)."""
+    """(chi2, point index, direction (3,), size) with the largest reduction of chi-square; points (n, 3)."""
     basis = at_points(points, "xyz", oblique=True)
     d = basis @ b
     A = basis @ G @ np.swapaxes(basis, 1, 2)
@@ -41,7 +41,7 @@ def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[fl
 
 
 def told(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
-    """Size, direction and foot of the line of action by the values along_x .. and x_m .., to first order."""
+    """Size, direction and foot of the line of action from the values along_x .. and x_m .., to first order."""
     names = list(values)
     first, last = names.index("along_x"), names.index("x_m")
     rows = [*range(first, first + 3), *range(last, last + 3)]
@@ -55,13 +55,13 @@ def told(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[s
 
 
 def foot(values: Values) -> np.ndarray:
-    """(3,) m: the point of the line of action nearest to the geometric centre, by the values along_x .. and x_m .."""
+    """(3,) m: the point of the line of action nearest to the geometric centre, from the values along_x .. and x_m .."""
     names = (*(f"along_{axis}" for axis in "xyz"), *(f"{axis}_m" for axis in "xyz"))
     return of_line(np.array([values[name] for name in names]))[4:]
 
 
 def of_line(x: np.ndarray) -> np.ndarray:
-    """(7,) size, direction with its largest component positive, foot of the line; x d sqrt(size) and a point (6,)."""
+    """(7,) size, direction with its largest component positive, and foot, from x = [d sqrt(size), point] (6,)."""
     a, point = x[:3], x[3:]
     mass = float(a @ a)
     d = a / np.sqrt(mass) * np.sign(a[np.argmax(np.abs(a))])

@@ -1,4 +1,4 @@
-"""What a model may lack of the mounts: relaxation, loss, mass, leveling, amplitude, time, and what they stand on."""
+"""Effects of the mounts that a model may lack: relaxation, loss, internal mass, leveling, friction, amplitude, time."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from avis_ctrl.rigs.rig import Rig
 
 
 def has_mounts(model: Table) -> bool:
-    """Whether the rig's mounts have stiffness and damping of their own by name."""
+    """Whether the rig has named stiffness and damping parameters of its mounts."""
     return "isolator1.k_z" in model.rig.parameters()
 
 
 def vertical(rig: Rig) -> np.ndarray:
-    """(n_g,) which mount rows are vertical."""
+    """(n_g,) mask of the vertical mount rows."""
     return mount_geometry(rig).along("z")
 
 
 class OfMounts(Effect):
-    """One that acts where mounts have stiffness and damping of their own by name."""
+    """An effect of mounts that have named stiffness and damping parameters."""
 
     at: tuple[str, ...] = ("isolators z",)
 
@@ -51,7 +51,7 @@ class OfMounts(Effect):
 
 @register
 class MountRelaxation(OfMounts):
-    """Vertical stiffness k (1 + r s tau/(1 + s tau)): a Maxwell branch, a second chamber behind an orifice."""
+    """Vertical stiffness k (1 + r s tau/(1 + s tau)): a Maxwell branch, or a second chamber behind an orifice."""
 
     name = "mount_relaxation"
     title = "the vertical stiffness of the mounts rises with frequency (a second chamber, a Maxwell branch)"
@@ -77,7 +77,7 @@ class StructuralDamping(OfMounts):
     """Loss nearly independent of frequency in every mount.
 
     causal : k (s/w_ref)^a, loss factor tan(pi a/2) at every frequency, with the rise of stiffness that causality
-    requires. complex : k (1 + j eta), the textbook's constant, which no passive element has over all frequencies.
+    requires. complex : k (1 + j eta), the textbook constant, which no passive element has at all frequencies.
     """
 
     name = "structural_damping"
@@ -99,10 +99,10 @@ class StructuralDamping(OfMounts):
 
 @register
 class MountSurge(OfMounts):
-    """A mass inside every vertical mount, between two springs in series that have the mount's stiffness together.
+    """A mass inside every vertical mount, between two springs in series that together have the mount's stiffness.
 
-    Frequency and damping ratio are those of the mass between payload and chassis at rest; both springs have the same
-    loss, and the mount's own dashpot is beside them. Mounts may differ in frequency about their mean.
+    Frequency and damping ratio are those of the mass with payload and chassis fixed. Both springs have the same loss;
+    the mount's own dashpot is in parallel with them. The mounts' frequencies may differ about their mean.
     """
 
     name = "mount_surge"
@@ -122,7 +122,7 @@ class MountSurge(OfMounts):
                 *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Over frequency and damping: to first order the mass inside a mount is a sprung mass on the payload there."""
+        """Seeds over frequency and damping: to first order the mass is a sprung mass on the payload at the mount."""
         rig = score.model.rig
         rows = mount_geometry(rig).payload[vertical(rig)]
         units = symmetric_coordinates(rows[:, :, None] * rows[:, None, :])
@@ -148,9 +148,9 @@ class MountSurge(OfMounts):
         ops.internal_damping = np.where(up, values["damping_ratio"], ops.internal_damping)
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """Means over the mounts. Their standard deviations include the scatter of the mounts, which one value for all
-        of them does not describe; that of the mass follows from frequency, payload_share and scatter, with the mean
-        stiffness taken as exact."""
+        """Means over the mounts. Their standard deviations include the scatter between the mounts, which a single value
+        does not describe. That of the mass follows from frequency, payload_share and scatter; the mean stiffness is
+        taken as exact."""
         found = super().reported(model, place, values, covariance)
         k = mount_geometry(model.effective.rig).stiffness[vertical(model.rig)]
         f, a, w = values["frequency_Hz"], values["payload_share"], surge_omega(values)
@@ -165,22 +165,22 @@ class MountSurge(OfMounts):
 
 
 def _of_mean(values: np.ndarray) -> float:
-    """Variance of the mean of what scatters."""
+    """Variance of the mean of scattered values."""
     return float(np.var(values, ddof=1) / len(values)) if len(values) > 1 else 0.0
 
 
 def surge_omega(values: Values) -> np.ndarray:
-    """(mounts,) rad/s of the resonance inside each."""
+    """(mounts,) resonance frequency inside each mount [rad/s]."""
     return 2 * np.pi * values["frequency_Hz"] * shares(values)
 
 
 @register
 class LevelingLoop(OfMounts):
-    """Every leveled mount k (1 + w/s), w = 2 pi rate, with a valve that lags k (1 + w/(s (1 + s tau))), or each with a
-    rate of its own.
+    """Leveled mounts k (1 + w/s), w = 2 pi rate; with a lag of the valves k (1 + w/(s (1 + s tau))); or a different
+    rate for each mount.
 
-    A valve lets air in at a rate by the height of the payload over the chassis; the force by this air is in
-    proportion to the mount's own stiffness.
+    A valve admits air at a rate that depends on the height of the payload above the chassis. The force of this air is
+    proportional to the mount's own stiffness.
     """
 
     name = "leveling_loop"
@@ -190,14 +190,14 @@ class LevelingLoop(OfMounts):
     holds_states = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        # Faster than the best damped mode dies away, the loop is unstable: no table that was measured has it.
+        # A rate above the decay rate of the best damped mode makes the loop unstable; a measured table is stable.
         fastest = max(2 * fastest_decay(model) / (2 * np.pi), 0.1)
         rate = EffectParameter("rate_Hz", "Hz", "of the integrator, over 2 pi", 0.0, 0.0, fastest, 0.02)
         if place.endswith("plain"):
             return (rate,)
         if place.endswith("each"):
             return (rate, *uneven(range(1, LIBRARY.leveled), "rate of valve {} over the mean, less one"))
-        # A valve may be faster than the data can show; its corner then runs to the upper end.
+        # A valve may be faster than the data can show; its corner then ends at the upper bound.
         return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *LIBRARY.valve_Hz,
                                       1.0, False, (0.1, 0.3, 1.0, 3.0), True))
 
@@ -213,14 +213,14 @@ class LevelingLoop(OfMounts):
         each = np.zeros(len(own))
         each[own] = shares(values)
         ops.stiffness_factor = ops.stiffness_factor + ratio[:, None] * each
-        # Each integrator starts with a force of its own, each valve with an opening.
+        # Each integrator has an initial force of its own, each valve an initial opening.
         rows = mount_geometry(ops.base.rig).payload[own].T
         ops.decays.append(rows / ops.s[:, None, None])
         if "valve_corner_Hz" in values:
             ops.decays.append(rows / (ops.s + 2 * np.pi * values["valve_corner_Hz"])[:, None, None])
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """With the mean force by displacement and second over the leveled mounts, at their stiffness as fitted."""
+        """With the mean force per displacement and second over the leveled mounts, at their fitted stiffness."""
         found = super().reported(model, place, values, covariance)
         rate, g = found["rate_Hz"], mount_geometry(model.rig)
         by_rate = 2 * np.pi * float(np.mean(g.stiffness[leveled(model.rig)]))
@@ -237,8 +237,8 @@ def leveled(rig: Rig) -> np.ndarray:
 
 @register
 class CubicStiffness(OfMounts):
-    """Force -k3 d^3 at every vertical mount, or -(k2 d^2 + k3 d^3 + k5 d^5); mounts may differ in k3 about their mean,
-    and in the other two by the same factors."""
+    """Force -k3 d^3 at every vertical mount, or -(k2 d^2 + k3 d^3 + k5 d^5). Mounts may differ in k3 about their mean;
+    the other two coefficients then differ by the same factors."""
 
     name = "cubic_stiffness"
     title = "the mounts stiffen with amplitude"
@@ -266,24 +266,24 @@ class CubicStiffness(OfMounts):
 
 
 def stiffness(model: Table, n: int, words: str) -> EffectParameter:
-    """Of a force in the n-th power of the deflection."""
+    """Coefficient of a force proportional to the n-th power of the deflection."""
     size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** (n - 1)
     return EffectParameter(f"k{n}_N_per_m{n}", f"N/m^{n}", f"{words} stiffness, mean of the mounts", 0.0, -1e4 * size,
                            1e4 * size, size)
 
 
 def powers(values: Values) -> list[tuple[int, str]]:
-    """Power of the deflection and name of each stiffness."""
+    """Exponent of the deflection and parameter name of each stiffness."""
     return [(int(name[1]), name) for name in values if name.startswith("k")]
 
 
 def stiffened(pull: np.ndarray | int, record: RecordMotion, values: Values) -> np.ndarray:
-    """(n, 6) generalized force on the payload by the mean mounts' pull [N], (n, m), in time or on lines."""
+    """(n, 6) generalized force on the payload from the pull (n, m) of equal mounts [N], in time or on lines."""
     return -pull @ (shares(values)[:, None] * record.rows[record.vertical])
 
 
 def largest_rms(model: Table) -> float:
-    """Largest r.m.s. deflection of a mount [m] in any record; 10 micrometres where none is known."""
+    """Largest r.m.s. deflection of a mount [m] in any record; 10 micrometres if none is known."""
     found = [float(one.rms_deflections.max()) for one in model.motion.values()]
     return max(found, default=1e-5) or 1e-5
 
@@ -297,8 +297,8 @@ def median_rms(model: Table) -> float:
 class ContactFriction(Effect):
     """Dahl friction at every motor, along its axis: f' = sigma v (1 - sign(v) f/F_c), F_c = sigma times the slip.
 
-    P. R. Dahl, A solid friction model (1968): stiff and lossless for motion far below the slip, Coulomb far above.
-    Contacts slip at the same displacement; how their stiffness is distributed among them the last fit finds.
+    P. R. Dahl, A solid friction model (1968): stiff and lossless for motion far below the slip, Coulomb friction far
+    above it. All contacts slip at the same displacement; the last fit distributes the stiffness among them.
     """
 
     name = "contact_friction"
@@ -322,7 +322,7 @@ class ContactFriction(Effect):
         return pushed(Contacts(record, values["slip_m"]).friction(0, len(record.volts)), record, values)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
-        """As `force`, interpolated between slips."""
+        """As `force`, interpolated between values of the slip."""
         f = record.interpolated(self.name, values["slip_m"], omega,
                                 lambda slip: Contacts(record, slip).friction(0, len(record.volts)))
         return Added(force=pushed(f, record, values))
@@ -336,19 +336,19 @@ class ContactFriction(Effect):
 
 
 def contacts(values: Values) -> np.ndarray:
-    """(m,) N/m: stiffness of each contact, in the order of the actuators."""
+    """(m,) stiffness of each contact [N/m], in the order of the actuators."""
     return values["stiffness_N_per_m"] * shares(values)
 
 
 class Contacts:
-    """Friction of all contacts over their stiffness [m] along a record, from a state that is kept."""
+    """Friction of all contacts over their stiffness [m] along a record, continued from a stored state."""
 
     def __init__(self, record: RecordMotion, slip: float):
         self.record, self.slip = record, slip
         self.state, self.last = np.zeros(len(record.driven_rows)), np.zeros(len(record.driven_rows))
 
     def friction(self, start: int, stop: int, keep: bool = False) -> np.ndarray:
-        """(stop - start, m) m, after the samples up to which the state was kept."""
+        """(stop - start, m) m, continued from the last stored state."""
         deflection = np.ascontiguousarray(self.record.deflection[start:stop, self.record.driven_rows])
         found = dahl(deflection, self.last, self.slip, self.state)
         if keep:
@@ -357,15 +357,16 @@ class Contacts:
 
 
 def pushed(f: np.ndarray, record: RecordMotion, values: Values) -> np.ndarray:
-    """(n, 6) generalized force on the payload by friction over stiffness, (n, m), in time or on lines."""
+    """(n, 6) generalized force on the payload from friction over stiffness (n, m), in time or on lines."""
     return -f @ (contacts(values)[:, None] * record.rows[record.driven_rows])
 
 
 @register
 class StiffnessDrift(OfMounts):
-    """Every stiffness times 1 + change p(t), p = -0.5 .. 0.5 from begin to end of the campaign.
+    """Every stiffness times 1 + change p(t), where p goes from -0.5 to 0.5 over the campaign.
 
-    linear : p = (t - middle)/T. settling : as exp(-t/tau) towards an end, as after a change of temperature or pressure.
+    linear : p = (t - middle)/T. settling : as exp(-t/tau) towards a final value, as after a temperature or pressure
+    change.
     """
 
     name = "stiffness_drift"
@@ -392,8 +393,8 @@ class StiffnessDrift(OfMounts):
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
-        # The model's change is of the stiffness that the record's motion was found with; a person's is of what the
-        # table's stiffness was at the beginning.
+        # The model's change is relative to the stiffness from which the record's motion was computed; the reported one
+        # is relative to the table's stiffness at the beginning.
         own, ratio = found["relative_change"], drift_over_stiffness(model)
         begin = 1 - own.value * ratio / 2
         one = Reported(own.value * ratio / begin, own.std * ratio / begin ** 2, own.unit)
@@ -406,18 +407,18 @@ class StiffnessDrift(OfMounts):
 
 
 def campaign_clock(model: Table) -> tuple[float, float]:
-    """First and last time [s] of the campaign that a model was found from; (0, 1) where it knows no record."""
+    """First and last time [s] of the campaign of a model's records; (0, 1) if it has none."""
     return next((one.campaign_s for one in model.motion.values()), (0.0, 1.0))
 
 
 def drift_over_stiffness(model: Table) -> float:
-    """Stiffness of the record's motion, whose share a drift's change is, over that of the model's rig."""
+    """Stiffness of the record's motion, to which a drift's change is relative, over that of the model's rig."""
     known = float(np.sum(mount_geometry(model.effective.rig).stiffness))
     return next((float(np.sum(one.stiffness)) / known for one in model.motion.values()), 1.0)
 
 
 def drifted(when: np.ndarray, time_constant: float) -> np.ndarray:
-    """-0.5 .. 0.5 as `when` goes from 0 to 1: linear, or for a time constant > 0 in the same units settling."""
+    """-0.5 .. 0.5 as `when` goes from 0 to 1: linear, or settling with a time constant > 0 in the same units."""
     if time_constant <= 0:
         return np.asarray(when - 0.5)
     return np.expm1(-when / time_constant) / np.expm1(-1 / time_constant) - 0.5

@@ -1,4 +1,4 @@
-"""What a model may lack of the payload: where its mass is, and what ties it to the ground."""
+"""Effects of the payload that a model may lack: offset of its centre of mass, products of inertia."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PRODUCTS = {"Jxy": "J12", "Jxz": "J13", "Jyz": "J23"}
 
 @register
 class ComOffset(Effect):
-    """Centre of mass beside where the rig file has it; parallel-axis terms included (equations.md)."""
+    """Offset of the centre of mass from that of the rig file; parallel-axis terms included (equations.md)."""
 
     name = "com_offset"
     title = "the centre of mass is not where the model has it"
@@ -31,7 +31,7 @@ class ComOffset(Effect):
 
 @register
 class ProductOfInertia(Effect):
-    """One entry beside the diagonal of the inertia tensor about the centre of mass: J12 = -integral of x y dm."""
+    """One off-diagonal entry of the inertia tensor about the centre of mass: J12 = -integral of x y dm."""
 
     name = "product_of_inertia"
     title = "a product of inertia of the payload"
@@ -52,7 +52,7 @@ class ProductOfInertia(Effect):
 
 
 class AtPoint(Effect):
-    """Something at a point of the payload."""
+    """An effect at a point of the payload."""
 
     def position(self) -> tuple[EffectParameter, ...]:
         return tuple(EffectParameter(f"{axis}_m", "m", f"its place along {axis}, from the geometric centre", 0.0,

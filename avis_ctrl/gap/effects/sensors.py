@@ -1,4 +1,4 @@
-"""What a model may lack of the sensors: corner, sensitivity, direction, gravity."""
+"""Effects of the sensors that a model may lack: corner, sensitivity, direction, gravity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarr
 
 
 def receptance(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
-    """1/(s^2 + 2 zeta w s + w^2), (n,): of a mode of unit mass."""
+    """1/(s^2 + 2 zeta w s + w^2), (n,): receptance of a mode of unit mass."""
     return 1 / second_order(s, frequency_Hz, damping)
 
 
@@ -33,7 +33,7 @@ def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
 
 
 def axis_of(model: Table, sensor: str) -> str:
-    """x, y or z: the earth axis that a sensor lies along, within what one is tilted; empty where it lies along none."""
+    """The earth axis (x, y or z) with which a sensor is aligned, within the tilt limit; empty if there is none."""
     direction = model.rig.sensor_axes()[sensor][1]
     along = np.flatnonzero(np.abs(direction) > np.cos(SETTINGS.tilted_rad))
     return "xyz"[along[0]] if len(along) else ""
@@ -46,7 +46,7 @@ class _OfSensor(Effect):
 
 @register
 class GeophoneCorner(_OfSensor):
-    """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter undoes a corner that is not there.
+    """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter compensates a corner that does not exist.
 
     Rademakers, section 2.1.1: the geophone is S s^2/(s^2 + 2 zn wn s + wn^2), the compensation has its zeros at wn, zn.
     """
@@ -65,7 +65,7 @@ class GeophoneCorner(_OfSensor):
                 EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        # A factor of the present corner, which the tolerance fit may have moved: both then change the same parameter.
+        # Relative to the present corner, which the tolerance fit may have moved: both then change the same parameter.
         k, (f, z) = ops.sensor(place), suspensions(ops.base.rig)[place]
         own = ops.base.sensors.suspensions
         f_own, z_own = (own[k] if own else None) or (f, z)
@@ -75,7 +75,7 @@ class GeophoneCorner(_OfSensor):
 
 @register
 class SensorGain(_OfSensor):
-    """One sensitivity times a factor."""
+    """One sensitivity multiplied by a factor."""
 
     name = "sensor_gain"
     title = "a sensor's sensitivity is not the one of the rig file"
@@ -90,7 +90,7 @@ class SensorGain(_OfSensor):
 
 @register
 class SensorMisalignment(_OfSensor):
-    """Direction (e + a e1 + b e2)/norm in the place of e: tan of the tilt towards the two other earth axes."""
+    """Direction (e + a e1 + b e2)/norm instead of e; a, b are tangents of the tilt towards the two other earth axes."""
 
     name = "sensor_misalignment"
     title = "a sensor's axis is tilted, so that it sees another axis too"
@@ -121,7 +121,7 @@ class SensorMisalignment(_OfSensor):
 class TiltCoupling(Effect):
     """A horizontal inertial sensor reads a - g along its axis: a_x - g phi_y, a_y + g phi_x (equations.md, axes).
 
-    The strength of gravity is free: it must come out as 9.8 m/s^2, of one sign or the other by the sensor's polarity.
+    The magnitude of gravity is free: it must result as 9.8 m/s^2, with a sign given by the sensor's polarity.
     """
 
     name = "tilt_coupling"

@@ -1,4 +1,4 @@
-"""Effects of the user's own, from a Python file: loaded, registered, and tried out before a search relies on them."""
+"""User-defined effects from a Python file: loaded, registered, and tested before a search relies on them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from avis_ctrl.gap.table_model import TableModel, active
 
 @dataclass(frozen=True)
 class OwnEffects:
-    """What a file has registered. sha256 : of its bytes, as they were run."""
+    """Effects that a file has registered. sha256 : of its bytes as executed."""
 
     path: Path
     names: tuple[str, ...]
@@ -27,11 +27,11 @@ class OwnEffects:
 
 
 def load_effects(path: str | Path) -> OwnEffects:
-    """Run a Python file that registers effects. Its code runs with the rights of the user.
+    """Run a Python file that registers effects. Its code runs with the user's rights.
 
     Raises
     ------
-    InputError : no such file, a file that does not run, one that registers nothing.
+    InputError : no such file, a file that does not run, or one that registers nothing.
     """
     path = Path(path)
     try:
@@ -56,7 +56,7 @@ def load_effects(path: str | Path) -> OwnEffects:
 
 
 def said(error: BaseException, path: Path | None = None) -> str:
-    """An error of a user's file in one line, with the line of the file where there is one."""
+    """An error of a user's file in one line, with the line number if known."""
     line = getattr(error, "lineno", None) if isinstance(error, SyntaxError) else None
     for frame in traceback.extract_tb(error.__traceback__):
         if path is not None and frame.filename == str(path):
@@ -66,11 +66,11 @@ def said(error: BaseException, path: Path | None = None) -> str:
 
 
 def try_out(own: OwnEffects, model: TableModel) -> None:
-    """Ask each effect of a file for places and parameters, and let it act on a table.
+    """Request places and parameters from each effect of a file, and apply it to a table.
 
     Raises
     ------
-    InputError : an effect that fails, says nothing of itself, or leaves no finite response.
+    InputError : an effect that fails, lacks its texts, or gives a response that is not finite.
     """
     known = library()
     for name in own.names:

@@ -1,1 +1,1 @@
-"""Faults of the signals themselves, looked for before physics is blamed: converter, hum, noise, floor motion."""
+"""Faults of the signals themselves, checked before the physics: converter, hum, noise, floor motion."""

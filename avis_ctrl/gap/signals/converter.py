@@ -1,16 +1,16 @@
-"""Resolution and clipping of a channel's converter, where they are worse than the rig file says.
+"""Resolution and clipping of a channel's converter, where they are worse than stated in the rig file.
 
-Resolution. A signal that passed a step q has its values near q k + b, k whole. The characteristic function of its
-amplitudes, phi(nu) = mean exp(2 pi j nu y), then has modulus near 1 at nu = 1/q, where that of a smooth distribution of
-standard deviation s is close to 0 (Widrow and Kollar, Quantization Noise, 2008, chapter 4). With the values rounded
-again to the nominal lsb it is sinc(lsb/q) at least. phi is the transform of the histogram of codes.
-Signals of a few steps only have no phi to speak of; there the gaps between the codes used tell: noise of one lsb never
-leaves the code next to its most frequent one empty.
+Resolution. The values of a signal with quantisation step q are near q k + b, with integer k. The characteristic
+function of its amplitudes, phi(nu) = mean exp(2 pi j nu y), then has modulus near 1 at nu = 1/q, where that of a smooth
+distribution of standard deviation s is close to 0 (Widrow and Kollar, Quantization Noise, 2008, chapter 4). If the
+values are rounded again to the nominal lsb, it is at least sinc(lsb/q). phi is the transform of the histogram of codes.
+Signals of only a few steps have no useful phi. Their step shows in the gaps between the codes in use: noise of one lsb
+never leaves the code next to its most frequent one empty.
 
-Clipping. The outermost value of the whole campaign repeats far more often than a smooth signal allows
+Clipping. The extreme value of the whole campaign repeats far more often than a smooth signal allows
 (`measurement.gates.clipping.repeated_extreme`), well inside the nominal range.
 
-Nominal range and resolution belong to the model and are no finding.
+Nominal range and resolution are part of the model and are not reported.
 """
 
 from __future__ import annotations
@@ -32,24 +32,22 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class ConverterSettings:
-    """Of the check of converters.
+    """Settings of the check of converters.
 
-    false_alarm : chance of a false alarm in a clean campaign, over all channels, ends and records [1].
-    least_step : smallest step that counts [nominal lsb]: two, less what an estimate may miss.
-    least_phi : modulus of the characteristic function that a comb of such a step reaches [1]: sinc(1/2) = 0.64 at
-        two.
-    free_of_signal : cycles per standard deviation from which the characteristic function of a smooth signal has
-        died out (a sine's Bessel function last).
-    on_the_comb : fraction of the codes in use that lie within one of the comb, at least [1]: the rest is noise
-        behind the step.
-    few_codes : codes in use up to which a signal counts as one of few steps: below, it has no characteristic
-        function to speak of.
-    off_the_mode : samples that must lie off the most frequent code: with fewer, the signal never left its code.
-    neighbour : probability of the code next to the most frequent one, at least [1]: of noise of 0.3 lsb and more,
-        at any offset.
-    nominal_margin : distance of a clip level from the nominal limit below which it is the nominal one [lsb]:
-        offsets of converters.
-    longest : samples of a record that are looked at: more tell nothing new and take memory.
+    false_alarm : probability of a false alarm in a clean campaign, over all channels, ends and records [1].
+    least_step : smallest step that is reported [nominal lsb]: two, minus the possible error of an estimate.
+    least_phi : minimum modulus of the characteristic function for a comb of such a step [1]: sinc(1/2) = 0.64 at two.
+    free_of_signal : cycles per standard deviation from which the characteristic function of a smooth signal has died
+        out (the Bessel function of a sine comes last).
+    on_the_comb : minimum fraction of the codes in use that are within one code of the comb [1]: the rest is noise added
+        after the quantisation.
+    few_codes : codes in use up to which a signal counts as one of few steps, without a useful characteristic function.
+    off_the_mode : minimum number of samples off the most frequent code: with fewer, the signal never left its code.
+    neighbour : minimum probability of the code next to the most frequent one [1]: for noise of 0.3 lsb and more, at any
+        offset.
+    nominal_margin : distance of a clip level from the nominal limit below which it is the nominal one [lsb]: offsets of
+        converters.
+    longest : maximum number of samples of a record that are inspected: more add nothing new and take memory.
     """
 
     false_alarm: float = 1e-3
@@ -69,10 +67,11 @@ SETTINGS = ConverterSettings()
 
 @dataclass(frozen=True, eq=False)
 class ConverterFinding:
-    """One departure of one channel's converter from the rig file.
+    """One difference of one channel's converter from the rig file.
 
     parameters : "resolution_V" (step between values), or "clip_high_V" and/or "clip_low_V" (values where it clips).
-    confidence : 1 - p, p a bound on the chance that a channel as in the rig file shows this anywhere in the campaign.
+    confidence : 1 - p, p an upper bound on the probability that a channel as in the rig file shows this anywhere in the
+        campaign.
     """
 
     channel: str
@@ -84,7 +83,7 @@ class ConverterFinding:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Of one channel in one record; codes are the nearest nominal ones of samples inside the nominal range."""
+    """Samples of one channel in one record; codes are the nominal codes nearest to samples inside the nominal range."""
 
     record: str
     y: np.ndarray
@@ -93,7 +92,7 @@ class _Samples:
 
 
 def nominal_converter(rig: Rig) -> Converter:
-    """Of the rig file.
+    """The converter of the rig file.
 
     Raises
     ------
@@ -106,10 +105,10 @@ def nominal_converter(rig: Rig) -> Converter:
 
 
 def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:
-    """What each sensor's converter does worse than the rig file says; empty where it does not.
+    """Properties of each sensor's converter that are worse than stated in the rig file; empty if there are none.
 
-    A step is found from 1.9 nominal lsb on, a clip level where some 40 samples reach it (8 for each period of a
-    periodic record). Both need samples of a record in memory, one record and channel at a time beside the codes of all.
+    A step is detected from 1.9 nominal lsb on, a clip level if about 40 samples reach it (8 per period of a periodic
+    record). Up to `longest` samples of every record are held in memory.
 
     Raises
     ------
@@ -139,7 +138,7 @@ def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, .
 
 @dataclass(frozen=True)
 class _Step:
-    """q, b [lsb] with standard error of q, and the chance p of seeing it in a clean channel."""
+    """Step q [lsb] with its standard error, and the probability p of such a step in a clean channel."""
 
     q: float
     std: float
@@ -161,7 +160,7 @@ def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: fl
 
 
 def _comb(of: Sequence[_Samples]) -> _Step | None:
-    """The step whose comb |phi| shows, over the records that spread over enough steps."""
+    """The step whose comb appears in |phi|, from the records that extend over enough steps."""
     low = min(int(one.codes.min()) for one in of)
     size = scipy.fft.next_fast_len(4 * (max(int(one.codes.max()) for one in of) - low + 1), real=True)
     nu = np.arange(size // 2 + 1) / size
@@ -176,7 +175,7 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
         n = float(len(one.codes))
         total[free] += n * phi[free]
         weight[free] += n
-        # Each step that is passed is one look at where the values lie within a step.
+        # Each step that the signal crosses is one independent sample of where the values lie within a step.
         travelled += free * np.minimum(n, np.abs(np.diff(one.codes)).sum() * nu)
     usable = (weight > 0) & (nu <= 1 / SETTINGS.least_step)
     if not usable.any():
@@ -185,7 +184,7 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
     high = np.flatnonzero(mean >= max(SETTINGS.least_phi, 0.85 * mean.max()))
     if not high.size:
         return None
-    # The lowest frequency of the comb is its step's; beside it phi has the width of the transform.
+    # The lowest frequency of the comb is 1/q; its peak has the width of the transform.
     run = high[: int(np.argmax(np.append(np.diff(high), 2) > 1)) + 1]
     at = int(run[np.argmax(mean[run])])
     fitted = _fitted(of, 1 / nu[at])
@@ -197,9 +196,9 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
 
 
 def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float] | None:
-    """q by least squares of the distinct codes over their numbers k, widening from the middle where k is certain.
+    """q by least squares of the distinct codes over their numbers k, widening from the middle, where k is certain.
 
-    None where the codes in use do not lie on the comb: samples heaped at a few levels have a large phi too.
+    None if the codes in use do not lie on the comb: samples concentrated at a few levels have a large phi, too.
     """
     codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
     middle = float(codes[np.argmax(counts)])
@@ -214,13 +213,13 @@ def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float] | None:
     k = np.rint((x - b) / q)
     if np.mean(np.abs(x - b - q * k) <= 1.0) < SETTINGS.on_the_comb:
         return None
-    # Rounding to the nominal lsb is the error, at least where the comb happens to be exact.
+    # The error is at least that of rounding to the nominal lsb, even if the comb happens to fit exactly.
     rest = max(float(np.std(x - b - q * k)), 1 / np.sqrt(12.0))
     return q, rest / max(float(k.std()) * np.sqrt(len(k)), 1e-9)
 
 
 def _gaps(of: Sequence[_Samples]) -> _Step | None:
-    """The step of a signal that shows a few values only, from the codes between them that nothing reaches."""
+    """The step of a signal with only a few values, from the unused codes between them."""
     codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
     off = int(counts.sum() - counts.max())
     if not 2 <= len(codes) <= SETTINGS.few_codes or off < SETTINGS.off_the_mode:
@@ -229,17 +228,17 @@ def _gaps(of: Sequence[_Samples]) -> _Step | None:
     smallest = int(steps.min())
     if smallest < 2:
         return None
-    # A step that is no whole number of codes shows as two of them, one apart.
+    # A step that is not an integer number of codes appears as two integer steps that differ by one.
     k = np.concatenate([[0], np.cumsum(np.rint(steps / steps[steps <= smallest + 1].mean()))])
     q = float(np.polyfit(k, codes, 1)[0])
     std = 1 / np.sqrt(6.0) / max(float(k[-1]), 1.0)
-    # Both neighbours of the most frequent code empty, in so many changes of value.
+    # Probability that both neighbours of the most frequent code are empty in so many samples.
     return _Step(q, std, float((1 - SETTINGS.neighbour) ** min(counts.sum(), 1e5)))
 
 
 def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float, level: float
               ) -> ConverterFinding | None:
-    """Both ends of a channel."""
+    """Clipping at either end of a channel's range."""
     parameters, p_all, count, records = {}, 0.0, 0, set()
     for end, sign, bound in (("low", -1.0, -nominal.limits_V[0]), ("high", 1.0, nominal.limits_V[1])):
         made = _plateau(of, sign, bound, nominal.lsb_V, lsb, level)
@@ -264,7 +263,7 @@ def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float,
 
 def _plateau(of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: float, lsb: float, level: float
              ) -> tuple[float, float, float, dict[str, int]] | None:
-    """Level, width, chance and samples by record of a flat end that no record goes beyond."""
+    """Level, width, p-value and samples by record of a flat end that no record exceeds."""
     top = max(float(np.max(sign * one.y)) for one in of)
     if top <= 0 or top > bound - max(SETTINGS.nominal_margin * nominal_lsb, lsb):
         return None

@@ -1,11 +1,12 @@
-"""Lines of the mains in what a model leaves: one fundamental near 50 or 60 Hz, its harmonics, all records and channels.
+"""Mains lines in the residual of a model: one fundamental near 50 or 60 Hz, its harmonics, all records and channels.
 
-A line at k f0 is compared with lines near it that hold the same mixture of noise, misfit and distortion. For a
-periodic record with P periods these are the lines 2 P j further: they lie alike on (or beside) the harmonics of the
-period, odd ones with odd ones. For others they are the next ones beyond the main lobe of the Hann window. With z the
-line's power over the mean of the louder side of m lines, noise gives z ~ F(2, 2m), whose tail is (1 + z/m)^-m; so
-m log(1 + z/m) is exponential with mean 1, and its sum over records is gamma distributed (Fisher 1925). The search
-over f0, harmonics and channels is paid for by Bonferroni.
+A line at k f0 is compared with nearby lines that contain the same mixture of noise, model error and distortion. For a
+periodic record with P periods these are the lines at offsets 2 P j: they are in the same position relative to the
+harmonics of the period, and odd harmonics are compared with odd ones. For other records they are the next lines beyond
+the main lobe of the Hann window. Let z be the line's power over the mean of the louder side of m lines. For noise, z
+has the distribution F(2, 2m), whose tail is (1 + z/m)^-m. m log(1 + z/m) is then exponential with mean 1, and its sum
+over records is gamma distributed (Fisher 1925). A Bonferroni correction accounts for the search over f0, harmonics and
+channels.
 """
 
 from __future__ import annotations
@@ -21,23 +22,21 @@ from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.signals.record_residual import RecordResidual
 
 MAINS_HZ = (50.0, 60.0)
-# int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same of none: 28.1 / 12.
+# int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same without window: 28.1 / 12.
 HANN_COST = 2.34
 
 
 @dataclass(frozen=True)
 class HumSettings:
-    """Of the search for mains hum.
+    """Settings of the search for mains hum.
 
-    search_Hz : half width of the band about 50 and 60 Hz in which the fundamental is looked for [Hz], within which
-        grids keep their frequency.
-    false_alarm : chance of a false alarm in a whole campaign [1]: one user in a thousand is misled.
-    least_ratio : mean power of a line over that of its neighbours, at least [1]: floors are not quite flat.
-    neighbours : lines on either side with which a line is compared: enough for their mean, few enough for a floor
-        to be flat.
-    guard : lines left out next to the tested one: the main lobe of a Hann window is two lines wide.
-    polluted_lines : half width of a polluted band in a transform without window, whose side lobes fall slowly
-        [lines].
+    search_Hz : half width of the band about 50 and 60 Hz in which the fundamental is searched [Hz]; grids keep their
+        frequency within it.
+    false_alarm : probability of a false alarm in a whole campaign [1]: one user in a thousand is misled.
+    least_ratio : minimum mean power of a line over that of its neighbours [1]: noise floors are not quite flat.
+    neighbours : lines on either side with which a line is compared: enough for their mean, few enough for a flat floor.
+    guard : lines omitted next to the tested one: the main lobe of a Hann window is two lines wide.
+    polluted_lines : half width of a polluted band in a transform without window, whose side lobes fall slowly [lines].
     """
 
     search_Hz: float = 0.3
@@ -55,7 +54,7 @@ SETTINGS = HumSettings()
 class HumLine:
     """A harmonic in one channel: peak amplitude [unit of y] over the records, weighted by their noise.
 
-    ratio : power to that of the lines next to it, mean of the records.
+    ratio : power over that of the neighbouring lines, mean of the records.
     """
 
     channel: str
@@ -69,9 +68,10 @@ class HumFinding:
     """Mains hum.
 
     frequency_Hz : the fundamental, common to all records. nominal_Hz : 50 or 60.
-    lines : harmonics and channels that stand out, the largest first.
+    lines : significant harmonics and channels, the largest first.
     parameters : "frequency_Hz", and "amplitude_V" of the largest line (in the unit of y).
-    confidence : 1 - p, p the chance of a line like the most significant one anywhere in a campaign without hum.
+    confidence : 1 - p, p the probability of a line as significant as the most significant one anywhere in a campaign
+        without hum.
     """
 
     nominal_Hz: float
@@ -92,7 +92,8 @@ class HumFinding:
 
 @dataclass(frozen=True, eq=False)
 class _Score:
-    """For a nominal frequency: f0 grid (n,); score, ratio (n, harmonics, channels); tests: records in each score."""
+    """For a nominal frequency: f0 grid (n,); score, ratio (n, harmonics, channels); tests: number of records in each
+    score."""
 
     nominal_Hz: float
     f0: np.ndarray
@@ -102,16 +103,16 @@ class _Score:
 
     @property
     def p(self) -> np.ndarray:
-        """Of each line by itself; 1 where it is not `least_ratio` times as strong as those next to it."""
+        """P-value of each line by itself; 1 if it is not `least_ratio` times as strong as its neighbours."""
         tested = (self.tests > 0) & (self.ratio > SETTINGS.least_ratio)
         return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
 def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
-    """The hum in what a model leaves, None where no line stands out.
+    """The hum in the residual of a model, None if no line is significant.
 
-    Works on the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
-    neighbours are not driven is passed over. Costs a transform of each record and some 10 ms.
+    Tests the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
+    neighbours are not driven is skipped. Takes a transform of each record and about 10 ms.
     """
     scores = [_scores(left, nominal) for nominal in MAINS_HZ]
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
@@ -119,14 +120,14 @@ def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
     chance = min(1.0, min(float(p.min()) for p in each) * trials)
     if chance > SETTINGS.false_alarm:
         return None
-    # p underflows where lines are strong, so that the sum of the scores tells where they are strongest: at 300 Hz
-    # stands a harmonic of either of the mains, elsewhere of one of them.
+    # p underflows where lines are strong; there the sum of the scores decides between the frequencies. 300 Hz is a
+    # harmonic of both mains frequencies, other lines belong to one of them.
     surest = [p * trials <= SETTINGS.false_alarm for p in each]
     strength = [np.sum(np.where(sure, one.score, 0.0), axis=(1, 2)) for one, sure in zip(scores, surest, strict=True)]
     which = int(np.argmax([sums.max() for sums in strength]))
     best, sure, at = scores[which], surest[which], int(np.argmax(strength[which]))
     frequency = _refined(left, float(best.f0[at]), np.argwhere(sure[at]))
-    # With the frequency known, what else stands out is judged among the lines there.
+    # With the frequency known, further lines are tested at its harmonics only.
     there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
     own = there.p[0]
     hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
@@ -137,10 +138,10 @@ def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
 
 def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
              ) -> np.ndarray:
-    """(samples // 2 + 1,) True at lines of a record's transform that hum reaches, to be left out of a fit.
+    """(samples // 2 + 1,) mask of the lines of a record's transform that hum reaches, to be left out of a fit.
 
-    half_lines : on either side of each harmonic that was found in any channel; a transform without window leaks as
-    1/distance, so that what is left is 1/(pi half_lines) of the amplitude, or less.
+    half_lines : on either side of each harmonic found in any channel. A transform without window leaks as 1/distance,
+        so that at most 1/(pi half_lines) of the amplitude remains.
     """
     mask = np.zeros(samples // 2 + 1, bool)
     for k in finding.harmonics:
@@ -152,9 +153,9 @@ def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_line
 
 def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: float, channels: Sequence[str]
              ) -> np.ndarray:
-    """(samples, n_y) y less the sines of the lines found, whose amplitude and phase fit e (samples, n_y) best.
+    """(samples, n_y) y minus the sines of the detected lines, with amplitudes and phases fitted to e (samples, n_y).
 
-    e : the residual of the same record, so that what u drives at these frequencies stays.
+    e : the residual of the same record, so that the response to u at these frequencies remains.
     """
     cleaned = np.array(y, float)
     f0 = finding.frequency_Hz.value
@@ -167,7 +168,7 @@ def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: 
 
 
 def _scores(left: Sequence[RecordResidual], nominal: float, f0: np.ndarray | None = None) -> _Score:
-    """At f0 (n,), by default everywhere within `search_Hz` of the nominal frequency."""
+    """Scores at f0 (n,), by default on a grid within `search_Hz` of the nominal frequency."""
     h = left[0].header
     duration = max(one.header.duration_s for one in left)
     top = int(0.49 * h.sample_rate_Hz / (nominal + SETTINGS.search_Hz))
@@ -182,13 +183,13 @@ def _scores(left: Sequence[RecordResidual], nominal: float, f0: np.ndarray | Non
 
 
 def _offsets(one: RecordResidual) -> np.ndarray:
-    """How many lines away those are that a line is compared with."""
+    """Distances, in lines, of the lines with which a line is compared."""
     stride = 2 * one.periods or 1
     return max(stride, SETTINGS.guard + 1) + stride * np.arange(SETTINGS.neighbours)
 
 
 def _add(one: RecordResidual, f0: np.ndarray, score: np.ndarray, tests: np.ndarray, ratio: np.ndarray) -> None:
-    """A record's part, harmonic by harmonic; lines are looked at once however many f0 fall on them."""
+    """Add the contribution of a record, harmonic by harmonic; a line is evaluated once however many f0 fall on it."""
     power, df = np.abs(one.E) ** 2, one.frequency_Hz[1]
     offsets = _offsets(one)
     for k in range(1, score.shape[1] + 1):
@@ -202,7 +203,7 @@ def _add(one: RecordResidual, f0: np.ndarray, score: np.ndarray, tests: np.ndarr
         z = power[b] / np.maximum(floor, 1e-300)
         usable = inside[:, None] & (floor > 0)
         if one.header.excitation != "noise":
-            # The experiment's own line among silent ones is no hum.
+            # A driven line among silent neighbours is excitation, not hum.
             alike = (one.driven[b[:, None] + offsets].mean(1) + one.driven[b[:, None] - offsets].mean(1)) / 2
             usable &= ~(one.driven[b] & (alike < 0.5))[:, None]
         s = SETTINGS.neighbours * np.log1p(z / SETTINGS.neighbours)
@@ -222,17 +223,17 @@ def _fitted(A: np.ndarray, e: np.ndarray) -> np.ndarray:
 
 
 def _spread(one: RecordResidual, f: float) -> np.ndarray:
-    """(n_y,) variance of either part of a sine's amplitude: 2 s^2 / N, s^2 of the lines near f that are like it."""
+    """(n_y,) variance of the cosine or sine amplitude of a line: 2 s^2 / N, s^2 from comparable lines near f."""
     b, offsets = round(f / one.frequency_Hz[1]), _offsets(one)
     near = np.clip(np.concatenate([b - offsets, b + offsets]), 1, len(one.E) - 1)
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
 def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
-    """f0 by least squares of all lines that stand out, amplitudes and phases free in each record.
+    """f0 by least squares over all significant lines, with free amplitudes and phases in each record.
 
     Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
-    of either part of the amplitude (Rife and Boorstyn 1974), times what the window costs, all lines together.
+    of the cosine or sine amplitude (Rife and Boorstyn 1974), times the cost of the window, for all lines together.
     """
     rate = left[0].header.sample_rate_Hz
     pieces = []
@@ -241,7 +242,7 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
         window = hann(n, sym=False)
         for k, j in hits:
             k = int(k) + 1
-            # Shifted to zero frequency and averaged down to about 60 values: the fine search is cheap there.
+            # Shifted to zero frequency and averaged down to about 60 values, which makes the fine search cheap.
             block = max(n // 64, 1)
             turned = one.e[:, j] * window * np.exp(-2j * np.pi * k * start / rate * np.arange(n))
             coarse = turned[:n // block * block].reshape(-1, block).mean(axis=1)
@@ -255,7 +256,7 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
                                            options={"xatol": 1e-5 * reach}).x)
     information = 0.0
     for k, t, c, s, duration in pieces:
-        # The window's mean is 1/2; s is the variance of either part of the amplitude.
+        # The window's mean is 1/2; s is the variance of the cosine or sine amplitude.
         A2 = (4 * abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t)))) ** 2
         information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12 / HANN_COST
     return Reported(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
@@ -270,7 +271,7 @@ def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: n
         A = _sines(f0, ks, one.header.samples, rate)
         c = _fitted(A, one.e)
         v = np.maximum(np.array([_spread(one, k * f0) for k in ks]), 1e-300)
-        # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; the radial part alone moves the amplitude.
+        # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; only its radial component changes the amplitude.
         power += (c[:len(ks)] ** 2 + c[len(ks):] ** 2 - 2 * v) / v
         weight += 1 / v
     for k, j in hits:

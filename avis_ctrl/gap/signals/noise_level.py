@@ -1,17 +1,18 @@
-"""How much the floor and the sensors' own noise are, against what the rig file calls ambient.
+"""Levels of floor motion and sensor noise, compared with the ambient levels in the rig file.
 
-Sensor noise: variance of each channel on quiet lines far above the modes, where the mounts pass nothing of the floor.
+Sensor noise: variance of each channel on quiet lines far above the modes, where the mounts transmit no floor motion.
 
-Floor: on quiet lines e = G v + n with G (n_y, 3) of the model and n of the variance D just found, so that
+Floor: on quiet lines e = G v + n with G (n_y, 3) of the model and n with the variance D of the sensor noise, so that
 
     v_hat = (G^H D^-1 G)^-1 G^H D^-1 e,    E|v_hat|^2 = S_v + diag (G^H D^-1 G)^-1
 
-gives the density S_v of each direction without bias whatever its shape (generalised least squares). The mounts hide the
-floor from the sensors above some 15 Hz; there a power law that fits below is carried on, with what it is uncertain by.
-What the floor cannot explain, the part of e outside the range of G, says whether it is the floor at all.
+gives the density S_v of each direction without bias, whatever its shape (generalised least squares). Above about 15 Hz
+the mounts hide the floor from the sensors; there a power law fitted at lower frequencies is extrapolated, with its
+uncertainty. The part of e outside the range of G, which the floor cannot explain, shows whether the source is the floor
+at all.
 
-The floor's power must not depend on u. It is taken as S + c L^2 in the level L of the records, c >= 0, where that is
-significant: what the model lacks, and distortion, vanish towards L = 0.
+The floor's power must not depend on u. It is modelled as S + c L^2 in the level L of the records, c >= 0, if c is
+significant: model errors and distortion vanish as L goes to 0.
 """
 
 from __future__ import annotations
@@ -36,28 +37,28 @@ FloorResponse = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class NoiseLevelSettings:
-    """Of the level of floor and sensors.
+    """Settings of the levels of floor motion and sensor noise.
 
     floor_band_Hz : band of the floor's level [Hz]: that of the rig file's `[ambient]`.
-    sensor_band : band of the sensors' own noise, in parts of the sample rate [1]: 100 Hz to 490 Hz at 1 kHz, where
-        no table moves.
-    significant : standard errors above ambient that count as significant [1]: 2e-4 one-sided, for three directions
-        and their mean.
-    seen_factor : r.m.s. in the band where sensors see the floor over the figure for the whole band, from which the
-        floor is clearly above ambient [1]: no shape of an ambient spectrum explains that, but a model some per cent
-        wrong may explain less.
-    total_factor : the same of the whole band, by a power law [1]: an ambient floor that is flat where it is seen
-        and ends there would be taken for sqrt(59.5 / 14.5) = 2.0 times what it is.
-    sensor_factor : sensor noise over what is expected, from which it counts as raised [1]: a converter that is not
-        dithered, or noise not quite white, makes less.
-    foreign : fraction of the excess outside the range of G above which it is not the floor [1]; a force anywhere
+    sensor_band : band of the sensor noise, in fractions of the sample rate [1]: 100 Hz to 490 Hz at 1 kHz, where no
+        table moves.
+    significant : standard errors above ambient that count as significant [1]: 2e-4 one-sided, for three directions and
+        their mean.
+    seen_factor : r.m.s. in the band where sensors detect the floor over the ambient figure for the whole band, from
+        which the floor is clearly above ambient [1]: no shape of an ambient spectrum explains that; a smaller factor
+        could be due to a model error of a few per cent.
+    total_factor : the same for the whole band, with a power law [1]: an ambient floor that is flat where it is detected
+        and ends there would be estimated at sqrt(59.5 / 14.5) = 2.0 times its value.
+    sensor_factor : sensor noise over the expected value, from which it counts as raised [1]: a converter without
+        dither, or noise that is not quite white, has a smaller effect.
+    foreign : fraction of the excess outside the range of G above which it is not the floor [1]; a force at any place
         would have a half.
-    bands_per_octave : bands to the octave.
-    seen : a direction is seen where the density's error is below this fraction of a white ambient floor's density
-        [1].
+    bands_per_octave : bands per octave.
+    seen : a direction is detected if the density's error is below this fraction of a white ambient floor's density [1],
+        plus half of the estimate.
     narrowest_Hz : narrowest band [Hz]: a few lines of a record of 20 s.
-    line : power outside the range of G over its median in the band, above which a line is none of the floor [1]; a
-        gamma distribution of shape 3 is above 20 times its median once in 1e20.
+    line : power outside the range of G over its median in the band, above which a line is not due to the floor [1]; a
+        gamma distribution of shape 3 exceeds 20 times its median with probability 1e-20.
     """
 
     floor_band_Hz: tuple[float, float] = (0.5, 60.0)
@@ -78,12 +79,12 @@ SETTINGS = NoiseLevelSettings()
 
 @dataclass(frozen=True, eq=False)
 class FloorLevel:
-    """Velocity of the floor that was not measured.
+    """Velocity of the floor where it was not measured.
 
-    rms : of each direction in 0.5-60 Hz, a power law beyond `seen_to_Hz`. seen : in 0.5 Hz to seen_to_Hz only.
+    rms : of each direction in 0.5-60 Hz, with a power law beyond `seen_to_Hz`. seen : from 0.5 Hz to seen_to_Hz only.
     ambient : of the rig file [m/s].
-    foreign : part of the excess over sensor noise that no floor motion makes, 0 to 1.
-    clear, significant : whether the floor is above ambient clearly, and beyond doubt of statistics.
+    foreign : fraction of the excess over sensor noise that no floor motion explains, 0 to 1.
+    clear, significant : whether the floor is above ambient by a clear factor, and with statistical significance.
     """
 
     rms: dict[str, Reported]
@@ -103,7 +104,7 @@ class FloorLevel:
 
     @property
     def confidence(self) -> float:
-        """1 - p, p a bound on the chance that estimates of a floor that is at ambient come out as high."""
+        """1 - p, p an upper bound on the probability of estimates as high as these if the floor is at ambient."""
         chance = 5 * float(norm.sf(_excess(self.ambient, self.mean_rms, self.mean_seen, self.seen)))
         return 1 - min(chance, 1.0)
 
@@ -119,10 +120,11 @@ class FloorLevel:
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevels:
-    """Floor (None where every record has it measured, or no line shows it) and sensors, with what is above ambient.
+    """Levels of floor motion and sensor noise, and sensors above ambient.
 
-    sensors : r.m.s. of each channel with its converter's rounding, at the lowest level of the drives. raised : those
-    above ambient, which is no effect of the library.
+    floor : None if every record has it measured, or no line shows it. sensors : r.m.s. of each channel including its
+        converter's rounding, at the lowest level of the drives. raised : sensors above ambient, which is no effect of
+        the library.
     """
 
     floor: FloorLevel | None
@@ -131,25 +133,25 @@ class NoiseLevels:
 
     @property
     def ground_motion(self) -> FloorLevel | None:
-        """The floor where it moves clearly more than the rig file says, and it is the floor."""
+        """The floor if it moves clearly more than stated in the rig file, and the source is the floor."""
         floor = self.floor
         return floor if floor and floor.significant and floor.clear and floor.foreign <= SETTINGS.foreign else None
 
 
 def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
                  steps_V: dict[str, float] | None = None) -> NoiseLevels:
-    """Levels of floor and sensor noise, and what is above the rig's [ambient].
+    """Levels of floor motion and sensor noise, and which of them are above the rig's [ambient].
 
     Parameters
     ----------
     left : y minus the prediction, which should include the floor of records that have it measured.
-    floor_response : omega (n,) rad/s -> (n, n_y, 3), unit of y per m/s; of a ResponseModel the last three columns of
+    floor_response : omega (n,) rad/s -> (n, n_y, 3), unit of y per m/s; for a ResponseModel the last three columns of
         `response`.
     hum : lines to leave out. steps_V : resolution of channels whose converter was found coarser.
 
     Raises
     ------
-    InputError : a rig file without [ambient], too few quiet lines for the sensors' noise.
+    InputError : a rig file without [ambient], or too few quiet lines for the sensor noise.
     """
     first = left[0].header
     ambient = getattr(rig, "ambient", None)
@@ -178,7 +180,7 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
 
 
 def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str) -> dict[str, Reported]:
-    """Of the records at the lowest level: distortion and misfit raise what others show."""
+    """From the records at the lowest level: distortion and model error raise the noise of others."""
     some = [one for one in high if len(one.left)]
     least = min(one.level for one in some)
     quiet = [one for one in some if one.level <= 1.05 * least]
@@ -191,7 +193,7 @@ def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str)
 
 def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarray, ambient: float, rate: float
            ) -> FloorLevel | None:
-    """From v_hat of every line, band by band."""
+    """Level of the floor from v_hat of every line, band by band."""
     edges = _edges()
     count = len(edges) - 1
     estimated = [_floor_lines(one, floor_response, D) for one in low if len(one.left)]
@@ -211,10 +213,10 @@ def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarr
 
 
 def _foreign(estimated: Sequence[tuple], edges: np.ndarray, n_out: int) -> tuple[np.ndarray, float]:
-    """Noise outside the range of G by that of the sensors, (bands,), 1 at least; and the part of the excess that it is.
+    """Noise outside the range of G over sensor noise (bands,), at least 1, and the fraction of the excess that it is.
 
-    The part is the mean over bands that hold more than noise. By medians of each band, which the few lines on a
-    resonance do not lead; that of a gamma distribution is its shape less 1/3.
+    The fraction is the mean over bands that contain more than noise. The median in each band is robust against the few
+    lines on a resonance; that of a gamma distribution is its shape minus 1/3.
     """
     louder, shares = np.ones(len(edges) - 1), []
     f, parallel, outside = (np.concatenate([one[k] for one in estimated]) for k in (0, 3, 4))
@@ -231,7 +233,7 @@ def _foreign(estimated: Sequence[tuple], edges: np.ndarray, n_out: int) -> tuple
 
 
 def _edges() -> np.ndarray:
-    """Thirds of an octave, but no band narrower than `narrowest_Hz`."""
+    """Band edges: `bands_per_octave`, with no band narrower than `narrowest_Hz`."""
     edges = [SETTINGS.floor_band_Hz[0]]
     while edges[-1] < SETTINGS.floor_band_Hz[1] * 0.9:
         edges.append(max(edges[-1] * 2 ** (1 / SETTINGS.bands_per_octave), edges[-1] + SETTINGS.narrowest_Hz))
@@ -245,7 +247,7 @@ def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) 
     covariance = np.linalg.inv(W @ G)
     v = (covariance @ (W @ one.e[:, :, None]))[:, :, 0]
     fitted = (G @ v[:, :, None])[:, :, 0]
-    # Scaled by the largest variance of the channels, so that the projections are of unit noise.
+    # Scaled by the noise variances of the channels, so that the projections have unit noise.
     inside = np.sum(np.abs(fitted) ** 2 / D, axis=1) / one.left
     outside = np.sum(np.abs(one.e - fitted) ** 2 / D, axis=1) / one.left
     noise = np.real(np.einsum("nii->ni", covariance))
@@ -259,9 +261,9 @@ def _band(one: tuple, low: float, high: float, white: float, louder: float
     inside = (f >= low) & (f < high)
     if np.count_nonzero(inside) < 4:
         return None
-    # Lines of machines or mains in the sensors' signals stand out where no floor motion is seen.
+    # Machine or mains lines in the sensor signals stand out in the part that is not floor motion.
     inside &= outside <= SETTINGS.line * np.median(outside[inside])
-    # Noise that is no floor's is as loud in the range of G as outside it, seen from the sensors.
+    # Noise from other sources is assumed as large inside the range of G as outside it, relative to sensor noise.
     P, N, h = power[inside], louder * noise[inside], left[inside][:, None]
     S = np.full(3, white)
     for _ in range(3):
@@ -273,9 +275,9 @@ def _band(one: tuple, low: float, high: float, white: float, louder: float
 
 
 def _at_zero_level(rows: list[tuple[np.ndarray, np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """S (3,) and std of S + c L^2 over the records, c only where it is above twice its error."""
+    """S (3,) and its standard error from S + c L^2 over the records, with c only if it exceeds twice its error."""
     value, variance = np.stack([r[0] for r in rows]), np.stack([r[1] for r in rows])
-    # Of each record's variance its own estimate is part; the mean of all is steadier and does not favour low draws.
+    # A record's variance contains its own estimate; the median of all is more stable and does not favour low estimates.
     steady = np.maximum(np.median(variance, axis=0), 1e-300) * np.ones((len(rows), 1))
     L2 = np.array([r[2] for r in rows]) ** 2
     S, std = np.zeros(3), np.zeros(3)
@@ -284,7 +286,7 @@ def _at_zero_level(rows: list[tuple[np.ndarray, np.ndarray, float]]) -> tuple[np
         S[j], std[j] = np.sum(w * value[:, j]) / w.sum(), 1 / np.sqrt(w.sum())
         if np.ptp(L2) > 0:
             A = np.column_stack([np.ones(len(L2)), L2 / L2.max()])
-            # Records whose own scatter is large, since misfit is most of it, count less here.
+            # Records with a large scatter, mostly due to model error, have less weight here.
             w = 1 / np.maximum(variance[:, j], steady[:, j])
             covariance = np.linalg.inv((A.T * w) @ A)
             c = covariance @ (A.T @ (w * value[:, j]))
@@ -323,12 +325,12 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
 
 
 def _excess(ambient: float, mean: Reported, mean_seen: Reported, seen: dict[str, Reported]) -> float:
-    """Standard errors by which the highest of these five estimates is above ambient."""
+    """Standard errors by which the highest of these five estimates exceeds ambient."""
     return max((one.value - ambient) / max(one.std, 1e-30) for one in (mean, mean_seen, *seen.values()))
 
 
 def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[float, float]:
-    """Power above `end` of a power law a f^-s fitted below, and its standard error over slopes that fit."""
+    """Power above `end` of a power law a f^-s fitted below, and its standard error, averaged over slopes that fit."""
     if end >= SETTINGS.floor_band_Hz[1] * (1 - 1e-9):
         return 0.0, 0.0
     slopes = np.linspace(0.0, 6.0, 61)
@@ -339,7 +341,7 @@ def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[fl
     a_var = 1 / (shape ** 2 @ w)
     a = np.maximum((shape * S) @ w * a_var, 0.0)
     chi2 = ((S - a[:, None] * shape) ** 2) @ w
-    # A spectrum that is no power law widens everything.
+    # A spectrum that is not a power law widens all errors.
     scale = max(float(chi2.min()) / max(len(f) - 2, 1), 1.0)
     weight = np.exp(-(chi2 - chi2.min()) / (2 * scale))
     weight /= weight.sum()

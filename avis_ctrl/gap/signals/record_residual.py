@@ -1,4 +1,4 @@
-"""What a model leaves of a record, in time and on the lines of its transform."""
+"""Residual of a model in a record, in time and on the lines of its transform."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scipy.signal.windows import hann
 from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 
-# Variance of a mean of |e|^2 over neighbouring lines of a Hann window, by that of independent lines: the correlation
-# of e is 2/3 one line apart and 1/6 two apart, so 1 + 2 (4/9 + 1/36).
+# Variance of a mean of |e|^2 over neighbouring lines of a Hann window, over that of independent lines: the correlation
+# of e is 2/3 one line apart and 1/6 two lines apart, so 1 + 2 (4/9 + 1/36).
 HANN_SHARED = 1 + 2 * (4 / 9 + 1 / 36)
 
 
@@ -31,7 +31,7 @@ class RecordResidual:
 
     @cached_property
     def frequency_Hz(self) -> np.ndarray:
-        """(n,) of the lines."""
+        """(n,) frequencies of the lines."""
         return scipy.fft.rfftfreq(self.header.samples, 1 / self.header.sample_rate_Hz)
 
     @cached_property
@@ -46,18 +46,18 @@ class RecordResidual:
 
     @cached_property
     def driven(self) -> np.ndarray:
-        """(n,) lines that u does not leave silent."""
+        """(n,) mask of the lines that u excites."""
         power = np.sum(np.abs(self.U) ** 2, axis=1)
         return power > FIT.silent_line ** 2 * power.max() if power.max() > 0 else np.zeros(len(power), bool)
 
     @property
     def silent(self) -> bool:
-        """u does nothing."""
+        """Whether u is zero."""
         return not np.any(self.u)
 
     @property
     def periods(self) -> int:
-        """Whole periods that fill the record; 0 where it is not periodic, or not cut between periods."""
+        """Number of whole periods that fill the record; 0 if it is not periodic, or not cut between periods."""
         h = self.header
         whole = h.periods if h.period_samples and h.samples % h.period_samples == 0 else 0
         return whole if whole >= 2 else 0
@@ -68,7 +68,7 @@ class RecordResidual:
 
 
 def record_residuals(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[RecordResidual, ...]:
-    """Of the records that a prediction (samples, n_y) is given for, by record name; memory holds all of them."""
+    """Residuals of the records for which a prediction (samples, n_y) is given by name; memory holds all of them."""
     records = (campaign.named(name).load() for name in predicted)
     return tuple(RecordResidual(record.header, record.u, record.y - predicted[record.header.name])
                  for record in records)

@@ -1,9 +1,9 @@
-"""Clipped samples of y replaced by what a model expects there, and u as the drives can follow it.
+"""Replace clipped samples of y by the value that a model expects there, and limit u to what the drives can follow.
 
-A clipped sample says only that the true value lies beyond the limit. Its expectation given the model is the prediction
-where that lies beyond the limit too, and close to the limit otherwise: the E step of expectation maximisation for
-censored data (Dempster, Laird and Rubin 1977, section 4.2), with noise small against the excess. Refit, predict and
-repair again until the parameters stand still.
+A clipped sample shows only that the true value is beyond the limit. Its expectation given the model is the prediction
+if that is beyond the limit, too; otherwise it is close to the limit. This is the E step of expectation maximisation for
+censored data (Dempster, Laird and Rubin 1977, section 4.2), with noise small compared with the excess. Fit, predict and
+repair again until the parameters converge.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from avis_ctrl.rigs.rig import Rig
 class Repaired:
     """A campaign in memory.
 
-    clipped : fraction of the samples of y of each channel, over all records, that lie at its limits.
+    clipped : fraction of each channel's samples of y, over all records, that are at its limits.
     """
 
     campaign: Campaign
@@ -32,7 +32,7 @@ class Repaired:
 
 def channel_limits(rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFinding, ...] = ()
                    ) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value [V] that each channel can show: what was found, otherwise the rig file's."""
+    """Lowest and highest value [V] that each channel can show: as found, otherwise as in the rig file."""
     limits = dict.fromkeys(names, nominal_converter(rig).limits_V)
     for one in findings:
         if one.kind == "clipping" and one.channel in limits:
@@ -45,10 +45,10 @@ def channel_limits(rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFi
 
 def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | None = None,
            findings: tuple[ConverterFinding, ...] = ()) -> Repaired:
-    """Every record in memory, clipped samples replaced where a prediction (samples, n_y) of the record is given.
+    """Every record in memory, with clipped samples replaced if a prediction (samples, n_y) of the record is given.
 
-    Samples within half a nominal step of a limit count as clipped. Without predictions only u is clipped, at the rig's
-    drive limit: what was commanded beyond it is nominal behaviour.
+    Samples within half a nominal step of a limit count as clipped. u is limited to the rig's drive limit: larger
+    commands are nominal behaviour. Without predictions, nothing else is changed.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Models of one axis, identified from measured records in the same frame as the rig: see `identify_single_axis`."""
+"""Single-axis models identified from records, in the same framework as the rig: see `identify_single_axis`."""

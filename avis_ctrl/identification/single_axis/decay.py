@@ -1,7 +1,7 @@
-"""Corner and damping from free decays, and how they move with the amplitude.
+"""Corner frequency and damping ratio from free decays.
 
-A released oscillator decays as a combination of exp(s_1 t), exp(s_2 t), s^2 + 2 zeta omega_0 s + omega_0^2 = 0, in
-every channel that sees it; the amplitudes and a drifting zero of each channel are projected out (Golub and Pereyra
+A released oscillator decays as a combination of exp(s_1 t) and exp(s_2 t), s^2 + 2 zeta omega_0 s + omega_0^2 = 0, in
+every channel that measures it. The amplitudes and a drifting zero of each channel are projected out (Golub and Pereyra
 1973).
 """
 
@@ -16,16 +16,16 @@ from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded
 
 def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping: float, drift: int = 1
               ) -> SingleAxisFit:
-    """Corner and damping ratio of a decay, common to all channels.
+    """Corner frequency and damping ratio of a decay, common to all channels.
 
     Parameters
     ----------
-    time : (n,) s, from after the release. channels : (n, c), each brought to unit r.m.s. corner_Hz, damping : start.
-    drift : degree of the polynomial that each channel's zero follows.
+    time : (n,) s, starting after the release. channels : (n, c), normalised here to unit standard deviation. corner_Hz,
+    damping : initial values. drift : degree of the polynomial of each channel's drifting zero.
 
     Raises
     ------
-    InputError : shapes, start values. ComputationError : nothing that decays.
+    InputError : wrong shapes or initial values. ComputationError : no decaying oscillation fits.
     """
     time, y = np.asarray(time, float).ravel(), np.asarray(channels, float)
     y = y[:, None] if y.ndim == 1 else y
@@ -57,11 +57,11 @@ def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping:
 
 
 def _columns(t: np.ndarray, theta: np.ndarray, drift: int) -> np.ndarray:
-    """(n, 3 + drift): both solutions and the drift, finite at critical damping and beyond."""
+    """(n, 3 + drift): both solutions and the drift; finite at critical damping and beyond."""
     w0, zeta = 2 * np.pi * theta[0], theta[1]
     rest = complex(w0 * np.emath.sqrt(1 - zeta ** 2))
     envelope = np.exp(-zeta * w0 * t)
-    if rest.imag:  # aperiodic: cosh and sinh, taken into the exponential before they overflow
+    if rest.imag:  # aperiodic: cosh and sinh, combined with the exponential before they overflow
         slow, fast = np.exp(-(zeta * w0 - abs(rest.imag)) * t), np.exp(-(zeta * w0 + abs(rest.imag)) * t)
         first, second = (slow + fast) / 2, (slow - fast) / (2 * abs(rest.imag))
     else:

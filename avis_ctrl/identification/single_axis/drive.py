@@ -1,10 +1,10 @@
 """A one-axis drive with friction: F = M a + Fv v + Fc sign(v) + offset.
 
 Inverse dynamic identification (Gautier, 1997; Janot, Gautier and Brunot, "Data set and reference models of EMPS",
-2019): position filtered without phase lag, differentiated, both sides of the equation through the same low-pass filter
-(parallel filter), then linear regression. In a closed loop the noise of the position reaches the force, so that least
-squares is biased by it; the reference is free of noise, and its derivatives, or those of the loop simulated with the
-present parameters, serve as instruments (Janot, Vandanjon and Gautier, IEEE T-CST 22 (2014) 132).
+2019): the position is filtered without phase lag and differentiated, both sides of the equation pass the same low-pass
+filter (parallel filter), and a linear regression follows. In a closed loop the noise of the position reaches the force
+and biases least squares. The reference is free of noise; its derivatives, or those of the loop simulated with the
+current parameters, serve as instruments (Janot, Vandanjon and Gautier, IEEE T-CST 22 (2014) 132).
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
     Parameters
     ----------
     time : (n,) s, uniform. position : (n,) m. force : (n,) N.
-    cutoff_Hz : of the fourth-order Butterworth filter, run forth and back.
-    coulomb : "asymmetric" has one viscous and one Coulomb friction for each direction and no offset of its own, for a
-        constant force is half the difference of the two Coulomb frictions wherever the drive moves; "none" leaves
-        Coulomb friction out.
-    reference : (n,) m of a closed loop; its derivatives are the instruments. Least squares without it.
+    cutoff_Hz : of the fourth-order Butterworth filter, run forward and backward.
+    coulomb : "asymmetric" has separate viscous and Coulomb friction for each direction and no separate offset, because
+        a constant force is half the difference of the two Coulomb frictions wherever the drive moves; "none" omits
+        Coulomb friction.
+    reference : (n,) m of a closed loop; its derivatives are the instruments. Without it, least squares.
 
     Raises
     ------
-    InputError : shapes, a time that is not uniform, a cutoff at or above half the sample rate.
+    InputError : wrong shapes, non-uniform time, a record too short, a cutoff at or above half the sample rate.
     """
     if coulomb not in get_args(Coulomb):
         raise InputError(f"expected one of {', '.join(get_args(Coulomb))}", field="coulomb", value=coulomb)
@@ -54,7 +54,7 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
     units, X = _columns(position, rate, sections, coulomb, offset)
     Z = None if reference is None else _columns(others[2], rate, sections, coulomb, offset)[1]
     y = signal.sosfiltfilt(sections, force)
-    # The filter's own transient at the ends.
+    # Samples of the filter's transient at each end.
     edge = int(np.ceil(2 * rate / cutoff_Hz))
     if len(y) <= 4 * edge:
         raise InputError(f"expected more than {4 * edge / rate:g} s for this cutoff", field="samples", value=len(y))
@@ -66,7 +66,7 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
 
 def _columns(position: np.ndarray, rate: float, sections: np.ndarray, coulomb: str, offset: bool
              ) -> tuple[dict[str, str], np.ndarray]:
-    """Units by name and columns (n, p) of the inverse dynamic model, through the parallel filter."""
+    """Units by name and columns (n, p) of the inverse dynamic model after the parallel filter."""
     q = signal.sosfiltfilt(sections, position)
     v = np.gradient(q, 1 / rate)
     a = np.empty_like(q)

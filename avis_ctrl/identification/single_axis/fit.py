@@ -1,7 +1,7 @@
-"""What every single-axis fit returns, and standard deviations that stand up to coloured residuals.
+"""Common result of all single-axis fits, with standard deviations that are valid for coloured residuals.
 
-A regression of a time series whose residual is correlated from sample to sample knows less than its number of samples
-says. With J the Jacobian, e the residual and s_t = J_t e_t the scores, the covariance of the estimate is
+If the residual of a regression is correlated from sample to sample, its samples contain less information than their
+number suggests. With J the Jacobian, e the residual and s_t = J_t e_t the scores, the covariance of the estimate is
 
     inv(J^T J) n S inv(J^T J),    S = sum over lags l of w_l E[s_t s_(t-l)^T]
 
@@ -24,11 +24,11 @@ from avis_ctrl.summary import Shown
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """What a model leaves.
+    """Statistics of a model's residual.
 
-    rms : in the unit of the measured quantity. share : norm of the residual over norm of what was measured.
-    lag_one : correlation of neighbouring residuals (0 white, 1 the same again). inflation : largest ratio of an honest
-    standard deviation to the one that a white residual would give. lags : L above, 0 where none was used.
+    rms : in the unit of the measured quantity. share : norm of the residual over that of the measured quantity.
+    lag_one : correlation of neighbouring residuals (0: white, 1: equal). inflation : largest ratio of a reported
+    standard deviation to that for a white residual. lags : L above, 0 if none were used.
     """
 
     rms: float
@@ -45,12 +45,12 @@ class SingleAxisFit(Shown):
     Attributes
     ----------
     model : its equation, in words.
-    information : names, values, units, rank and the Cramer-Rao bound for a white residual of the level found.
-    covariance : (n_p, n_p) with the colour of the residual, or the misfit, accounted for as `covariance_method` says.
-    chi2, dof : against `noise`: "given" (measured beforehand), or "residual" (estimated from what is left, so that
-        chi2/dof is 1 by construction and says nothing of the model).
-    abscissa, measured, predicted : for a figure; time s or frequency Hz along axis 0.
-    notes : what a reader of the numbers must know.
+    information : names, values, units, rank and the Cramer-Rao bound for a white residual of the estimated level.
+    covariance : (n_p, n_p); accounts for the colour of the residual, or the misfit, as `covariance_method` describes.
+    chi2, dof : relative to `noise`: "given" (measured beforehand), or "residual" (estimated from the residual, so that
+        chi2/dof is 1 by construction and no test of the model).
+    abscissa, measured, predicted : for a figure; time [s] or frequency [Hz] along axis 0.
+    notes : caveats for a reader of the numbers.
     """
 
     model: str
@@ -80,7 +80,7 @@ class SingleAxisFit(Shown):
 
     @property
     def standard_deviation(self) -> np.ndarray:
-        """(n_p,) honest; infinite where the data do not determine the parameter by itself."""
+        """(n_p,) from `covariance`; infinite where the data do not determine the parameter by itself."""
         return np.where(self.information.known, np.sqrt(np.diag(self.covariance)), np.inf)
 
     def of(self, name: str) -> tuple[float, float]:
@@ -112,7 +112,7 @@ def andrews_lags(scores: np.ndarray) -> int:
     power = np.maximum(np.sum(before ** 2, axis=0), np.finfo(float).tiny)
     rho = np.clip(np.sum(now * before, axis=0) / power, -0.999, 0.999)
     sigma4 = np.mean((now - rho * before) ** 2, axis=0) ** 2
-    # Each score in its own size, so that no parameter's unit decides.
+    # Each score is normalised, so that the parameters' units have no influence.
     weight = 1 / np.maximum(np.mean(scores ** 2, axis=0) ** 2, np.finfo(float).tiny)
     top = np.sum(weight * 4 * rho ** 2 * sigma4 / ((1 - rho) ** 6 * (1 + rho) ** 2))
     bottom = np.sum(weight * sigma4 / (1 - rho) ** 4)
@@ -121,7 +121,7 @@ def andrews_lags(scores: np.ndarray) -> int:
 
 
 def long_run_covariance(scores: np.ndarray, lags: int) -> np.ndarray:
-    """(p, p) S above of scores (n, p)."""
+    """(p, p) S above, from scores (n, p)."""
     n = len(scores)
     total = scores.T @ scores / n
     for lag in range(1, lags + 1):
@@ -131,30 +131,30 @@ def long_run_covariance(scores: np.ndarray, lags: int) -> np.ndarray:
 
 
 def sandwich(bread: np.ndarray, scores: np.ndarray, lags: int, dof: float) -> np.ndarray:
-    """(p, p) covariance of an estimate: bread n S bread^T n/dof, dof = n less what was fitted."""
+    """(p, p) covariance of an estimate: bread n S bread^T n/dof, dof = n minus the number of fitted parameters."""
     n = len(scores)
     return bread @ (n * long_run_covariance(scores, lags)) @ bread.T * n / dof
 
 
 def not_below(covariance: np.ndarray, bread: np.ndarray) -> np.ndarray:
-    """The covariance with no variance smaller than that of `bread`, correlations kept.
+    """The covariance with no variance below that of `bread`; correlations are kept.
 
-    Where few rows hold most of what is known of a parameter (lines at a resonance, few frequencies), the fit bends to
-    them, their residuals are small, and the scores say too little: bread is the variance for residuals that are
-    independent and of the level of their neighbours.
+    If few rows contain most of the information on a parameter (lines at a resonance, few frequencies), the fit adapts
+    to them and their residuals are small, so that the scores underestimate the variance. The variance of bread is that
+    for independent residuals of the same level as their neighbours.
     """
     lift = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(covariance), np.finfo(float).tiny), 1.0))
     return covariance * np.outer(lift, lift)
 
 
 def slopes(function: Callable[[np.ndarray], np.ndarray], theta: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """(..., p) derivative of a function (...) by theta (p,) of size `scale`, by central differences."""
+    """(..., p) derivative of a function (...) with respect to theta (p,) of size `scale`, by central differences."""
     steps = np.diag(1e-5 * scale)
     return np.stack([(function(theta + h) - function(theta - h)) / (2 * h.sum()) for h in steps], axis=-1)
 
 
 def inverse_product(Z: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """(p, p) inverse of Z^T X, (n, p) each; zero along combinations that the data do not determine."""
+    """(p, p) pseudo-inverse of Z^T X, (n, p) each; zero along combinations that the data do not determine."""
     size, size_z = np.linalg.norm(X, axis=0), np.linalg.norm(Z, axis=0)
     return np.linalg.pinv((Z / size_z).T @ (X / size), rcond=1e-12) / size[:, None] / size_z
 
@@ -163,18 +163,18 @@ def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: n
               drawn: tuple[np.ndarray, np.ndarray, np.ndarray], *, instruments: np.ndarray | None = None,
               lags: int | None = None, method: str = "", relative: np.ndarray | None = None,
               given_chi2: float | None = None, notes: tuple[str, ...] = ()) -> SingleAxisFit:
-    """A fit from what it leaves.
+    """Build the result of a fit from its residual.
 
     Parameters
     ----------
     parameters : unit by name. theta : (p,). e : (n, ..) residual of n samples or lines. J : (n, .., p) its derivative,
-    of either sign. spent : numbers of e that went into the fit, linear unknowns included.
-    drawn : abscissa, measured and predicted of the result.
-    instruments : as J, in the estimating equations instead of J.
-    lags : e has unit variance already, and is correlated over so many rows; by default the level of e is estimated from
-        it, and the lags follow Andrews' rule.
-    method : how the lags came about, in words. relative : what the statistics are of, measured less predicted by
-    default. given_chi2 : against noise that was measured beforehand.
+    of either sign. spent : degrees of freedom that the fit used, linear unknowns included.
+    drawn : abscissa, measured and predicted values of the result.
+    instruments : as J; used instead of J in the estimating equations.
+    lags : given if e has unit variance already and is correlated over this many rows; by default the level of e is
+        estimated from it, and the lags follow Andrews' rule.
+    method : how the lags were chosen, in words. relative : residual for the statistics, by default measured minus
+    predicted. given_chi2 : chi-square for noise that was measured beforehand.
     """
     n, p = len(e), len(theta)
     J, e = J.reshape(n, -1, p), e.reshape(n, -1)
@@ -206,14 +206,14 @@ def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: n
 
 def regression(model: str, parameters: Mapping[str, str], X: np.ndarray, y: np.ndarray, time: np.ndarray,
                instruments: np.ndarray | None = None) -> SingleAxisFit:
-    """y = X theta + e for time series, by least squares or with instruments.
+    """Regression y = X theta + e for time series, by least squares or instrumental variables.
 
-    parameters : unit by name. X, instruments : (n, p); y : (n,). Instruments Z of the same shape give theta =
-    inv(Z^T X) Z^T y, consistent where they do not correlate with the noise, as is not so of X in a closed loop.
+    parameters : unit by name. X, instruments : (n, p); y : (n,). Instruments Z of the same shape give the estimate
+    inv(Z^T X) Z^T y, consistent if Z is uncorrelated with the noise. In a closed loop X is correlated with the noise.
 
     Raises
     ------
-    InputError : shapes that do not fit, numbers that are not finite. ComputationError : columns that vanish.
+    InputError : shapes that do not fit, numbers that are not finite. ComputationError : a column of zeros.
     """
     Z = X if instruments is None else instruments
     n, p = X.shape

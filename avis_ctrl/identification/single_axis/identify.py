@@ -1,4 +1,4 @@
-"""From files to a single-axis model.
+"""Identification of a single-axis model from files.
 
     identify_single_axis("seismometer", folder, {"drive": "FuncGen", "coil": "Current", "displacement": "Laser",
                          "t": "Seconds"}, scale={"coil": 0.9425e-6, ...})
@@ -25,7 +25,7 @@ from avis_ctrl.identification.single_axis.sine import SineRecord, fit_sine
 from avis_ctrl.measurement.campaign import Campaign, RecordSource
 from avis_ctrl.measurement.formats.reader import read_measurements
 
-# kind -> (role that drives, other roles that must be mapped, roles that may be)
+# kind -> (role of the input, other required roles, optional roles)
 ROLES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "seismometer": ("drive", (), ("coil", "displacement", "ground")),
     "decay": ("", ("y",), ()),
@@ -45,23 +45,23 @@ OPTIONS: dict[str, dict[str, str]] = {
 def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str], *,
                          scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None,
                          **options: Any) -> SingleAxisFit:
-    """Read measurements of one axis and fit a model of it.
+    """Read measurements of one axis and fit a model to them.
 
     Parameters
     ----------
-    kind : "seismometer" (stepped sine, a directory with one CSV a frequency, or a campaign), "decay" (one record),
+    kind : "seismometer" (stepped sine: a directory with one CSV per frequency, or a campaign), "decay" (one record),
         "drive" or "oscillator" (one record).
-    columns : role to name of a column or variable, and "t" to that of the time where there is one. Roles:
-        seismometer: drive, and coil, displacement or both; with a shaken ground its velocity is the drive, and the coil
-        is mapped as "ground". decay: y. drive: force, position, and reference for instruments. oscillator: u, y.
-    scale : role to the factor that brings the file's numbers to SI; 1 otherwise.
-    sample_rate_Hz : where the file has no time.
+    columns : role to name of a column or variable, and "t" to that of the time if there is one. Roles: seismometer:
+        drive, and coil, displacement or both; for a shaken ground its velocity is the drive, and the coil is mapped as
+        "ground". decay: y. drive: force, position, and reference for instruments. oscillator: u, y.
+    scale : role to the factor that converts the file's numbers to SI; 1 by default.
+    sample_rate_Hz : for files without time.
     options : of `fit_seismometer`, `fit_decay` (with start_s and end_s from the record's start), `fit_drive`,
         `fit_oscillator`.
 
     Raises
     ------
-    InputError : an unknown kind, role, option or column; a file that cannot be read. ComputationError : as the fits.
+    InputError : an unknown kind, role, option or column; an unreadable file. ComputationError : as in the fits.
 
     Examples
     --------
@@ -96,7 +96,7 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
 
 def sine_records(campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
                  ) -> tuple[list[SineRecord], list[str]]:
-    """The sine of each record by frequency, and why the others were refused.
+    """The sine of each record, in order of frequency, and the reasons why the others were refused.
 
     driven, measured : roles, in the order of the campaign's u and y.
     """
@@ -117,7 +117,7 @@ def sine_records(campaign: Campaign, driven: str, measured: Sequence[str], scale
 
 def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
                  ) -> tuple[Responses, list[str]]:
-    """Responses to the drive from sine records, and the records that were left out, with the reason.
+    """Responses to the drive from sine records, and the reasons why the others were omitted.
 
     Raises
     ------

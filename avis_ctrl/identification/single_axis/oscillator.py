@@ -1,13 +1,13 @@
-"""A lumped oscillator m y'' + d y' + k y = u from records of input and output, in the frequency domain.
+"""A lumped oscillator m y'' + d y' + k y = u identified from input and output records in the frequency domain.
 
-For a stretch of record that is not periodic, the discrete Fourier transforms obey exactly (Pintelon and Schoukens 2012,
-section 6.3.2; band-limited signals)
+For a non-periodic stretch of record, the discrete Fourier transforms obey exactly (Pintelon and Schoukens 2012, section
+6.3.2; band-limited signals)
 
     Y = (U + T) / (m s^2 + d s + k),    T a polynomial in s: the state at both ends of the stretch, and leakage
 
-whose coefficients are projected out. The noise is what the fit leaves, smoothed over neighbouring lines, so that its
-colour weighs the lines. A cubic spring k3 y^3 is not a parameter here: under a Gaussian output of variance sigma^2 the
-best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963).
+The coefficients of T are projected out. The noise is the residual of the fit, smoothed over neighbouring lines, so that
+the lines are weighted according to its colour. A cubic spring k3 y^3 is not a parameter here: for a Gaussian output of
+variance sigma^2 the best linear spring is k + 3 k3 sigma^2 (equivalent linearisation, Caughey 1963).
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ PARAMETERS = {"m": "u s^2 a unit of y", "d": "u s a unit of y", "k": "u a unit o
 
 
 def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float]) -> SingleAxisFit:
-    """m, d and k from one stretch of record.
+    """Fit m, d and k to one stretch of record.
 
     Parameters
     ----------
-    u, y : (n,), band-limited (not held between samples). band_Hz : lines used; the input must be there.
+    u, y : (n,), band-limited (not held between samples). band_Hz : of the lines used; the input must excite it.
 
     Raises
     ------
-    InputError : shapes, a band outside 0 .. half the sample rate or with fewer than 40 lines.
+    InputError : wrong shapes, a band outside 0 .. half the sample rate or with fewer than 40 lines.
     ComputationError : no oscillator with positive mass and stiffness fits.
     """
     U, Y, f = _lines(u, y, sample_rate_Hz, band_Hz)
@@ -69,7 +69,7 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
                                next_step="check the columns and widen the band")
     J = slopes(lambda x: left(x, weight), x, np.abs(x)) / to_units
     n, e, spent = len(f), left(x, weight), len(x) + TRANSIENT
-    # Damping rests on the few lines of the resonance, to which the fit bends.
+    # The damping is determined by the few lines of the resonance, to which the fit adapts.
     return concluded("m y'' + d y' + k y = u", PARAMETERS, x * to_units, e.reshape(2, n).T,
                      J.reshape(2, n, -1).swapaxes(0, 1), spent, (f, Y, Y - error), lags=CORRELATED_LINES,
                      method=f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
@@ -98,7 +98,7 @@ def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, floa
 
 
 def _linear(U: np.ndarray, Y: np.ndarray, s: np.ndarray, powers: np.ndarray) -> np.ndarray:
-    """Start: Y (m s^2 + d s + k) - T = U is linear."""
+    """Initial values: Y (m s^2 + d s + k) - T = U is linear in the unknowns."""
     A = np.column_stack([Y * s ** 2, Y * s, Y, -powers])
     return np.linalg.lstsq(_parts(A), _parts(U), rcond=None)[0][:3]
 

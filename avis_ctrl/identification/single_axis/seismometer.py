@@ -1,12 +1,12 @@
-"""A second-order seismometer from sine amplitudes and phases, driven by its calibration coil or by the ground.
+"""Second-order seismometer identified from sine amplitudes and phases, driven by its calibration coil or the ground.
 
-With the mass m on the suspension omega_0, zeta, a force F moves it relative to the frame by x, and its coil gives V:
+A force F moves the mass m on the suspension omega_0, zeta by x relative to the frame, and the coil gives the voltage V:
 
     x/F = (1/m) / (s^2 + 2 zeta omega_0 s + omega_0^2)        V = S s x
     V/v_ground = S s^2 / (s^2 + 2 zeta omega_0 s + omega_0^2)   (Wielandt, IASPEI NMSOP chapter 5; sign of S free)
 
-so that coil, displacement and ground responses are one denominator under s^1, s^0 and s^2. A displacement sensor may
-report late by delay_s.
+The coil, displacement and ground responses thus share one denominator, with the numerators s^1, s^0 and s^2. The
+displacement sensor may have a delay delay_s.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scipy.optimize import brentq, least_squares
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded, slopes
 
-# The misfit of neighbouring frequencies is alike; scores are taken as correlated over this many.
+# Misfits of neighbouring frequencies are similar; scores count as correlated over this many frequencies.
 CORRELATED_LINES = 2
-# A mode of the mount with more damping has the phase of a delay to fourth order: the two cannot be distinguished.
+# A mount mode with more damping has the phase of a delay to fourth order, so that the two cannot be distinguished.
 LARGEST_MODE_DAMPING = 0.2
 POWER = {"coil": 1, "displacement": 0, "ground": 2}
 UNITS = {"corner_Hz": "Hz", "damping": "", "force_gain": "m/s^2 a unit of drive", "sensitivity": "V s/m",
@@ -55,13 +55,13 @@ class Responses:
             raise InputError("expected at least four increasing, positive frequencies", field="frequency_Hz", value=n)
 
     def at(self, keep: np.ndarray) -> Responses:
-        """Some of the frequencies."""
+        """The responses at some of the frequencies."""
         return Responses(self.frequency_Hz[keep], {kind: H[keep] for kind, H in self.value.items()},
                          {kind: V[keep] for kind, V in self.variance.items()})
 
 
 def response(frequency_Hz: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
-    """The model's responses by kind, (n,) each, for parameters as a fit names them."""
+    """The model's responses by kind, (n,) each, for parameters named as in a fit."""
     p = dict(zip(names, values, strict=True))
     s, w0 = 2j * np.pi * np.asarray(frequency_Hz, float), 2 * np.pi * p["corner_Hz"]
     D = s ** 2 + 2 * p["damping"] * w0 * s + w0 ** 2
@@ -74,20 +74,20 @@ def response(frequency_Hz: np.ndarray, names: tuple[str, ...], values: np.ndarra
 
 
 def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
-    """Corner, damping and gains.
+    """Fit corner frequency, damping ratio and gains.
 
-    With coil and displacement: force_gain (m/s^2 a unit of drive), sensitivity (V s/m) and, if asked for,
-    drive_delay_s of both against the drive and delay_s of the displacement against the coil. With one channel alone,
-    its gain, and delay_s against the drive.
+    With coil and displacement: force_gain (m/s^2 per unit of drive), sensitivity (V s/m) and, with `delay`,
+    drive_delay_s of both relative to the drive and delay_s of the displacement relative to the coil. With one channel:
+    its gain, and delay_s relative to the drive.
 
-    The responses' own noise is far below what a linear model misses of a real instrument, so a relative misfit r, the
-    same at every frequency, is added to the noise and chosen so that chi-square per degree of freedom is one; the
-    chi-square that is reported is against the noise alone. Standard deviations let the misfit of neighbouring
-    frequencies correlate, and are not taken below those of independent misfits of size r.
+    The noise of the responses is far smaller than the error of a linear model of a real instrument. Therefore a
+    relative misfit r, equal at every frequency, is added to the noise such that chi-square per degree of freedom is
+    one. The reported chi-square is relative to the noise alone. The standard deviations allow correlated misfits of
+    neighbouring frequencies, and are at least those for independent misfits of size r.
 
     Raises
     ------
-    ComputationError : no oscillator with positive corner and damping comes near the data.
+    ComputationError : no oscillator with positive corner frequency and damping fits the data.
     """
     begin = _start(data, delay)
     names, start, kinds = tuple(begin), np.array(list(begin.values())), list(data.value)
@@ -112,7 +112,7 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
     model = response(data.frequency_Hz, names, theta)
     measured, predicted = (np.column_stack([values[kind] for kind in kinds]) for values in (data.value, model))
     e = misses(theta, r)
-    # Few frequencies: a parameter on which their misfits happen to cancel is not known better for it.
+    # With few frequencies the misfits may cancel in a parameter by chance, which must not reduce its variance.
     return concluded(
         f"second-order seismometer, {' and '.join(kinds)}", {name: UNITS[name] for name in names}, theta, e,
         slopes(lambda x: misses(x, r), theta, scale), len(names), (data.frequency_Hz, measured, predicted),
@@ -124,7 +124,7 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
 
 def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Callable[[float, np.ndarray], np.ndarray],
                  start: np.ndarray) -> tuple[np.ndarray, float]:
-    """Estimate and relative misfit r with chi2/dof = 1; r = 0 where the noise alone explains the data."""
+    """Estimate and relative misfit r for chi2/dof = 1; r = 0 if the noise alone explains the data."""
     theta = solved(0.03, start)
     dof = misses(theta, 0.0).size - len(theta)
     for _ in range(20):
@@ -142,7 +142,7 @@ def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Call
 
 
 def _start(data: Responses, delay: bool) -> dict[str, float]:
-    """A linear estimate by name: H (s^2 + a1 s + a0) = b s^p is linear in a1, a0 and b (Levy, 1959)."""
+    """Linear estimate by name: H (s^2 + a1 s + a0) = b s^p is linear in a1, a0 and b (Levy, 1959)."""
     kind = next(iter(data.value))
     H, s = data.value[kind], 2j * np.pi * data.frequency_Hz
     s0 = float(np.sqrt(np.abs(s[0] * s[-1])))

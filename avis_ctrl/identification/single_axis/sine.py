@@ -1,4 +1,4 @@
-"""Amplitude and phase of every channel of a sine record, with the covariance of the noise next to its line."""
+"""Amplitude and phase of every channel of a sine record, with the covariance of the noise near its line."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from avis_ctrl.errors import ComputationError, InputError
 
 HARMONICS = 7  # fitted, so that distortion does not count as noise
 NEIGHBOURS = 12  # lines on either side whose residual gives the noise
-# A phasor whose record leaves more than this of its power unexplained is not a measurement of a sine.
+# Largest r.m.s. of the unexplained part over that of the sine; above it a channel is not a measurement of a sine.
 LARGEST_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class SineRecord:
-    """Phasors at one frequency, X exp(j omega t) the real part of which is the signal.
+    """Phasors X at one frequency; the signal is the real part of X exp(j omega t).
 
-    frequency_Hz : fitted. phasor : (c,) complex. covariance : (c, c) complex, E[e e^H] of their errors.
-    harmonics : (c, h - 1) amplitudes of the second and higher harmonics over the first. unexplained : (c,) r.m.s. of
-    what sine, harmonics and a slow drift leave, over the r.m.s. of the sine. held : (c,) longest stretch during which a
-    channel stays within 0.1 % of its largest or smallest value, in periods.
+    frequency_Hz : fitted. phasor : (c,) complex. covariance : (c, c) complex, E[e e^H] of the phasor errors.
+    harmonics : (c, h - 1) amplitudes of the second and higher harmonics over the fundamental. unexplained : (c,) r.m.s.
+    of the residual of sine, harmonics and slow drift, over the r.m.s. of the sine. held : (c,) longest time for which a
+    channel stays within 0.1 % of its range from its largest or smallest value, in periods.
     """
 
     name: str
@@ -35,7 +35,7 @@ class SineRecord:
     held: np.ndarray
 
     def ratio(self, output: str, reference: str) -> tuple[complex, float]:
-        """Y/U and the variance E|error|^2 of it."""
+        """Y/U and its variance E|error|^2."""
         i, j = (self._index(name) for name in (output, reference))
         H = self.phasor[i] / self.phasor[j]
         row = np.zeros(len(self.channels), complex)
@@ -43,11 +43,11 @@ class SineRecord:
         return complex(H), float(np.real(row @ self.covariance @ row.conj()))
 
     def refusal(self, channel: str) -> str:
-        """Why this channel is no sine; empty where it is one."""
+        """Why this channel is not a sine; empty if it is one."""
         i = self._index(channel)
         if self.unexplained[i] <= LARGEST_SHARE:
             return ""
-        # A sine stays within 0.1 % of its range next to one end for 2 % of its period.
+        # A sine stays within 0.1 % of its range from one end for 2 % of its period.
         stuck = (f"; it stays at one end of its range for {100 * self.held[i]:.0f} % of a period, where a sine does "
                  "for 2 %: out of range") if self.held[i] > 0.04 else ""
         return f"record {self.name}, {channel}: a sine leaves {100 * self.unexplained[i]:.0f} % unexplained{stuck}"
@@ -63,7 +63,8 @@ def fit_sine(name: str, time: np.ndarray, channels: dict[str, np.ndarray], refer
 
     Raises
     ------
-    InputError : shapes, fewer than three periods. ComputationError : a reference without a line.
+    InputError : wrong shapes, an unknown reference. ComputationError : no sine in the reference, or less than three
+    periods.
     """
     time = np.asarray(time, float)
     if reference not in channels:
@@ -115,9 +116,9 @@ def _columns(t: np.ndarray, frequency: float, harmonics: int) -> np.ndarray:
 
 
 def _line_noise(e: np.ndarray, cycles_per_sample: float) -> np.ndarray:
-    """(c, c) covariance of the phasors' errors from the residual's spectrum on the neighbouring lines.
+    """(c, c) covariance of the phasor errors from the spectrum of the residual on the neighbouring lines.
 
-    The phasor is 2/n times the residual's Fourier transform at the frequency; the fit itself has emptied that line.
+    The phasor error is 2/n times the Fourier transform of the noise at the frequency; the fit has removed that line.
     """
     n = len(e)
     centre = round(cycles_per_sample * n)
@@ -128,7 +129,7 @@ def _line_noise(e: np.ndarray, cycles_per_sample: float) -> np.ndarray:
 
 
 def _longest_hold(y: np.ndarray) -> int:
-    """Steps of the longest stretch within 0.1 % of the range from the largest or the smallest value."""
+    """Steps in the longest stretch within 0.1 % of the range from the largest or the smallest value."""
     near, longest = 1e-3 * np.ptp(y), 0
     for at in (y > y.max() - near, y < y.min() + near):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]])))

@@ -1,11 +1,12 @@
-"""Phases of a multisine that keep its crest factor low.
+"""Multisine phases with a low crest factor.
 
 The peak is the limit of the p-norm. Guillaume, Schoukens, Pintelon and Kollar (IEEE Trans. Instrum. Meas. 40 (1991),
-pp. 982-989) minimise it for p = 4, 8, 16 .. in turn, each from the answer before. So does this module; their
-Gauss-Newton step is replaced by L-BFGS with the gradient by FFT, because their Jacobian of samples by lines is dense.
+pp. 982-989) minimise the norm for p = 4, 8, 16 .. in turn, each time starting from the previous result. This module
+does the same, but replaces their Gauss-Newton step by L-BFGS with a gradient computed by FFT, because their Jacobian
+(samples by lines) is dense.
 
-Only the samples count: a zero-order hold makes no voltage between them. What a filter behind the hold makes of the
-signal may peak higher.
+Only the samples are considered: with a zero-order hold there are no other voltages between them. The output of a filter
+behind the hold may have a higher peak.
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-# Exponents of the norm, powers of two, and steps spent on each.
+# Exponents of the norm (powers of two), and maximum number of iterations for each.
 EXPONENTS = (4, 8, 16, 32, 64, 128, 256)
 STEPS = 60
 
 
 def crest_factor(u: np.ndarray) -> np.ndarray:
-    """Peak over r.m.s. along the samples, u (..., samples); 0 where the signal is zero."""
+    """Peak over r.m.s. along the samples of u (..., samples); 0 where the signal is zero."""
     peak, rms = np.max(np.abs(u), axis=-1), np.sqrt(np.mean(np.square(u), axis=-1))
     return np.divide(peak, rms, out=np.zeros_like(peak), where=rms > 0)
 
 
 def synthesise(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int) -> np.ndarray:
-    """sum of amplitude cos(2 pi k n / samples + phase) over the lines k, (..., samples) for phase (..., n_lines)."""
+    """Sum of amplitude cos(2 pi k n / samples + phase) over the lines k, (..., samples) for phase (..., n_lines)."""
     spectrum = np.zeros((*np.shape(phase)[:-1], samples // 2 + 1), complex)
     spectrum[..., lines] = 0.5 * samples * amplitude * np.exp(1j * np.asarray(phase))
     return np.fft.irfft(spectrum, samples)
@@ -33,12 +34,12 @@ def synthesise(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samp
 
 def low_crest_phases(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int,
                      rotations: np.ndarray | None = None) -> np.ndarray:
-    """Phases near a local minimum of the peak, started from `phase`, (n_lines,).
+    """Phases (n_lines,) near a local minimum of the peak, starting from `phase`.
 
-    rotations : constants [rad] added to all phases in turn; the highest peak of the signals so made is minimised, so
-        that orthogonal experiments, which rotate each input's spectrum, share one set of phases. One signal by default.
+    rotations : constants [rad] added to all phases in turn. The highest peak of the resulting signals is minimised, so
+        that orthogonal experiments, which rotate each input's spectrum, can use the same phases. Default: one signal.
 
-    Never worse than the start: the best of the p-norms' answers by peak, the start included.
+    The result is never worse than the start: it has the lowest peak among the start and the minima of all p-norms.
     """
     turns = np.exp(1j * (np.zeros(1) if rotations is None else np.asarray(rotations)))[:, None]
     best, lowest = phase, np.inf

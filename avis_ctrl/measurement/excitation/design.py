@@ -1,22 +1,23 @@
-"""Signals to drive a rig with: random-phase multisines for several inputs, and band-limited noise.
+"""Excitation signals for a rig: random-phase multisines for several inputs, and band-limited noise.
 
-A multisine is a sum of cosines at whole multiples of 1/period. Over whole periods it does not leak, and what is
-measured at the lines that it leaves out is noise or nonlinear distortion (Pintelon and Schoukens, System
-Identification, 2nd ed., 2012, chapters 4 and 5). Several inputs are told apart in one of two ways:
+A multisine is a sum of cosines at integer multiples of 1/period. Over whole periods there is no leakage, and the
+response on lines that are not excited is noise or nonlinear distortion (Pintelon and Schoukens, System Identification,
+2nd ed., 2012, chapters 4 and 5). The responses to several inputs are separated in one of two ways:
 
-orthogonal : n_u experiments with U(k) = diag(A(k) exp(j phi(k))) T, T an orthogonal matrix with entries of modulus one
-    (Dobrowiecki and Schoukens, Automatica 43 (2007), pp. 38-46): every input drives every line with its own amplitude
-    in every experiment. T is Hadamard's where n_u is a power of two, and the DFT's otherwise.
-zippered : one experiment, the lines dealt out to the inputs in turn; each realisation deals them one place further, so
-    that n_u realisations give every line to every input once.
+orthogonal : n_u experiments with U(k) = diag(A(k) exp(j phi(k))) T, where T is an orthogonal matrix with entries of
+    modulus one (Dobrowiecki and Schoukens, Automatica 43 (2007), pp. 38-46): every input drives every line with its own
+    amplitude in every experiment. T is a Hadamard matrix if n_u is a power of two, otherwise the DFT matrix.
+zippered : one experiment, in which the lines are assigned to the inputs in turn. Each realisation shifts the assignment
+    by one place, so that in n_u realisations every input drives every line once.
 
-Crest factor. T fixes only how the spectra of one input relate between experiments; the phases phi of each input are
-free, and orthogonality does not depend on them. With Hadamard's T an input repeats itself up to sign, so that one
-optimisation serves all experiments at no loss. With the DFT's T it is turned by a constant phase from one to the next,
-and the highest peak of all turns is minimised: about 1.55 to 1.6 for flat spectra, where one signal alone reaches 1.4.
+Crest factor. T only fixes how the spectra of an input are related between experiments. The phases phi of each input are
+free and do not affect orthogonality. With a Hadamard matrix the signal of an input only changes sign between
+experiments, so that one optimisation serves all experiments at no loss. With the DFT matrix its phases are rotated by a
+constant from one experiment to the next, and the highest peak over all rotations is minimised: about 1.55 to 1.6 for
+flat spectra, compared with 1.4 for a single signal.
 
-The optimised signals are no longer Gaussian in distribution: the best linear approximation of a nonlinear rig, which
-depends on the distribution, is then that for signals of this kind.
+The optimised signals are no longer Gaussian in distribution. The best linear approximation of a nonlinear rig depends
+on the distribution, and is then valid for signals of this kind.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_cres
 
 Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]
-# Samples times drives times records: 1 GiB.
+# Maximum of samples times drives times records: 1 GiB.
 MOST_VOLTAGES = 2 ** 27
 
 
 @dataclass(frozen=True, eq=False)
 class ExcitationSignals:
-    """Voltages to play.
+    """Voltage signals to be played.
 
     Attributes
     ----------
     kind : "multisine" (one period each, to be repeated) or "noise".
     u : (records, samples, n_u) V, held between samples.
-    period_s : of a multisine, otherwise None.
-    line_Hz : (n_lines,) excited lines, over all inputs; empty for noise.
+    period_s : period of a multisine, otherwise None.
+    line_Hz : (n_lines,) excited lines of all inputs; empty for noise.
     detection_Hz : lines of the grid inside the band that were left out at random.
-    limit_V : largest voltage allowed.
-    crest_before : (records, n_u) crest factor with the phases first drawn.
-    settings : everything that the signals were made from, seed included; plain values.
+    limit_V : maximum voltage.
+    crest_before : (records, n_u) crest factor with the initial random phases.
+    settings : all settings used for the design, including the seed, as plain values.
     """
 
     kind: str
@@ -66,25 +67,25 @@ class ExcitationSignals:
 
     @property
     def rms_V(self) -> np.ndarray:
-        """(records, n_u)"""
+        """(records, n_u) r.m.s. voltage."""
         return np.sqrt(np.mean(self.u ** 2, axis=1))
 
     @property
     def peak_V(self) -> np.ndarray:
-        """(records, n_u)"""
+        """(records, n_u) maximum absolute voltage."""
         return np.max(np.abs(self.u), axis=1)
 
     @property
     def crest(self) -> np.ndarray:
-        """(records, n_u) peak over r.m.s. as designed."""
+        """(records, n_u) crest factor as designed."""
         return crest_factor(np.moveaxis(self.u, 1, -1))
 
     def scaled_to(self, rms_V: float | None = None) -> ExcitationSignals:
-        """The same signals at another level: the common r.m.s. of every input, by default the largest possible.
+        """The same signals at another level: the same r.m.s. for every input, by default the largest possible.
 
         Raises
         ------
-        InputError : a level that needs more than limit_V; it names the largest possible.
+        InputError : a level that needs more than limit_V; the message gives the largest possible level.
         """
         largest = float(self.limit_V / np.max(self.crest))
         rms_V = largest if rms_V is None else rms_V
@@ -93,37 +94,37 @@ class ExcitationSignals:
             raise InputError(f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
                              f"{self.limit_V / largest:.3f} more would exceed the limit of {self.limit_V:g} V",
                              field="rms_V", value=rms_V)
-        # Round-off must not put the peak beyond the limit.
+        # Round-off must not push the peak beyond the limit.
         u = np.clip(self.u * (rms_V / self.rms_V[:, None, :]), -self.limit_V, self.limit_V)
         return replace(self, u=u, settings=self.settings | {"rms_V": float(rms_V)})
 
 
 @dataclass(frozen=True)
 class MultisineSettings:
-    """What a multisine is asked to be.
+    """Specification of a multisine.
 
     Attributes
     ----------
     inputs : names of the drives, in order.
-    sample_rate_Hz, period_s : their product a whole number of samples.
-    band_Hz : lowest and highest frequency, ends included; the highest below half the sample rate.
-    limit_V : largest voltage.
-    rms_V : r.m.s. of every input; None for as much as the limit allows.
-    lines : "full" every line, "odd" odd ones only, "odd_detection" odd ones of which in each group of consecutive ones
-        one at random is left out.
-    spacing : the lines are multiples (odd multiples) of spacing/period; the lines between show noise.
-    group : odd lines in a group, of which one is left out.
-    scheme : how the inputs are told apart, see above.
-    realisations : independent draws of the phases; the lines are the same in all.
-    dealt : by how many places the zippered lines of the first realisation are dealt on.
-    compensate_hold : divide the amplitudes by the sinc of the zero-order hold, so that the held voltage, not its
-        samples, is flat.
-    low_crest : minimise the crest factor; False keeps the phases drawn.
-    seed : of all that is random.
+    sample_rate_Hz, period_s : their product must be a whole number of samples.
+    band_Hz : lowest and highest frequency, ends included; the highest must be below half the sample rate.
+    limit_V : maximum voltage.
+    rms_V : r.m.s. of every input; None for the largest value that the limit allows.
+    lines : "full" every line, "odd" odd lines only, "odd_detection" odd lines, of which one per group of consecutive
+        odd lines is left out at random.
+    spacing : the lines are multiples (odd multiples) of spacing/period; the lines between them show noise.
+    group : number of odd lines in a group, of which one is left out.
+    scheme : how the responses to the inputs are separated, see above.
+    realisations : number of independent draws of the phases; the lines are the same in all realisations.
+    dealt : number of places by which the assignment of zippered lines is shifted in the first realisation.
+    compensate_hold : divide the amplitudes by the sinc of the zero-order hold, so that the spectrum of the held voltage
+        is flat, not that of its samples.
+    low_crest : minimise the crest factor; False keeps the initial random phases.
+    seed : seed of all random numbers.
 
     Raises
     ------
-    InputError : a value out of its range, a band without lines.
+    InputError : a value outside its range, more voltages than fit into memory.
     """
 
     inputs: tuple[str, ...]
@@ -159,11 +160,11 @@ class MultisineSettings:
 
     @property
     def samples(self) -> int:
-        """In a period."""
+        """Samples per period."""
         return round(self.period_s * self.sample_rate_Hz)
 
     def grid(self) -> np.ndarray:
-        """(n,) numbers of the lines inside the band, those of detection included."""
+        """(n,) numbers of the lines inside the band, including detection lines."""
         low, high = (frequency * self.period_s for frequency in self.band_Hz)
         k = np.arange(int(np.ceil(low * (1 - 1e-9))), int(np.floor(high * (1 + 1e-9))) + 1)
         k = k[(k > 0) & (k % self.spacing == 0) & (2 * k < self.samples)]
@@ -171,7 +172,7 @@ class MultisineSettings:
 
 
 def multisine(settings: MultisineSettings) -> ExcitationSignals:
-    """The signals asked for: n_u records a realisation when orthogonal, one when zippered.
+    """Design a multisine: n_u records per realisation for the orthogonal scheme, one for the zippered scheme.
 
     Raises
     ------
@@ -198,10 +199,10 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
 
 def _one_input(lines: np.ndarray, amplitude: np.ndarray, turns: np.ndarray, samples: int, low_crest: bool,
                rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(experiments, samples) of one input of unit r.m.s., with low crest factor, and as first drawn."""
+    """(experiments, samples) of one input of unit r.m.s., with low crest factor and with the initial random phases."""
     amplitude = amplitude / np.sqrt(np.sum(amplitude ** 2) / 2)
     drawn = rng.uniform(0, 2 * np.pi, lines.size)
-    # Half a turn is a change of sign, which changes no peak.
+    # A rotation by pi only changes the sign, not the peak.
     different = np.unique(np.round(turns % np.pi, 9) % np.round(np.pi, 9))
     phase = low_crest_phases(lines, amplitude, drawn, samples, different) if low_crest else drawn
     return (synthesise(lines, amplitude, phase + turns[:, None], samples),
@@ -213,7 +214,7 @@ def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple
     grid = settings.grid()
     left_out = np.zeros(grid.size, bool)
     if settings.lines == "odd_detection":
-        # A last group that is not full keeps all its lines.
+        # An incomplete last group keeps all its lines.
         starts = np.arange(0, grid.size - settings.group + 1, settings.group)
         left_out[starts + rng.integers(settings.group, size=starts.size)] = True
     lines = grid[~left_out]
@@ -225,15 +226,15 @@ def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple
 
 
 def orthogonal_matrix(n: int) -> np.ndarray:
-    """(n, n), T T^H = n I, entries of modulus one: Hadamard's for a power of two, otherwise the DFT's."""
+    """(n, n) T with T T^H = n I and entries of modulus one: Hadamard if n is a power of two, otherwise DFT."""
     return hadamard(n).astype(float) if n & (n - 1) == 0 else dft(n)
 
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """Gaussian noise, flat inside band_Hz and nothing outside it; as in `MultisineSettings`.
+    """Settings of Gaussian noise, flat inside band_Hz and zero outside; other fields as in `MultisineSettings`.
 
-    records : independent ones; duration_s : of each.
+    records : number of independent records; duration_s : duration of each record.
     """
 
     inputs: tuple[str, ...]
@@ -253,12 +254,12 @@ class NoiseSettings:
 
 
 def noise(settings: NoiseSettings) -> ExcitationSignals:
-    """Independent noise in every input and record, made by its Fourier lines, so that its band has sharp ends.
+    """Independent noise for every input and record, synthesised from Fourier lines so that the band has sharp edges.
 
     Raises
     ------
-    InputError : a record too short to have a line inside the band, a level beyond the limit (noise peaks at 4 to 5
-        times its r.m.s.).
+    InputError : a record too short for a line inside the band, a level beyond the limit (noise peaks at 4 to 5 times
+        its r.m.s.).
     """
     rng, N = np.random.default_rng(settings.seed), round(settings.duration_s * settings.sample_rate_Hz)
     if N < 4:
@@ -294,7 +295,7 @@ def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
 
 
 def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
-    """What both kinds of signals ask."""
+    """Checks that apply to multisines and noise."""
     inputs, rate, band_Hz = settings.inputs, settings.sample_rate_Hz, settings.band_Hz
     if not inputs or len(set(inputs)) != len(inputs):
         raise InputError("expected different names of at least one drive", field="inputs", value=inputs)

@@ -1,4 +1,4 @@
-"""Signals to play on a rig as files: HDF5, CSV or MATLAB .mat (v5). Every file carries seed and settings."""
+"""Write excitation signals to HDF5, CSV or MATLAB .mat (v5) files. Every file includes the seed and settings."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from avis_ctrl.measurement.excitation.design import ExcitationSignals
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 
 SUFFIXES = (".h5", ".hdf5", ".csv", ".mat")
-# A variable of a .mat file of version 5 holds less than 2^31 bytes.
+# Size limit of a variable in a version 5 .mat file.
 MAT5_BYTES = 2 ** 31
 
 
 def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1, rig: str = "") -> None:
     """Write all records; a multisine is repeated `periods` times.
 
-    .h5, .hdf5 : as a campaign without y: /records/NN/u with the campaign's attributes; at the top format =
-        "avis-excitation", version = 1, seed, and settings as JSON.
-    .csv : lines "# key = value" of settings, a header record,time_s,DRIVE.., and one line a sample.
+    .h5, .hdf5 : as a campaign without y: /records/NN/u with the campaign's attributes; file attributes
+        format = "avis-excitation", version = 1, seed, and settings as JSON.
+    .csv : settings as lines "# key = value", a header record,time_s,DRIVE.., and one line per sample.
     .mat : u (samples, drives, records), names, sample_rate_Hz, period_s, level_V, seed, settings (JSON).
 
     Raises
     ------
-    InputError : another suffix, a number of periods below one (or other than one for noise), a file that cannot be
-        written, too many samples for .mat.
-    ComputationError : the disk refuses; the file is then as it was.
+    InputError : another suffix, a number of periods below 1 (or other than 1 for noise), a file that cannot be written,
+        too many samples for .mat.
+    ComputationError : the disk is full; an existing file is then unchanged.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:

@@ -1,4 +1,4 @@
-"""What all readers of measurement files share: tolerant fields, units, and one clear line for every damage."""
+"""Functions shared by all readers of measurement files: tolerant fields, units, and one-line errors for any damage."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UNITS["lbf"] = ("N", 4.4482216152605)
 INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"), ("m/s",)
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 
-# A file that is held in memory whole; text and compressed numbers take about as much again while they are converted.
+# Largest file that is read whole into memory; text and compressed numbers need about twice as much during conversion.
 LARGEST_IN_MEMORY = 1_500_000_000  # bytes
 
 
@@ -36,10 +36,11 @@ def short(error: BaseException) -> str:
 
 @contextmanager
 def reading(path: object, what: str = "the file") -> Iterator[None]:
-    """Refusals inside name the file; so do the failures of the disk and of memory.
+    """Add the file name to errors raised inside, including those of the disk and of memory.
 
-    What h5py raises over damage is turned into an InputError where h5py is called (`stored.access`), so that a mistake
-    of our own is not taken for a damaged file. Results of huge numbers are refused as not finite, without a warning.
+    Exceptions of h5py on damaged files become an InputError where h5py is called (`stored.access`), so that a bug in
+    this package is not reported as a damaged file. Overflows give no warning here; the results are rejected as not
+    finite.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -57,7 +58,7 @@ def reading(path: object, what: str = "the file") -> Iterator[None]:
 
 @contextmanager
 def within(where: str) -> Iterator[None]:
-    """Refusals inside say which part of the file is meant, such as "record 00"."""
+    """Add the part of the file, such as "record 00", to InputErrors raised inside."""
     try:
         yield
     except InputError as error:
@@ -68,7 +69,7 @@ def within(where: str) -> Iterator[None]:
 
 
 def existing_file(path: str | Path) -> Path:
-    """The path, if something readable lies there.
+    """The path, if it is a readable file with content.
 
     Raises
     ------
@@ -91,7 +92,7 @@ def existing_file(path: str | Path) -> Path:
 
 
 def require_small(path: Path, size: int | None = None) -> int:
-    """Size in bytes of a file (or of what it holds, where that is known) that is read whole.
+    """Size in bytes of a file (or of its content, if known) that is read whole.
 
     Raises
     ------
@@ -106,12 +107,12 @@ def require_small(path: Path, size: int | None = None) -> int:
 
 
 def printable(text: str) -> str:
-    """A name out of a file as one line of a message can show it."""
+    """A name from a file, printable on one line of a message."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def _single(value: Any) -> Any:
-    """A value that files store as a scalar, a 0-d array or an array of one."""
+    """The value of a scalar, a 0-d array or an array with one element."""
     if isinstance(value, (np.ndarray, np.generic)):
         array = np.asarray(value)
         return array.reshape(-1).tolist()[0] if array.size == 1 and array.dtype.names is None else value
@@ -121,14 +122,14 @@ def _single(value: Any) -> Any:
 
 
 def brief(value: Any) -> Any:
-    """The value as a message may show it."""
+    """The value, shortened for messages."""
     if isinstance(value, np.ndarray):
         return f"array of shape {value.shape}, {value.dtype}"
     return value if len(repr(value)) <= 80 else repr(value)[:77] + "..."
 
 
 def as_number(value: Any, field: str) -> float:
-    """A finite real number from whatever holds one."""
+    """A finite real number from a scalar or an array with one element."""
     single = _single(value)
     if isinstance(single, bool) or not isinstance(single, (int, float)):
         raise InputError("expected one number", field=field, value=brief(single))
@@ -142,7 +143,7 @@ def as_number(value: Any, field: str) -> float:
 
 
 def as_text(value: Any, field: str) -> str:
-    """A text from str or bytes, bare or in an array of one."""
+    """Text from str or bytes, bare or in an array with one element."""
     single = _single(value)
     if isinstance(single, bytes):
         single = single.decode("utf-8", "replace")
@@ -152,9 +153,9 @@ def as_text(value: Any, field: str) -> str:
 
 
 def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...]:
-    """Channel names from an array or list of str or bytes, or one text (separated by commas for several).
+    """Channel names from an array or list of str or bytes, or from one text (separated by commas for several).
 
-    count : number of channels, where known.
+    count : number of channels, if known.
     """
     if isinstance(value, np.ndarray):
         value = value.reshape(-1).tolist()
@@ -174,18 +175,18 @@ def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...
 
 
 class Unit(NamedTuple):
-    """SI unit and the factor that takes stored numbers to it."""
+    """SI unit, and the factor that converts stored numbers to it."""
 
     si: str
     factor: float
 
 
 def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Unit:
-    """SI unit and factor of a unit's label; the spellings m/s^2, m/s2, m/s**2, m/s/s are one.
+    """SI unit and factor of a unit label; the spellings m/s^2, m/s2, m/s**2, m/s/s are equivalent.
 
     Raises
     ------
-    InputError : an unknown unit, or one not allowed for this quantity.
+    InputError : an unknown unit, or a unit not allowed for this quantity.
     """
     text = label.strip().strip("[]()").replace(" ", "").replace("\u00b2", "^2").replace("**", "^")
     text = text.replace("\u00b5", "u").replace("\u03bc", "u").replace("sec", "s").replace("m/s/s", "m/s^2")
@@ -198,7 +199,7 @@ def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Uni
 
 
 def units_of(value: Any, role: str, count: int) -> tuple[str, tuple[float, ...]]:
-    """One SI unit and the factor of each of `count` channels, from one label or one per channel."""
+    """Common SI unit and the factor of each of `count` channels, from one label or one per channel."""
     field = f"{role} unit"
     array = np.asarray(value, object).reshape(-1) if isinstance(value, (np.ndarray, list, tuple)) else [value]
     if len(array) not in (1, count):
@@ -212,14 +213,14 @@ def units_of(value: Any, role: str, count: int) -> tuple[str, tuple[float, ...]]
 
 
 def require(fields: Mapping[str, Any], name: str, expected: str) -> Any:
-    """A field that has to be there."""
+    """The value of a required field."""
     if name not in fields or fields[name] is None:
         raise InputError(f"missing; expected {expected}", field=name)
     return fields[name]
 
 
 def stated_period(value: Any, field: str) -> float | None:
-    """Period of a record in s; an empty one, NaN or 0 is how struct arrays and tables say that there is none."""
+    """Period of a record in s; None if empty, NaN or 0, as struct arrays and tables mark records without a period."""
     if isinstance(value, np.ndarray) and value.size == 0:
         return None
     single = _single(value)
@@ -230,7 +231,7 @@ def stated_period(value: Any, field: str) -> float | None:
 
 
 def is_number(text: str) -> bool:
-    """Whether a text is one number."""
+    """Whether a text is a number."""
     try:
         float(text)
     except ValueError:
@@ -252,6 +253,6 @@ def numbers(array: Any, field: str) -> np.ndarray:
 
 
 def kind_of(dtype: np.dtype) -> str:
-    """What an array holds, in words."""
+    """Kind of the elements of an array, in words."""
     words = {"O": "objects", "S": "bytes", "U": "text", "c": "complex numbers", "b": "booleans", "V": "structures"}
     return words.get(dtype.kind, str(dtype))

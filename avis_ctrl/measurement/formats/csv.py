@@ -1,12 +1,12 @@
-"""CSV records: a header line with the channels' names, lines of numbers, and what `# key = value` comments state.
+"""CSV records: a header line with channel names, lines of numbers, and comments of the form `# key = value`.
 
-    # sample_rate_Hz = 1000         (in the place of a column t)
+    # sample_rate_Hz = 1000         (instead of a column t)
     # excitation = noise            (also level_V, period_s, start_s, rig)
     t [s],Az1 [V],Sz1 [V]
     0.000,0.1,-0.002
 
-Separator (comma, semicolon, tab) and decimal comma are detected. Without a mapping of columns, t or time is the time,
-u* and A1, Ax1, ... are inputs, y* and S1, Sx1, ... are outputs, vx, vy, vz the floor.
+Separator (comma, semicolon, tab) and decimal comma are detected. Without a column mapping, t or time is the time, u*
+and A1, Ax1, ... are inputs, y* and S1, Sx1, ... are outputs, vx, vy, vz the floor.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from avis_ctrl.measurement.formats.common import existing_file, is_number, readi
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
-CHUNK = 1 << 16  # lines that are turned into numbers at once
+CHUNK = 1 << 16  # lines that are converted to numbers at once
 LONGEST_LINE = 1 << 20  # characters
 USUAL = {"t": r"t|time|t_s|time_s", "u": r"u_?\w*|a[xyz]?\d+", "y": r"y_?\w*|s[xyz]?\d+"}
 STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s", "excitation")
@@ -36,24 +36,24 @@ TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 
 @dataclass(frozen=True)
 class Layout:
-    """What the top of a CSV file says."""
+    """Contents of the header of a CSV file."""
 
     names: list[str]
     units: list[str | None]
     separator: str
     stated: dict[str, str]
-    lines: int  # above the first line of numbers
+    lines: int  # number of lines before the first line of numbers
 
 
 def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
          hints: Hints | None = None) -> Campaign:
     """A CSV file (one record) or a directory of CSV files (one record each, in the order of their names).
 
-    columns : roles t, u, y, floor to names of columns; hints : what the file does not say.
+    columns : roles t, u, y, floor to names of columns; hints : what the file does not state.
 
     Raises
     ------
-    InputError : names file, line and column, or how many time stamps are wrong and where.
+    InputError : names file, line and column, or number and place of wrong time stamps.
     """
     path, hints = Path(path), hints or Hints()
     files = [path]
@@ -77,7 +77,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
 
 
 def is_text(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a text."""
+    """Whether the first bytes of a file are text."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return True
     return bool(head.strip()) and not re.search(rb"[\x00-\x08\x0e-\x19\x1b-\x1f\x7f]", head)
@@ -93,7 +93,9 @@ def _open(path: Path) -> TextIO:
 
 
 def _lines(stream: TextIO) -> Iterator[str]:
-    """Lines without their end; bytes that are no UTF-8 count as Latin-1, the older encoding of measuring software."""
+    """Lines without line ends; bytes that are not UTF-8 are read as Latin-1, the older encoding of measurement
+    software.
+    """
     while line := stream.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
             raise InputError(f"expected lines shorter than {LONGEST_LINE} characters")
@@ -118,10 +120,10 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
         raise InputError(f"expected a header line with the names of the columns; there are {count} lines without one")
     separator = next((mark for mark in ";\t," if mark in line), ",")
     titles = [title.strip() for title in line.split(separator)]
-    if titles and not titles[-1]:  # a separator that ends every line
+    if titles and not titles[-1]:  # every line ends with a separator
         titles = titles[:-1]
     if all(is_number(title.replace(",", ".")) for title in titles):
-        if numbered:  # a file without a header line, whose columns are known by number
+        if numbered:  # no header line; the columns are given by number
             names = [str(k + 1) for k in range(len(titles))]
             return Layout(names, [None] * len(names), separator, stated, count - 1)
         raise InputError("expected a header line with the names of the columns, found numbers", field=f"line {count}",
@@ -144,7 +146,7 @@ def _numbered(columns: Mapped | None) -> bool:
 
 
 def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list[str]]:
-    """Names of the columns of each role, as the caller mapped them or as they are usually called."""
+    """Names of the columns of each role, from the caller's mapping or by their usual names."""
     titles = {f"{name} [{unit}]": name for name, unit in zip(layout.names, layout.units, strict=True) if unit}
     titles |= {str(k + 1): name for k, name in enumerate(layout.names) if str(k + 1) not in layout.names}
     if columns is not None:
@@ -168,7 +170,7 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
 
 
 def _followed_by_numbers(path: Path, layout: Layout) -> bool:
-    """Whether the first filled line below the header is one of numbers."""
+    """Whether the first non-empty line below the header contains numbers."""
     with _open(path) as stream:
         below = (line for line in islice(_lines(stream), layout.lines, None) if line.strip())
         entries = [entry.strip().replace(",", ".") for entry in next(below, "").split(layout.separator)]
@@ -198,7 +200,7 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
 
 
 def _with_stated(hints: Hints, stated: dict[str, str]) -> Hints:
-    """Hints completed by the comments of the file."""
+    """Hints completed with the comments of the file."""
     texts = {field: stated[field].replace(",", ".") for field in STATED if field in stated}
     with within("comment"):
         return hints.completed({field: float(text) if is_number(text) else text for field, text in texts.items()})
@@ -252,7 +254,7 @@ def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> np.ndarray:
 
 
 def _misfit(chunk: list[str], row: int, layout: Layout, use: list[int]) -> InputError:
-    """Where the first entry stands that is no number."""
+    """Error with the place of the first entry that is not a number."""
     for number, line in enumerate(chunk, row + 1):
         entries = line.split(layout.separator)
         for column in use if line.strip() else ():

@@ -1,12 +1,12 @@
-"""HDF5 campaign: several records of one rig in one file, read in pieces, written whole or not at all.
+"""HDF5 campaign: several records of one rig in one file, read in pieces, written completely or not at all.
 
-Layout: attributes format = "avis-campaign", version = 1, rig; groups /records/<name> with the data sets u, y and,
-where it was measured, floor.
+Layout: attributes format = "avis-campaign", version = 1, rig; groups /records/<name> with the data sets u, y and, if
+measured, floor.
 
-A frequency response lies in the group /frf in their place: data sets frequency_Hz (n,), value (n, n_y, n_u) complex,
-and one of: variance (n, n_y, n_u); coherence with the attribute averages; noise (n, n_y, n_y) with gram (n, n_u, n_u),
-as `FrequencyResponse` holds them. Attributes inputs, outputs, input_unit, output_unit; optional method, dof, and data
-sets measurement_noise, distortion.
+A frequency response is stored in the group /frf instead of /records: data sets frequency_Hz (n,), value (n, n_y, n_u)
+complex, and one of: variance (n, n_y, n_u); coherence with the attribute averages; noise (n, n_y, n_y) with gram (n,
+n_u, n_u), as in `FrequencyResponse`. Attributes inputs, outputs, input_unit, output_unit; optional method, dof, and
+data sets measurement_noise, distortion.
 """
 
 from __future__ import annotations
@@ -51,26 +51,27 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 FORMAT, VERSION = "avis-campaign", 1
 ROLES = ("u", "y", "floor")
-# What each record states.
+# Required attributes of each record.
 STATED = {"sample_rate_Hz": "the sample rate in Hz", "excitation": f"one of {', '.join(EXCITATIONS)}",
           "level_V": "the r.m.s. of the driven voltages", "start_s": "the time of the first sample in s"}
-# Of a response: attributes that have to be there, and data sets with the kinds of numbers that they hold.
+# Required attributes of a response, and its data sets with the allowed kinds of numbers.
 NAMED = {"inputs": "the channels' names", "outputs": "the channels' names", "input_unit": "such as 'V'",
          "output_unit": "such as 'V'"}
 DATASETS = {"frequency_Hz": "fiu", "value": "fiuc", "coherence": "fiu", "variance": "fiu",
             **dict.fromkeys(COVARIANCES, "fiuc")}
-CHUNK = 1 << 14  # samples of a record that lie together on disk
+CHUNK = 1 << 14  # samples per chunk on disk
 
 
 def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
          hints: Hints | None = None) -> Campaign | FrequencyResponse:
     """An HDF5 campaign, whose samples stay in the file until they are loaded, or its frequency response.
 
-    columns, hints : none of those of records, which the file states itself; rig : in the place of the file's.
+    columns, hints : none that apply to records, because the file states them itself; rig : replaces the name in the
+    file.
 
     Raises
     ------
-    InputError : not such a file, a missing or wrong attribute or data set; names file, record and field.
+    InputError : not an HDF5 campaign, a missing or wrong attribute or data set; names file, record and field.
     """
     path, hints = existing_file(path), hints or Hints()
     with reading(path, "the HDF5 file"), open_hdf5(path) as file:
@@ -100,12 +101,12 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
 
 
 def _listed(group: h5py.Group) -> str:
-    """What a group holds, in words."""
+    """Names of the members of a group, for messages."""
     return ", ".join(sorted(map(printable, members(group)))) or "nothing"
 
 
 def _check_root(file: h5py.File) -> str:
-    """Name of the rig, after format and version were checked."""
+    """Name of the rig, after format and version have been checked."""
     found = attributes(file, "format", "version", "rig")
     with within("attributes of the file"):
         require(found, "format", f"{FORMAT!r}")
@@ -115,7 +116,7 @@ def _check_root(file: h5py.File) -> str:
 
 
 def check_version(stated: Any, version: Any) -> None:
-    """Refuse another format than that of a campaign, and another version."""
+    """Raise InputError unless format and version are those of a campaign."""
     if (name := as_text(stated, "format")) != FORMAT:
         raise InputError(f"expected {FORMAT!r}", field="format", value=name)
     if (number := as_number(version, "version")) != VERSION:
@@ -123,7 +124,7 @@ def check_version(stated: Any, version: Any) -> None:
 
 
 def _in_order(group: h5py.Group) -> list[str]:
-    """Names in the order they were written, where the file kept it; otherwise "2" before "10"."""
+    """Names in the order of creation, if the file kept it; otherwise in natural order ("2" before "10")."""
     with access("/records"):
         in_order = group.id.get_create_plist().get_link_creation_order()
     if in_order:
@@ -156,7 +157,7 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
 
 
 def _part(dataset: Any, role: str) -> Part:
-    """What a data set of (samples, channels) says of its channels; the samples stay where they are."""
+    """Channels of a data set of (samples, channels); the samples stay in the file."""
     if not isinstance(dataset, h5py.Dataset):
         raise InputError("expected a data set, found a group", field=role)
     shape, dtype = layout(dataset)
@@ -185,7 +186,7 @@ def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
 
 
 def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
-    """The data set of that name, None if there is none."""
+    """Values of the data set with this name, None if there is none."""
     dataset = member(group, name)
     if dataset is None:
         return None
@@ -199,13 +200,13 @@ def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
 
 
 def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20) -> None:
-    """Write an HDF5 campaign, in pieces of at most `longest` samples and under its name only when complete.
+    """Write an HDF5 campaign in pieces of at most `longest` samples; the file gets its name only when it is complete.
 
     Raises
     ------
-    InputError : a record's name that is used twice or cannot be a group's, a place that cannot be written, and
-        whatever loading the records raises; the file is then as it was.
-    ComputationError : the disk refuses; the file is then as it was.
+    InputError : a record name that is used twice or cannot be the name of a group, a path that cannot be written, and
+        any error in loading the records; an existing file is then unchanged.
+    ComputationError : the disk is full; an existing file is then unchanged.
     """
     path = Path(path)
     names = [record.header.name for record in campaign.records]
@@ -246,12 +247,12 @@ def _roles(header: RecordHeader) -> list[tuple[str, tuple[str, ...], str]]:
 
 
 def write_frequency_response(path: str | Path, response: FrequencyResponse, rig: str = "unnamed") -> None:
-    """Write a frequency response as an HDF5 campaign without records; under its name only when complete.
+    """Write a frequency response as an HDF5 campaign without records; the file gets its name only when it is complete.
 
     Raises
     ------
-    InputError : a place that cannot be written; the file is then as it was.
-    ComputationError : the disk refuses; the file is then as it was.
+    InputError : a path that cannot be written; an existing file is then unchanged.
+    ComputationError : the disk is full; an existing file is then unchanged.
     """
     with replacing(Path(path)) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION, "rig": rig})

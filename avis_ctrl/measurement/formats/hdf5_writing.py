@@ -1,8 +1,8 @@
-"""HDF5 files that are written whole or not at all, on a disk that may fill.
+"""HDF5 files that are written completely or not at all, even if the disk becomes full.
 
-The HDF5 library does not survive a disk that refuses while a file is closed: it reports the refusal, forgets to free
-the file, and falls over it when Python ends (a segmentation fault, seen with HDF5 2.0). So it is given a file that
-never refuses, and the refusal is told once HDF5 has let go of it.
+The HDF5 library cannot handle write errors while a file is closed: it reports the error, does not free the file, and
+crashes when Python exits (a segmentation fault, seen with HDF5 2.0). Therefore it gets a file object that never fails,
+and the error is raised after HDF5 has released it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import h5py
 
 from avis_ctrl.files import whole_file
 
-# Pieces up to this size [bytes] may be structure, which HDF5 reads again; chunks of data are larger and are not.
+# Pieces up to this size [bytes] may be metadata, which HDF5 reads back; chunks of data are larger and are not read.
 STRUCTURE = 1 << 16
 
 
 class PatientFile:
-    """What h5py takes for a file: bytes go to a descriptor, after its first refusal nowhere.
+    """File object for h5py: bytes go to a descriptor; after the first write error they are discarded.
 
-    refused : the disk's first refusal. After it small pieces stay in memory, so that HDF5 finds its structure again.
+    refused : first error of the disk. After it small pieces stay in memory, so that HDF5 can read its metadata back.
     """
 
     def __init__(self, descriptor: int):
@@ -72,12 +72,12 @@ class PatientFile:
         return size
 
     def flush(self) -> None:
-        """The descriptor has no buffer."""
+        """Does nothing: the descriptor has no buffer."""
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[h5py.File]:
-    """A new HDF5 file that takes its name only when it is complete. Raises as `whole_file` does."""
+    """A new HDF5 file that gets its name only when it is complete. Raises as `whole_file` does."""
     with whole_file(path) as raw:
         patient = PatientFile(raw.fileno())
         try:

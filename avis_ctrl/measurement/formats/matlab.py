@@ -1,15 +1,15 @@
 """MATLAB .mat files, v5 and v7.3: records in two layouts, or a frequency response.
 
 Layout A, the contract's: a struct array (or cell array of structs) `records` with the fields u, y and sample_rate_Hz,
-and excitation, level_V, start_s, period_s (empty, 0 or NaN where not periodic), floor, u_names, y_names, u_unit,
-y_unit, floor_unit, t where they are known; beside it `rig`.
+and, if known, excitation, level_V, start_s, period_s (empty, 0 or NaN if not periodic), floor, u_names, y_names,
+u_unit, y_unit, floor_unit, t; next to it `rig`.
 
 Layout B, flat variables of one record: u, y, t or fs (Fs, sample_rate_Hz) or Ts, optionally floor, u_names, y_names,
-u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a mapping of columns says which variable is what.
+u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a column mapping assigns variables with other names.
 
 A frequency response is frequency_Hz, H, variance or coherence with averages, inputs, outputs and their units.
 
-Samples of v7.3 files stay on disk. Rows or columns may be the samples; what cannot be told apart is refused.
+Samples of v7.3 files stay on disk. Samples may be rows or columns; ambiguous arrays are rejected.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from avis_ctrl.measurement.formats.records import Hints, Mapped
 from avis_ctrl.measurement.formats.response import stated_response
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
-# "MAT-File Format", level 4: thousands are the byte order (0 little, 1 big endian), tens the type of the numbers, ones
-# the kind of matrix (full, text, sparse).
+# "MAT-File Format", level 4: the thousands digit is the byte order (0 little, 1 big endian), the tens digit the type of
+# the numbers, the ones digit the kind of matrix (full, text, sparse).
 MATRICES_V4 = {1000 * order + 10 * number + kind for order in (0, 1) for number in range(6) for kind in range(3)}
 
 
@@ -61,7 +61,7 @@ def variables(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    InputError : not of version 5 to 7.3, damaged, cut short, too large.
+    InputError : not of version 5 to 7.3, damaged, truncated, too large.
     """
     with path.open("rb") as stream:
         head = stream.read(128)
@@ -73,7 +73,7 @@ def variables(path: Path) -> dict[str, Any]:
 
 
 def is_version_4(head: bytes) -> bool:
-    """Whether a file begins with the header of a v4 matrix: type, rows, columns, imaginary, length of name, name."""
+    """Whether a file starts with the header of a v4 matrix: type, rows, columns, imaginary, length of name, name."""
     for order in "<>" if len(head) > 20 else "":
         kind, rows, columns, imaginary, length = struct.unpack(order + "5i", head[:20])
         name = head[20:20 + length] if 1 < length <= 64 else b""
@@ -83,13 +83,14 @@ def is_version_4(head: bytes) -> bool:
 
 
 def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
-    """The frequency response that the variables hold.
+    """Frequency response from the variables.
 
-    H is (n, n_y, n_u) or, as in an frd object's ResponseData, (n_y, n_u, n); MATLAB drops trailing ones.
+    H is (n, n_y, n_u) or, as in an frd object's ResponseData, (n_y, n_u, n); MATLAB drops trailing singleton
+    dimensions.
 
     Raises
     ------
-    InputError : a variable that is missing, of another kind or shape, or whose dimensions cannot be told apart.
+    InputError : a variable that is missing, has the wrong type or shape, or has ambiguous dimensions.
     """
     frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
     n_y, n_u = _sizes(tree, H, len(frequency))
@@ -123,7 +124,7 @@ def _sizes(tree: Mapping[str, Any], H: np.ndarray, lines: int) -> tuple[int, int
 
 
 def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> np.ndarray:
-    """(n, n_y, n_u) of an array of that shape or of (n_y, n_u, n), trailing ones dropped."""
+    """(n, n_y, n_u) from an array of this shape or of (n_y, n_u, n), without trailing singleton dimensions."""
     n, n_y, n_u = sizes
 
     def padded(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -1,6 +1,6 @@
 """Campaigns in .mat files: the struct array `records`, or the flat variables of one record.
 
-What a flat file may leave out, a record may leave out, too.
+Fields that are optional in a flat file are also optional in a record.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from avis_ctrl.measurement.formats.time_axis import sample_rate_from
 
 @dataclass(frozen=True)
 class MatlabSettings:
-    """much_longer : how many times more samples than channels a record has at least, where no names tell them apart
-    [1]: an array nearer to a square can be read either way.
+    """much_longer : minimum ratio of samples to channels if no names distinguish them [1]: an array closer to a square
+        can be read either way.
     """
 
     much_longer: float = 10.0
@@ -43,19 +43,19 @@ SETTINGS = MatlabSettings()
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output"), "t": ("t", "time"), "floor": ("floor",),
          "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"), "u_names": ("u_names",), "y_names": ("y_names",)}
 PERIODS = ("Ts", "dt")
-# What may stand beside `records` for all of them.
+# Variables next to `records` that apply to all of them.
 SHARED = ("u_names", "y_names", "u_unit", "y_unit", "floor_unit", *USUAL["sample_rate_Hz"], *PERIODS)
 
 
 def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign:
-    """The campaign of a tree that has `records`.
+    """The campaign of a tree with `records`.
 
-    columns : u_names, y_names at most: variables beside `records`, or the names themselves; hints hold for every
-    record, start_s for the first.
+    columns : only u_names and y_names: variables next to `records`, or the names themselves; hints apply to every
+    record, start_s to the first.
 
     Raises
     ------
-    InputError : everything that is missing, of all records, in one line; a field that is wrong, with its record.
+    InputError : everything that is missing in any record, in one line; a wrong field, with its record.
     """
     check_version(tree.get("format", FORMAT), _plain(tree.get("version", VERSION)))
     records = _structs(tree)
@@ -82,7 +82,7 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
 
 def flat_campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None,
                   hints: Hints) -> Campaign:
-    """The campaign of one record whose fields are the variables of the file; columns : which variable is what."""
+    """Campaign of one record, whose fields are the variables of the file; columns : roles to variables."""
     record, notes = _record(path, "00", tree, tree, columns, _with_stated(hints, tree), None)
     return Campaign(_rig(rig, tree), (record,), str(path), tuple(notes))
 
@@ -101,7 +101,8 @@ def _structs(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
-    """Refuse what no reader can assume: all of it at once, so that one look at the file mends it."""
+    """Raise InputError for fields that cannot be assumed, all in one message so that the file can be repaired at once.
+    """
     missing: dict[str, list[str]] = {}
     for name, fields in records.items():
         excitation = hints.excitation or (fields.get("excitation") if isinstance(fields.get("excitation"), str) else "")
@@ -123,7 +124,7 @@ def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
 
 
 def _own_hints(hints: Hints, fields: Mapping[str, Any]) -> Hints:
-    """Hints completed by the record; a period that the caller gives is that of the multisines."""
+    """Hints completed with the record's fields; a period given by the caller applies to multisines."""
     stated = _with_stated(replace(hints, period_s=None), fields)
     given = hints.period_s if stated.excitation in (None, "multisine") else None
     return replace(stated, period_s=stated.period_s if given is None else given)
@@ -131,9 +132,9 @@ def _own_hints(hints: Hints, fields: Mapping[str, Any]) -> Hints:
 
 def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str, Any], columns: Mapped | None,
             hints: Hints, end_s: float | None) -> tuple[RecordSource, list[str]]:
-    """A record, on disk where the file is v7.3 and each role has one variable, in memory otherwise.
+    """A record, on disk if the file is v7.3 and each role has one variable, otherwise in memory.
 
-    tree : where names of channels are looked up; end_s : of the record before, None for the first.
+    tree : where names of channels are looked up; end_s : end of the previous record, None for the first.
     """
     notes, chosen = [], _chosen(fields, columns)
     flat = fields is tree
@@ -161,7 +162,7 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
         counts = [math.prod(item.shape) // samples for item in items]
         names = stated.get(role)
         if names is None:
-            # Variables of one channel give their own names; the columns of a matrix are numbered.
+            # Variables with one channel give their names to the channels; the columns of a matrix are numbered.
             names = tuple(variable if flat and count == 1 else f"{variable if flat else role}{i + 1}"
                           for variable, count in zip(chosen[role], counts, strict=True) for i in range(count))
             notes += [] if flat else [f"{role}_names not stated; numbered {names[0]} to {names[-1]}"]
@@ -177,13 +178,13 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
 
 
 def _chosen(fields: Mapping[str, Any], columns: Mapped | None) -> dict[str, list[str]]:
-    """Variables of each role, as the caller mapped them or as they are usually called."""
+    """Variables of each role, from the caller's mapping or by their usual names."""
     chosen = {}
     for role in USUAL:
         names = mapped(columns, role)
         if names is None:
             names = _usual(fields, role)
-        elif not role.endswith("_names"):  # those may be the names themselves
+        elif not role.endswith("_names"):  # may be the names themselves
             pick(names, list(fields), role)
         chosen[role] = names
     return chosen
@@ -191,7 +192,7 @@ def _chosen(fields: Mapping[str, Any], columns: Mapped | None) -> dict[str, list
 
 def _stated_names(matrices: Mapping[str, Sequence[Matrix]], chosen: Mapping[str, list[str]],
                   tree: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Names of the channels of each role, where somebody states them."""
+    """Names of the channels of each role, if stated."""
     stated: dict[str, tuple[str, ...]] = {"floor": FLOOR_NAMES} if "floor" in matrices else {}
     for role in ("u", "y"):
         items = matrices[role]
@@ -207,19 +208,19 @@ def _plain(value: Any) -> Any:
 
 
 def _empty(value: Any) -> bool:
-    """Nothing, an array of no elements, an empty cell array, an empty text: how struct arrays leave a field out."""
+    """Whether a value is None, or an empty array, cell array or text, as struct arrays store absent fields."""
     if isinstance(value, Matrix):
         return 0 in value.shape
     return value is None or (isinstance(value, (list, str)) and not value)
 
 
 def _usual(tree: Mapping[str, Any], role: str) -> list[str]:
-    """The variable or field that is called what a role usually is, if there is one."""
+    """The variable or field with a usual name of a role, if there is one."""
     return [name for name in USUAL[role] if not _empty(tree.get(name))][:1]
 
 
 def _matrix(value: Any, field: str) -> Matrix:
-    """A real matrix with samples in it, or an InputError that says what it is."""
+    """The value as a real matrix with samples; otherwise an InputError that describes it."""
     if not isinstance(value, Matrix) or value.kind not in "fiu" or len(value.shape) != 2:
         words = f"a {value.kind}" if isinstance(value, Unreadable) else describe(value)
         raise InputError("expected a real matrix, samples by channels", field=field, value=words)
@@ -230,9 +231,9 @@ def _matrix(value: Any, field: str) -> Matrix:
 
 def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[str, int],
                  known: int | None = None) -> int:
-    """Number of samples that all matrices share, whichever way round they are.
+    """Number of samples common to all matrices, in either orientation.
 
-    channels : number of channels of a role, where names tell it; known : length of the time vector.
+    channels : number of channels of a role, if known from names; known : length of the time vector.
 
     Raises
     ------
@@ -269,13 +270,13 @@ def _oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
 
 
 def _with_stated(hints: Hints, tree: Mapping[str, Any]) -> Hints:
-    """Hints completed by variables or fields of the same names."""
+    """Hints completed with variables or fields of the same names."""
     return hints.completed({field: _plain(tree[field]) for field in ("level_V", "start_s", "period_s", "excitation")
                             if not _empty(tree.get(field))})
 
 
 def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int | None) -> tuple[str, ...]:
-    """Channel names from a variable of that name, or the names that the caller wrote instead of one."""
+    """Channel names from a variable with this name, or the names themselves if the caller gave them instead."""
     if len(value) == 1 and value[0] in tree:
         return as_names(_plain(tree[value[0]]), field, count)
     if len(value) == 1 and count is None:
@@ -286,7 +287,7 @@ def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int
 
 def _clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],
            hints: Hints) -> tuple[float, float, str, int | None]:
-    """Sample rate [Hz], first time [s], note, number of samples (None where there is no time vector)."""
+    """Sample rate [Hz], first time [s], note, number of samples (None without a time vector)."""
     start, note, known, rate = 0.0, "", None, None
     if chosen["t"]:
         name = chosen["t"][0]

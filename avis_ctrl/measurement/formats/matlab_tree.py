@@ -1,8 +1,8 @@
-"""Variables of a .mat file as one kind of tree, whatever its version.
+"""Variables of a .mat file as a tree that is the same for all versions.
 
 A numeric array becomes a `Matrix` in MATLAB's orientation, char a str (several rows: a list of str), a cell array a
-list, a struct a dict, a struct array a list of dicts, and what has no meaning here (function handles, objects, sparse
-matrices, tables) an `Unreadable` that is refused only where it is used.
+list, a struct a dict, a struct array a list of dicts. Types without a meaning here (function handles, objects, sparse
+matrices, tables) become an `Unreadable`, which is rejected only where it is used.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-DEEPEST = 8  # nested structs and cells
+DEEPEST = 8  # levels of nested structs and cells
 MOST_CELLS = 10_000  # of one cell or struct array
 
 
 @dataclass(frozen=True)
 class Unreadable:
-    """A variable of a class that holds no measurement."""
+    """A variable of a class that cannot contain measurements."""
 
     kind: str
 
@@ -28,8 +28,8 @@ class Unreadable:
 class Matrix:
     """A numeric array in MATLAB's orientation.
 
-    shape : as MATLAB shows it; kind : of numpy's dtype (f, i, u, c); read : its values in that shape; dataset : where
-    it lies in a v7.3 file (stored with the dimensions reversed), None where it is in memory.
+    shape : as MATLAB shows it; kind : of numpy's dtype (f, i, u, c); read : returns its values in that shape; dataset :
+    its name in a v7.3 file (stored with reversed dimensions), None if it is in memory.
     """
 
     shape: tuple[int, ...]
@@ -43,7 +43,7 @@ TOO_DEEP = Unreadable("structure nested too deep")
 
 
 def describe(value: Any) -> str:
-    """What a variable is, in words."""
+    """Type and shape of a variable, in words."""
     if isinstance(value, Matrix):
         return f"{'complex ' * (value.kind == 'c')}array of {'x'.join(map(str, value.shape))}"
     if isinstance(value, Unreadable):

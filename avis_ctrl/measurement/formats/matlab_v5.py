@@ -1,11 +1,11 @@
-"""MATLAB v5 files (also written by -v6 and -v7): our own strict reader of numbers, text, cells and structs.
+"""MATLAB v5 files (also written by -v6 and -v7): a strict reader of numbers, text, cells and structs.
 
-A C reader that trusts a damaged size can end the process. Here every size is checked against the bytes that are left,
-and dimensions against the bytes of data, before anything is taken; numbers are converted where they are used. What
-does not fit together is refused, not repaired.
+A C reader that trusts a corrupt size can crash the process. Here every size is checked against the remaining bytes, and
+dimensions against the bytes of data, before any data are used; numbers are converted on access. Inconsistent data are
+rejected, not repaired.
 
 Layout: "MAT-File Format", The MathWorks, chapter 1 (level 5): 128 bytes of header, then data elements, each with a tag
-(type, number of bytes) of 8 bytes, and padded to multiples of 8; up to four bytes may stand in the tag itself.
+(type, number of bytes) of 8 bytes, and padded to multiples of 8; up to four bytes may be stored in the tag itself.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ HEADER, TAG = 128, 8
 MATRIX, COMPRESSED = 14, 15
 INT8, UINT8, INT32, UINT32, UTF8, UTF16, UTF32 = 1, 2, 5, 6, 16, 17, 18
 NUMERIC = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-NAME = (INT8, UINT8, UTF8)  # the document says miINT8; other writers use the two others
+NAME = (INT8, UINT8, UTF8)  # miINT8 in the document; some writers use the other two
 CHARACTERS = {INT8: "latin-1", UINT8: "latin-1", 4: "utf-16", UTF8: "utf-8", UTF16: "utf-16", UTF32: "utf-32"}
 CELL, STRUCT, OBJECT, CHAR, SPARSE, FUNCTION, OPAQUE = 1, 2, 3, 4, 5, 16, 17
 CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 FOREIGN = {OBJECT: "MATLAB object", SPARSE: "sparse matrix", FUNCTION: "function handle", OPAQUE: "MATLAB object"}
-COMPLEX = 0x0800  # of the array flags
+COMPLEX = 0x0800  # bit of the array flags
 MOST_DIMENSIONS = 32
 MOST_ELEMENTS = 1 << 31  # of an array in a v5 file
-HIGHEST_RATIO = 1032  # of zlib: no stream holds more bytes than that many times its own
+HIGHEST_RATIO = 1032  # maximum expansion of a zlib stream
 
 
 def variables(path: Path) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def variables(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    InputError : damaged, cut short, or too large to be held in memory; names the variable or the byte it starts at.
+    InputError : damaged, truncated, or too large for memory; names the byte where the variable starts.
     """
     size = require_small(path)
     with path.open("rb") as stream:
@@ -70,14 +70,14 @@ def variables(path: Path) -> dict[str, Any]:
                 if error.file is not None:
                     raise
                 raise InputError(error.expected, field=f"variable at byte {at}") from None
-            if name:  # without one: the workspace of function handles
+            if name:  # no name: the workspace of function handles
                 tree[name] = value
             at += TAG + length
     return tree
 
 
 def _order(header: bytes) -> str:
-    """Byte order of the file, as struct and numpy write it."""
+    """Byte order of the file, as a format character of struct and numpy."""
     order = {b"IM": "<", b"MI": ">"}.get(header[126:128])
     if order is None or struct.unpack(order + "H", header[124:126])[0] != 0x0100:
         raise InputError("expected version 0x0100 and the mark MI in bytes 124 to 127 of the header; damaged?",
@@ -92,7 +92,7 @@ def _damaged(found: str) -> InputError:
 def _inflated(packed: memoryview, order: str, path: Path, held: int) -> memoryview:
     """The matrix in a compressed element, without its tag; no more is inflated than the tag states.
 
-    held : bytes of the variables before it.
+    held : number of bytes of the variables before it.
     """
     stream = zlib.decompressobj()
     try:
@@ -114,7 +114,7 @@ def _inflated(packed: memoryview, order: str, path: Path, held: int) -> memoryvi
 
 
 class Elements:
-    """The data elements in the body of a matrix, one after the other."""
+    """Sequential reader of the data elements in the body of a matrix."""
 
     def __init__(self, body: memoryview, order: str):
         self.body, self.order, self.at = body, order, 0
@@ -124,12 +124,12 @@ class Elements:
         return len(self.body) - self.at
 
     def next(self, what: str, *kinds: int) -> tuple[int, memoryview]:
-        """Type and data of the next element, which has to be of one of the types."""
+        """Type and data of the next element, which must have one of the given types."""
         if self.left < TAG:
             raise _damaged(f"{what}: missing")
         kind, size = struct.unpack_from(self.order + "II", self.body, self.at)
         start, room = self.at + TAG, self.left - TAG
-        if kind >> 16:  # size and data stand in the tag
+        if kind >> 16:  # size and data are in the tag
             kind, size, start, room = kind & 0xFFFF, kind >> 16, self.at + 4, 4
         if size > room:
             raise _damaged(f"{what}: {size} bytes are stated, {room} are left")
@@ -139,7 +139,7 @@ class Elements:
         return kind, self.body[start:start + size]
 
     def integers(self, what: str, kind: int) -> list[int]:
-        """An element of 32-bit integers."""
+        """Values of an element of 32-bit integers."""
         content = self.next(what, kind)[1]
         if len(content) % 4:
             raise _damaged(f"{what}: {len(content)} bytes, no whole number of integers")
@@ -154,7 +154,7 @@ class Elements:
 
 
 def _printable(content: bytes, what: str) -> str:
-    """A name; those of variables and fields stand in messages and hold no control characters."""
+    """Name of a variable or field; names appear in messages and must not contain control characters."""
     name = content.rstrip(b"\0").decode("utf-8", "replace")
     if not name.isprintable() or "\ufffd" in name:
         raise _damaged(f"{what}: {name[:40]!r} is no name")
@@ -164,7 +164,7 @@ def _printable(content: bytes, what: str) -> str:
 def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
     """Name and value of a matrix."""
     if not len(body):
-        return "", EMPTY  # MATLAB writes no more of an empty cell
+        return "", EMPTY  # an empty cell has no content
     elements = Elements(body, order)
     flags = elements.integers("array flags", UINT32)
     if len(flags) != 2:
@@ -192,7 +192,7 @@ def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
 
 
 def _shape(dimensions: list[int]) -> tuple[int, ...]:
-    """Dimensions whose product cannot overflow, also of empty arrays."""
+    """Checked dimensions, whose product cannot overflow, even for empty arrays."""
     sane = 2 <= len(dimensions) <= MOST_DIMENSIONS and min(dimensions) >= 0
     if not sane or math.prod(max(length, 1) for length in dimensions) > MOST_ELEMENTS:
         raise _damaged(f"dimensions: {str(dimensions)[:60]} are no array's")
@@ -200,13 +200,13 @@ def _shape(dimensions: list[int]) -> tuple[int, ...]:
 
 
 def _numbers(elements: Elements, shape: tuple[int, ...], dtype: np.dtype, is_complex: bool) -> Matrix:
-    """A numeric array; MATLAB stores whole numbers in the smallest type that holds them all."""
+    """A numeric array; MATLAB stores whole numbers in the smallest type that fits them all."""
     names = ("real part", "imaginary part") if is_complex else ("real part",)
     parts = [_part(elements, math.prod(shape), dtype, name) for name in names]
 
     def read() -> np.ndarray:
         array = np.empty(math.prod(shape), complex if is_complex else dtype)
-        with np.errstate(invalid="ignore"):  # not-a-number is judged where the samples are used
+        with np.errstate(invalid="ignore"):  # NaN is checked where the samples are used
             if is_complex:
                 array.real, array.imag = parts
             else:
@@ -232,7 +232,7 @@ def _part(elements: Elements, count: int, dtype: np.dtype, what: str) -> np.ndar
 
 
 def _text(elements: Elements, shape: tuple[int, ...]) -> str | list[str]:
-    """Text; the rows of a char matrix are padded with blanks to one length."""
+    """Text; the rows of a char matrix are padded with blanks to equal length."""
     kind, content = elements.next("characters", *CHARACTERS)
     count = math.prod(shape)
     coding = CHARACTERS[kind]
@@ -281,7 +281,7 @@ def _structs(elements: Elements, shape: tuple[int, ...], depth: int) -> Any:
 
 
 def _require_room(elements: Elements, count: int) -> None:
-    """Each part takes a tag at least."""
+    """Check that `count` parts fit into the remaining bytes; each has at least a tag."""
     if count * TAG > elements.left:
         raise _damaged(f"{count} parts are stated; {elements.left} bytes are left")
 

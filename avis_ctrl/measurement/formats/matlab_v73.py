@@ -1,6 +1,6 @@
-"""MATLAB v7.3 files: HDF5, with dimensions reversed, text as codes, cells and struct arrays by reference.
+"""MATLAB v7.3 files: HDF5, with reversed dimensions, text as character codes, cells and struct arrays by reference.
 
-The class of a variable stands in its attribute MATLAB_class. Numbers stay in the file until they are read.
+The class of a variable is stored in its attribute MATLAB_class. Numbers stay in the file until they are read.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from avis_ctrl.measurement.formats.stored import (
     values_in,
 )
 
-MOST_ITEMS = 200_000  # of a file: references may lead in circles
+MOST_ITEMS = 200_000  # of a file: references may be circular
 
 
 def variables(path: Path) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def variables(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    InputError : no HDF5 file, damaged, cut short.
+    InputError : not an HDF5 file, damaged, truncated.
     """
     with reading(path, "the .mat file (v7.3)"), open_hdf5(path) as file:
         tree = Tree(file, path)
@@ -43,13 +43,13 @@ def variables(path: Path) -> dict[str, Any]:
 
 
 class Tree:
-    """Reader of one open file."""
+    """Reader of the variables in one open file."""
 
     def __init__(self, file: h5py.File, path: Path):
         self.file, self.path, self.items = file, path, 0
 
     def value(self, item: Any, depth: int) -> Any:
-        """What a group or data set holds."""
+        """Value of a group or data set."""
         self.items += 1
         if self.items > MOST_ITEMS:
             raise InputError(f"expected at most {MOST_ITEMS} variables, cells and fields; damaged?")
@@ -81,7 +81,7 @@ class Tree:
         return EMPTY if empty else self._matrix(item, shape, dtype)
 
     def _text(self, item: h5py.Dataset, shape: tuple[int, ...], dtype: np.dtype) -> Any:
-        """Text as UTF-16 codes; columns of the file are rows of a char matrix."""
+        """Text from UTF-16 codes; columns of the file are rows of a char matrix."""
         if dtype.kind != "u" or dtype.itemsize != 2:
             return Unreadable(f"text of type {dtype}")
         require_small(self.path, 2 * math.prod(shape))
@@ -102,7 +102,7 @@ class Tree:
         return self.value(member(self.file, reference), depth + 1)
 
     def _struct(self, group: h5py.Group, depth: int) -> Any:
-        """A struct, or a struct array: there each field holds references, one per element."""
+        """A struct, or a struct array: each of its fields has one reference per element."""
         fields = {name: member(group, name) for name in members(group)}
         arrays = {}
         for name, field in fields.items():

@@ -1,4 +1,4 @@
-"""One door to every measurement file: the format is told by the content, not by the name."""
+"""Common entry point for all measurement files: the format is recognised by the content, not by the name."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from avis_ctrl.measurement.layouts import FORMATS
 __all__ = ["FORMATS", "parse_columns", "read_measurements"]
 
 NAMING = ("u_names", "y_names")
-# Suffixes of texts that would pass for CSV.
+# Suffixes of text files that could be taken for CSV.
 NO_MEASUREMENT = {".py", ".m", ".md", ".rst", ".toml", ".json", ".yaml", ".yml", ".html", ".ipynb", ".tex", ".sh"}
 
 
 def parse_columns(text: str) -> dict[str, list[str]]:
-    """A mapping of columns from the text of a command line: "u=A1+A2,y=S1,t=time".
+    """Column mapping from a command-line text such as "u=A1+A2,y=S1,t=time".
 
     Raises
     ------
-    InputError : no role or no name, a role that does not exist or comes twice.
+    InputError : no role or no name, an unknown or repeated role.
     """
     columns: dict[str, list[str]] = {}
     for part in text.split(","):
@@ -46,22 +46,22 @@ def parse_columns(text: str) -> dict[str, list[str]]:
 
 def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None, rig: str | None = None,
                       **hints: Any) -> Campaign | FrequencyResponse:
-    """Measurements of whatever format: a campaign of records, or a frequency response.
+    """Read measurements in any supported format: a campaign of records, or a frequency response.
 
     columns : roles (t, u, y, floor, ...) to names, for files of flat columns; u_names and y_names to the name of a
-    MATLAB variable or, in any format, to the channels' names themselves in the order of the file; rig : name of the
-    rig, in the place of the file's; hints : what the file does not say, see `records.Hints`. A self-describing HDF5
-    campaign takes none of the hints for records: it states them.
+    MATLAB variable or, in any format, to the channel names themselves in the order of the file; rig : name of the rig,
+    which replaces that of the file; hints : what the file does not state, see `records.Hints`. A self-describing HDF5
+    campaign accepts no hints for records, because it states them itself.
 
     Raises
     ------
-    InputError : one line that names the file, the field, its value and what was expected.
+    InputError : one line with the file, the field, its value and what was expected.
     """
     known, path = hints_from(hints), Path(path)
     naming = {role: names for role in NAMING if (names := mapped(columns, role))}
     plain = {role: names for role, names in (columns or {}).items() if role not in NAMING} or None
     with reading(path):
-        if os.path.isdir(path):  # False, not an error, for names that no file can have
+        if os.path.isdir(path):  # False, not an error, for impossible file names
             return renamed(csv.read(path, plain, rig, known), naming)
         path = existing_file(path)
         if path.suffix.lower() in NO_MEASUREMENT:
@@ -72,14 +72,14 @@ def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None
         if kind == "matlab":
             measured = matlab.read(path, columns, rig, known)
             if isinstance(measured, Campaign):
-                return measured  # names told which way round a matrix is, or named the variable that holds them
+                return measured  # the names are already used, e.g. to find the orientation of a matrix
         else:
             measured = {"hdf5": hdf5.read, "uff": uff.read, "csv": csv.read}[kind](path, plain, rig, known)
         return renamed(measured, naming)
 
 
 def _format(path: Path, head: bytes) -> str:
-    """Which reader a file is for, by its content."""
+    """Name of the reader for a file, by its content."""
     if head.startswith(b"MATLAB "):
         return "matlab"
     if matlab.is_version_4(head):
@@ -100,7 +100,7 @@ def _format(path: Path, head: bytes) -> str:
 
 
 def _is_hdf5(path: Path, head: bytes) -> bool:
-    """By the signature; h5py also looks behind a user block."""
+    """By the signature; h5py also finds it behind a user block."""
     if head.startswith(b"\x89HDF\r\n\x1a\n"):
         return True
     try:
@@ -110,11 +110,11 @@ def _is_hdf5(path: Path, head: bytes) -> bool:
 
 
 def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[str]]) -> Campaign | FrequencyResponse:
-    """The same with other names of its channels; naming : u_names, y_names to names in the order of the file.
+    """The same measurements with other channel names; naming : u_names, y_names to names in the order of the file.
 
     Raises
     ------
-    InputError : not one name for each channel.
+    InputError : a number of names that differs from the number of channels.
     """
     response = isinstance(measured, FrequencyResponse)
     fields = {"u_names": "inputs", "y_names": "outputs"} if response else {"u_names": "u_names", "y_names": "y_names"}

@@ -1,4 +1,4 @@
-"""Records from what a file states of them: which channel is what, in which unit, and what nobody stated."""
+"""Records from the contents of a file: the role and unit of each channel, and assumptions for what is not stated."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from avis_ctrl.measurement.formats.common import as_number, as_text, stated_peri
 from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
 ROLES = ("t", "u", "y", "floor", "sample_rate_Hz", "u_names", "y_names")
-UNNAMED = "unnamed"  # rig of a campaign whose file does not say
-PIECE = 1 << 18  # samples of u on disk that are looked at together
+UNNAMED = "unnamed"  # rig of a campaign whose file states none
+PIECE = 1 << 18  # samples of u on disk that are loaded at once
 
 Mapped = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """same_rate : relative difference of two sample rates below which they are one clock's [1]: time stamps are rounded
-    by less, and the quartz clocks of two instruments differ by more.
+    """same_rate : relative difference of two sample rates below which they are from the same clock [1]: rounding of
+        time stamps causes smaller differences, and the quartz clocks of two instruments differ by more.
     """
 
     same_rate: float = 1e-6
@@ -34,10 +34,10 @@ SETTINGS = RecordSettings()
 
 @dataclass(frozen=True)
 class Hints:
-    """What the caller knows and the file may not say; a hint that is given overrides the file.
+    """What the caller knows and the file may not state; a hint that is given overrides the file.
 
-    u_unit, y_unit : unit in which the file's numbers are; averages, relative_standard_deviation : of frequency
-    responses, see `response_from`.
+    u_unit, y_unit : unit of the numbers in the file; averages, relative_standard_deviation : of frequency responses,
+    see `response_from`.
     """
 
     sample_rate_Hz: float | None = None
@@ -59,9 +59,10 @@ class Hints:
             raise InputError(f"expected one of {', '.join(EXCITATIONS)}", field="excitation", value=self.excitation)
 
     def completed(self, stated: Mapping[str, Any]) -> Hints:
-        """With what a file states of a record: sample_rate_Hz, excitation, level_V, start_s, period_s.
+        """Hints completed with sample_rate_Hz, excitation, level_V, start_s, period_s as a file states them for a
+        record.
 
-        Raises InputError if one of them is of another type.
+        Raises InputError if one of these has the wrong type.
         """
         kinds: dict[str, Any] = {"excitation": as_text, "period_s": stated_period}
         return replace(self, **{field: kinds.get(field, as_number)(value, field) for field, value in stated.items()
@@ -73,7 +74,7 @@ def hints_from(given: Mapping[str, Any]) -> Hints:
 
     Raises
     ------
-    InputError : an unknown name, a value of the wrong kind.
+    InputError : an unknown name, a value of the wrong type.
     """
     known = [field.name for field in fields(Hints)]
     for name in given:
@@ -83,11 +84,11 @@ def hints_from(given: Mapping[str, Any]) -> Hints:
 
 
 def mapped(columns: Mapped | None, role: str) -> list[str] | None:
-    """Names that a mapping gives a role; None where it does not speak of it.
+    """Names that a mapping assigns to a role; None if it does not contain the role.
 
     Raises
     ------
-    InputError : roles that do not exist, names that are no text.
+    InputError : unknown roles, names that are not text.
     """
     if columns is None:
         return None
@@ -106,7 +107,7 @@ def mapped(columns: Mapped | None, role: str) -> list[str] | None:
 
 
 def pick(names: Sequence[str], available: Sequence[str], role: str) -> None:
-    """Refuse names that are not there."""
+    """Raise InputError for names that are not available."""
     for name in names:
         if name not in available:
             raise InputError(f"not there; the file has {', '.join(available) or 'nothing'}", field=f"columns: {role}",
@@ -116,8 +117,8 @@ def pick(names: Sequence[str], available: Sequence[str], role: str) -> None:
 class Part(NamedTuple):
     """Channels of one role.
 
-    unit : label of all channels, or one each; None where nobody states it. samples : (samples, channels), or where
-    they lie in an HDF5 file.
+    unit : label of all channels, or one each; None if not stated. samples : (samples, channels), or their place in an
+    HDF5 file.
     """
 
     names: Sequence[str]
@@ -127,14 +128,13 @@ class Part(NamedTuple):
 
 def record_from(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float, hints: Hints,
                 path: str = "") -> tuple[RecordSource, list[str]]:
-    """A record of u, y and, where measured, floor, and a note for each assumption.
+    """A record of u, y and, if measured, floor, and a note for each assumption.
 
-    path : of the HDF5 file in which the samples of all parts stay.
+    path : HDF5 file in which the samples of all parts stay.
 
     Raises
     ------
-    InputError : parts of different length, a unit of another quantity, a period that is missing, samples that are not
-        finite.
+    InputError : parts of different lengths, a unit of another quantity, a missing period, samples that are not finite.
     """
     with within(f"record {name}"):
         return _record(name, parts, rate_Hz, start_s, hints, path)
@@ -184,7 +184,7 @@ def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float
 
 
 def _units(role: str, part: Part, hints: Hints) -> tuple[str, tuple[float, ...], list[str]]:
-    """SI unit, factor of each channel, and a note where a unit is assumed."""
+    """SI unit, factor of each channel, and a note if a unit is assumed."""
     stated = {"u": hints.u_unit, "y": hints.y_unit}.get(role) or part.unit
     default, count = "m/s" if role == "floor" else "V", len(part.names)
     if not count:
@@ -195,7 +195,7 @@ def _units(role: str, part: Part, hints: Hints) -> tuple[str, tuple[float, ...],
 
 
 def _root_mean_square(u: np.ndarray | Columns, names: Sequence[str], path: str) -> float:
-    """Of samples in memory or on disk, piece by piece."""
+    """R.m.s. of samples in memory or on disk, piece by piece."""
     total = 0.0
     for start, stop in ranges(len(u), PIECE):
         piece = u.load(path, names, "u", start, stop) if isinstance(u, Columns) else u[start:stop]
@@ -207,12 +207,12 @@ def _root_mean_square(u: np.ndarray | Columns, names: Sequence[str], path: str) 
 
 
 def with_header(record: RecordSource, **changes: Any) -> RecordSource:
-    """The record with some fields of its header changed; records of every kind are dataclasses with a header."""
+    """The record with changed header fields; records in memory and in files are dataclasses with a header."""
     return replace(record, header=replace(record.header, **changes))  # type: ignore[type-var]
 
 
 def one_clock(records: Sequence[RecordSource]) -> tuple[tuple[RecordSource, ...], list[str]]:
-    """Records whose time stamps leave sample rates that differ by rounding only get the rate of the first."""
+    """Give all records the rate of the first if their rates differ only by the rounding of time stamps."""
     first, notes, result = records[0].header.sample_rate_Hz, [], []
     for record in records:
         rate = record.header.sample_rate_Hz

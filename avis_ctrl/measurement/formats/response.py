@@ -1,4 +1,4 @@
-"""Frequency responses as other instruments hand them over: entries with coherence, variance, or a stated deviation."""
+"""Frequency responses from other instruments: entries with coherence, variance, or a stated standard deviation."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
 SINGLE_PRECISION = 2.0 ** -24
-ROUNDING = 1e-5  # a coherence that far above 1 is one that was printed
+ROUNDING = 1e-5  # a printed coherence may exceed 1 by this much
 
 
 def coherence_variance(value: np.ndarray, coherence: np.ndarray, averages: float) -> np.ndarray:
     """E|error|^2 of H1 estimates of one input at a time, from ordinary coherence and the number of averages.
 
     Bendat and Piersol (Random Data, 4th ed., 2010, chapter 9) give the normalised random error of the gain,
-    sqrt(1 - c) / sqrt(2 c n_d), and the same in radians of the phase; gain and phase errors are at right angles, so
+    sqrt(1 - c) / sqrt(2 c n_d), and the same in radians for the phase. Gain and phase errors are orthogonal, so
     E|error|^2 is the sum of both squares, |G|^2 (1 - c) / (c n_d). Their c is the true coherence. The sample coherence
-    states the residual after one coefficient was fitted to n_d averages, so that n_d - 1 in the place of n_d makes the
-    estimate unbiased. Averages that overlap count as fewer than they are.
+    is computed from the residual of one coefficient fitted to n_d averages, so that n_d - 1 instead of n_d makes the
+    estimate unbiased. Overlapping averages count as fewer than their number.
 
-    value, coherence : of the same shape, 0 < coherence <= 1; a coherence of 1 counts as 1 - 2^-24, its resolution in
-    single precision; averages : of independent blocks, at least 2.
+    value, coherence : of the same shape, 0 < coherence <= 1; a coherence of 1 counts as 1 - 2^-24, the resolution of
+    single precision; averages : number of independent blocks, at least 2.
     """
     lost = np.maximum(1.0 - coherence, SINGLE_PRECISION)
     return np.abs(value) ** 2 * lost / (coherence * (averages - 1.0))
@@ -49,7 +49,7 @@ def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyRespons
 
     Raises
     ------
-    InputError : a unit that is none of a response; noise in other units than SI; as in `response_from`.
+    InputError : a unit that does not suit a response; noise with units other than SI; as in `response_from`.
     """
     frequency, value = fields["frequency_Hz"], fields["value"]
     inputs, outputs = (as_names(fields[field], field) for field in ("inputs", "outputs"))
@@ -82,13 +82,13 @@ def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[
     """A frequency response whose entries count as independent.
 
     frequency_Hz : (n,); value : (n, n_y, n_u) complex; variance : (n, n_y, n_u) E|error|^2; coherence : (n, n_y, n_u)
-    ordinary coherence with its number of averages; relative_standard_deviation : sqrt(E|error|^2) / |G| that the
-    caller vouches for, used only where the file has neither. Lines where some coherence is 0 are left out, and
-    `method` says so: the response is not determined there.
+    ordinary coherence with its number of averages; relative_standard_deviation : sqrt(E|error|^2) / |G| stated by the
+    caller, used only if the file has neither. Lines where some coherence is 0 are left out, because the response is not
+    determined there; `method` states this.
 
     Raises
     ------
-    InputError : nothing known of the errors, a coherence outside 0 .. 1, fewer than 2 averages, wrong shapes.
+    InputError : no information on the errors, a coherence outside 0 .. 1, fewer than 2 averages, wrong shapes.
     """
     frequency_Hz, value = _plain(frequency_Hz, "frequency_Hz", "fiu"), _plain(value, "value", "fiuc").astype(complex)
     shape = (len(frequency_Hz), len(outputs), len(inputs)) if frequency_Hz.ndim == 1 else None
@@ -106,7 +106,7 @@ def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[
         if not keep.any():
             raise InputError("0 for some entry at every line; expected some above 0", field="coherence")
         variance = np.zeros(value.shape)
-        assert averages is not None  # _coherence has asked for it
+        assert averages is not None  # checked by _coherence
         variance[keep] = coherence_variance(value[keep], coherence[keep], averages)
         method = f"{method}; variance from coherence, {averages:g} averages".lstrip("; ")
     elif relative_standard_deviation is not None:

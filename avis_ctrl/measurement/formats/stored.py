@@ -15,12 +15,12 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record, RecordHeader, RecordSource, require_finite
 from avis_ctrl.measurement.formats.common import existing_file, numbers, printable, reading, short
 
-# What h5py raises over a damaged file.
+# Exceptions of h5py on damaged files.
 DAMAGE = (OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError)
 
 
 def open_hdf5(path: Path) -> h5py.File:
-    """The open file; InputError if it is no HDF5."""
+    """The open file; InputError if it is not HDF5."""
     try:
         return h5py.File(path, "r")
     except OSError as error:
@@ -31,7 +31,7 @@ def open_hdf5(path: Path) -> h5py.File:
 
 @contextmanager
 def access(what: object) -> Iterator[None]:
-    """What h5py raises as one InputError; nothing but calls into h5py stands inside."""
+    """Convert exceptions of h5py to InputError; only calls into h5py belong inside."""
     try:
         yield
     except DAMAGE as error:
@@ -40,7 +40,7 @@ def access(what: object) -> Iterator[None]:
 
 
 def members(group: h5py.Group) -> list[str]:
-    """Names in a group."""
+    """Names of the members of a group."""
     with access("a group"):
         return [str(name) for name in group]
 
@@ -54,7 +54,7 @@ def member(group: h5py.Group, name: Any) -> Any:
 
 
 def attributes(item: h5py.Group | h5py.Dataset, *names: str) -> dict[str, Any]:
-    """Those of the named attributes that are there."""
+    """The named attributes that exist."""
     found = {}
     for name in names:
         with access(f"attribute {name}"):
@@ -82,11 +82,11 @@ def values(dataset: h5py.Dataset, selection: Any = ()) -> np.ndarray:
 
 
 def values_in(path: str | Path, name: str, selection: Any = ()) -> np.ndarray:
-    """The same of a data set by its name in a file, which is opened for it.
+    """Stored values of a data set by its name in a file, which is opened for this purpose.
 
     Raises
     ------
-    InputError : there is none, in a file that is damaged or changed since it was opened first.
+    InputError : no such data set, a file that is damaged or has changed since it was first opened.
     """
     with open_hdf5(existing_file(path)) as file:
         found = member(file, name)
@@ -99,9 +99,9 @@ def values_in(path: str | Path, name: str, selection: Any = ()) -> np.ndarray:
 class Columns:
     """Channels of a record in one data set.
 
-    dataset : its name in the file; samples : of each channel; channels_first : stored as (channels, samples), as MATLAB
-    v7.3 writes a matrix of (samples, channels); a one-dimensional data set holds one channel; factors : to SI, one per
-    channel.
+    dataset : its name in the file; samples : number per channel; channels_first : stored as (channels, samples), as
+    MATLAB v7.3 writes a matrix of (samples, channels); a one-dimensional data set is one channel; factors : to SI, one
+    per channel.
     """
 
     dataset: str
@@ -136,9 +136,9 @@ class Columns:
 class StoredRecord(RecordSource):
     """A record in an HDF5 file.
 
-    The file is opened for each load and closed again, so that the record can be pickled and sent to another process.
+    The file is opened and closed for each load, so that the record can be pickled and sent to another process.
 
-    path : the file; columns : where "u", "y" and, where measured, "floor" lie.
+    path : the file; columns : places of "u", "y" and, if measured, "floor".
     """
 
     header: RecordHeader
@@ -146,11 +146,11 @@ class StoredRecord(RecordSource):
     columns: Mapping[str, Columns]
 
     def load(self, start: int = 0, stop: int | None = None) -> Record:
-        """Samples start .. stop (end of the record by default) in memory; reads only these rows.
+        """Load samples start .. stop (to the end of the record by default) into memory; only these rows are read.
 
         Raises
         ------
-        InputError : samples that are not finite numbers, a range outside the record, a file that ends early.
+        InputError : samples that are not finite numbers, a range outside the record, a truncated file.
         """
         h, stop = self.header, self.header.samples if stop is None else stop
         if not 0 <= start < stop <= h.samples:

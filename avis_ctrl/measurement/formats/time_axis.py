@@ -1,4 +1,4 @@
-"""From time stamps to a sample rate, with everything that is wrong with them said."""
+"""Sample rate from time stamps, with precise messages on faulty stamps."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 
-SILENT, JITTER, GAP = 1e-3, 0.1, 1.5  # of a sample: printed digits; noted; missing samples
+SILENT, JITTER, GAP = 1e-3, 0.1, 1.5  # in samples: limits for rounding, for jitter, for a step without a gap
 
 
 def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {}".format,
                      field: str = "t") -> tuple[float, float, str]:
-    """Sample rate [Hz], time of the first sample [s], and a note ("" where the stamps are even).
+    """Sample rate [Hz], time of the first sample [s], and a note ("" if the stamps are even).
 
-    The clock is the straight line through the first and the last stamp. Stamps that lie within a tenth of a sample of
-    it count as even, with a note beyond a thousandth. The rate is rounded as far as the stamps leave it open.
+    The clock is the straight line through the first and the last stamp. Stamps within a tenth of a sample of it count
+    as even, with a note above a thousandth. The rate is rounded within the uncertainty of the stamps.
 
     time_s : (n,) s; place : names a sample in messages, such as "line 17".
 
     Raises
     ------
-    InputError : fewer than two stamps; stamps that are not finite, stand still or go backwards, with a gap, or uneven:
-        where the first is and how many there are.
+    InputError : fewer than two stamps; stamps that are not finite, not increasing, with a gap, or uneven, with the
+        place of the first (of the worst, if uneven) and their number.
     """
     time_s = np.asarray(time_s, float)
     if time_s.ndim != 1 or len(time_s) < 2:
@@ -56,7 +56,7 @@ def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {
 
 
 def rounded(rate: float, uncertainty: float) -> float:
-    """The shortest decimal number within the relative uncertainty."""
+    """The shortest decimal number within the relative uncertainty of the rate."""
     for digits in range(2, 16):
         short = float(f"{rate:.{digits}g}")
         if abs(short - rate) <= uncertainty * rate:

@@ -1,8 +1,8 @@
 """Universal files (UFF, data set 58 and 58b): time responses as a campaign, frequency responses with their coherence.
 
-A channel is called by its entity name, such as "Sz1", or "node 3 +Z" where it has none. Units come from the axis
-label; without one from the specific data type and the factors of data set 164. Every function of a file is one channel
-of one record: the second function of the same channel belongs to the second record, and so on.
+The name of a channel is its entity name, such as "Sz1", or "node 3 +Z" without one. Units come from the axis label or,
+without a label, from the specific data type and the factors of data set 164. Every function in a file is one channel of
+one record: the second function of a channel belongs to the second record, and so on.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 TIME, RESPONSE, COHERENCE, MULTIPLE_COHERENCE = 1, 4, 6, 26
 WORDS = {0: "unknown", 2: "auto spectrum", 3: "cross spectrum", 5: "transmissibility", 7: "auto correlation",
          8: "cross correlation", 9: "power spectral density", 10: "energy spectral density", 12: "spectrum"}
-# Specific data type -> SI unit; displacement, velocity and acceleration count in units of length.
+# Specific data type -> SI unit; displacement, velocity and acceleration are scaled by the unit of length.
 LENGTHS, FORCE = {8: "m", 11: "m/s", 12: "m/s^2"}, 13
 HERTZ = {"": 1.0, "Hz": 1.0, "kHz": 1e3, "rad/s": 1 / (2 * np.pi)}
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3}
@@ -39,7 +39,7 @@ Entry = tuple[Point, Point]
 
 def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
          hints: Hints | None = None) -> Campaign | FrequencyResponse:
-    """A universal file: a campaign where it holds time responses, otherwise its frequency responses.
+    """A universal file: a campaign if it contains time responses, otherwise its frequency responses.
 
     columns : roles u, y, floor to names of channels. Without it, excitation forces, references of other functions and
     the names u*, A1, Ax1, ... are inputs.
@@ -63,7 +63,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
 
 
 def channel_names(points: Sequence[Point]) -> dict[Point, str]:
-    """Name of each channel; an entity's name that several have is completed by node and direction."""
+    """Name of each channel; an entity name that several channels have is completed with node and direction."""
     names = {point: point.channel() for point in points}
     shared = [name for name in names.values() if list(names.values()).count(name) > 1]
     return {point: f"{name} {point._replace(name='').channel()}" if name in shared else name
@@ -71,17 +71,17 @@ def channel_names(points: Sequence[Point]) -> dict[Point, str]:
 
 
 def axis_unit(axis: Axis, point: Point, function: Function, role: str, hint: str | None) -> Unit:
-    """SI unit of an axis and the factor to it: as the caller says, by its label, or by its data type.
+    """SI unit of an axis and the factor to it, from the caller's hint, the label, or the data type.
 
     Raises
     ------
-    InputError : no unit stated, one that is not known here, a label that contradicts data set 164.
+    InputError : no unit stated, an unknown unit, a label that contradicts data set 164.
     """
     field = f"{function.place}, channel {point.channel()}: unit"
     if hint is not None:
         return unit_of(hint, f"{role}_unit", ALLOWED[role])
     by_type = None
-    if abs(point.direction) < 4:  # a rotation's unit is not among ours
+    if abs(point.direction) < 4:  # units of rotations are not supported
         if axis.kind in LENGTHS:
             by_type = Unit(LENGTHS[axis.kind], 1 / function.length)
         elif axis.kind == FORCE:
@@ -116,7 +116,7 @@ def _clock(function: Function) -> tuple[float, float, str]:
     if not function.even:
         return sample_rate_from(time, field=f"{function.place}: abscissa")
     step = (time[-1] - time[0]) / (len(time) - 1)
-    # The increment is printed as E13.5: it leaves the rate open by half a unit of its sixth digit.
+    # The increment is printed as E13.5: its uncertainty is half a unit of the sixth digit.
     mantissa = step / 10.0 ** np.floor(np.log10(step))
     rate = rounded(1 / step, 0.5e-5 / mantissa)
     note = f"sample rate {1 / step:.9g} Hz, of an increment printed with six digits, taken as {rate:.9g} Hz"
@@ -124,7 +124,7 @@ def _clock(function: Function) -> tuple[float, float, str]:
 
 
 def _inputs(first: Mapping[Point, Function], names: Mapping[Point, str]) -> list[str]:
-    """Channels that are inputs by what the file says of them."""
+    """Channels that the file identifies as inputs."""
     references = {function.reference for function in first.values() if function.reference.node > 0
                   or function.reference.name}
     return [names[point] for point, function in first.items()
@@ -197,7 +197,7 @@ def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str,
         array = np.stack([function.value * unit.factor for function, unit in zip(some, units, strict=True)], axis=1) \
             if some else np.zeros((len(every[0].value), 0))
         parts[role] = Part(roles[role], [unit.si for unit in units], array)
-    # The units have been used.
+    # The units have already been applied.
     record, notes = record_from(name, parts, hints.sample_rate_Hz or rate, start,
                                 replace(hints, u_unit=None, y_unit=None))
     notes += [f"record {name}: {note}"] if note and hints.sample_rate_Hz is None else []
@@ -227,7 +227,7 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
         value[at] = _on(function, frequency) * factor
         units.add(si)
         beside = coherences.get((y, u))
-        if beside is None and len(inputs) == 1:  # multiple coherence names no reference
+        if beside is None and len(inputs) == 1:  # multiple coherence has no reference
             beside = next((some for (point, _), some in coherences.items() if point == y), None)
         complete &= beside is not None
         if beside is not None:
@@ -242,7 +242,7 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
 
 
 def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Function]:
-    """Functions of some types by response and reference."""
+    """Functions of the given types by response and reference."""
     entries: dict[Entry, Function] = {}
     for function in found:
         if function.kind in kinds:
@@ -255,7 +255,7 @@ def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Fun
 
 
 def _on(function: Function, frequency: np.ndarray) -> np.ndarray:
-    """Its values, if it has the frequencies of the others."""
+    """Values of the function, if it has the frequencies of the first frequency response."""
     own = _abscissa(function, HERTZ)
     if own.shape != frequency.shape or not np.allclose(own, frequency, rtol=1e-5, atol=1e-9):
         raise InputError(f"expected the {len(frequency)} frequencies of the first frequency response",
@@ -265,7 +265,7 @@ def _on(function: Function, frequency: np.ndarray) -> np.ndarray:
 
 
 def _ratio_unit(function: Function, hints: Hints) -> tuple[float, tuple[str, str]]:
-    """Factor to SI and (output unit, input unit) of a frequency response; one label may hold both ("m/s^2/V")."""
+    """Factor to SI and (output unit, input unit) of a frequency response; one label may contain both ("m/s^2/V")."""
     _, over, under = function.axes
     if not under.unit and under.kind == 0 and over.unit.count("/"):
         left, _, right = over.unit.rpartition("/")
@@ -277,7 +277,7 @@ def _ratio_unit(function: Function, hints: Hints) -> tuple[float, tuple[str, str
 
 
 def _averages(found: Sequence[Function]) -> float | None:
-    """Number of averages, if the ID lines of all functions that speak of it agree."""
+    """Number of averages, if all ID lines that state it agree."""
     counts = set()
     for function in found:
         for line in function.lines:

@@ -1,8 +1,8 @@
 """Data sets 58 (functions at nodal degrees of freedom) and 164 (units) of a universal file, ASCII or binary.
 
 Definitions: Universal Dataset Numbers 58 and 164, Structural Dynamics Research Laboratory, University of Cincinnati
-(SDRC I-DEAS Test); the binary variant 58b has the same eleven lines of header, and its first line ends with byte order
-(1 little, 2 big endian), float format (2 = IEEE 754), number of header lines and number of bytes.
+(SDRC I-DEAS Test). The binary variant 58b has the same eleven header lines; its first line ends with byte order (1
+little, 2 big endian), float format (2 = IEEE 754), number of header lines and number of bytes.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Axis(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Where a response or a reference is: entity name ("" if unused), node, direction."""
+    """Location of a response or a reference: entity name ("" if unused), node, direction."""
 
     name: str
     node: int
     direction: int
 
     def channel(self) -> str:
-        """Name of the channel: the entity's, with node and direction where it has none."""
+        """Name of the channel: the entity name, or node and direction without one."""
         if self.name:
             return self.name
         sign = "-" if self.direction < 0 else "+"
@@ -52,7 +52,7 @@ class Function:
 
     lines : the five ID lines; kind : function type (1 time response, 4 frequency response, 6 coherence, ...);
     abscissa : (n,); value : (n,) real or complex, in the file's units; axes : abscissa, ordinate, its denominator.
-    length, force : factors of the data set 164 before it: file units per SI unit.
+    length, force : factors of the preceding data set 164: file units per SI unit.
     """
 
     lines: tuple[str, ...]
@@ -69,11 +69,11 @@ class Function:
 
 
 def functions(path: Path) -> list[Function]:
-    """All data sets 58 of a file; others are passed over.
+    """All data sets 58 of a file; other data sets are skipped.
 
     Raises
     ------
-    InputError : a data set that is cut short or whose numbers cannot be read; names the byte it starts at.
+    InputError : a truncated data set, or unreadable numbers; names the byte where the data set starts.
     """
     text = path.read_bytes()
     at, number = 0, 0
@@ -103,14 +103,14 @@ def functions(path: Path) -> list[Function]:
 
 
 def _line(text: bytes, at: int) -> tuple[bytes, int]:
-    """The line that starts at a byte, and where the next one starts."""
+    """The line that starts at byte `at`, and the start of the next line."""
     end = text.find(b"\n", at)
     end = len(text) if end < 0 else end
     return text[at:end].rstrip(b"\r"), min(end + 1, len(text))
 
 
 def _closing(text: bytes, at: int, place: str) -> int:
-    """Where the line '-1' stands that closes a data set of text."""
+    """Position of the line '-1' that closes a data set of text."""
     while at < len(text):
         line, after = _line(text, at)
         if line.strip() == MARK:
@@ -184,7 +184,7 @@ def _used(word: str) -> str:
 
 
 def _axis(line: str) -> Axis:
-    """Exponents of units and the label are for programs that convert units themselves."""
+    """Axis from a header line; exponents of units and the axis label are ignored."""
     words = _words(line, _AXIS)
     return Axis(int(words[0] or 0), _used(words[5]))
 
@@ -193,7 +193,7 @@ Form = tuple[int, bool, bool, int]  # number of values, even spacing, double pre
 
 
 def _binary(text: bytes, title: bytes, at: int, form: Form, place: str) -> tuple[np.ndarray, int]:
-    """(count, columns) of a data set 58b; uneven abscissae are single precision unless the size says double."""
+    """(count, columns) of a data set 58b; uneven abscissae are single precision unless the size implies double."""
     count, even, double, parts = form
     words = title[:80].lower().split(b"b", 1)[1].split()
     try:
@@ -221,7 +221,7 @@ def _binary(text: bytes, title: bytes, at: int, form: Form, place: str) -> tuple
 
 
 def _ascii(body: bytes, form: Form, place: str) -> np.ndarray:
-    """(count, columns) of a data set 58 in text; a number that fills its field runs into the one before by its sign."""
+    """(count, columns) of a data set 58 in text; numbers that fill their fields are separated only by their signs."""
     count, even, _, parts = form
     columns = parts + (not even)
     words = re.sub(r"(?<=\d)(?=[+-])", " ", body.decode("latin-1").upper().replace("D", "E")).split()

@@ -1,4 +1,4 @@
-"""Frequency responses from measurements: what an estimate holds, and the estimators."""
+"""Frequency responses from measurements: the class for estimates, and the estimators."""
 
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 

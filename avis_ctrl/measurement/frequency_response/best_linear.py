@@ -1,18 +1,18 @@
 """Best linear approximation of a nonlinear rig from random-phase multisines, with noise and distortion separated.
 
-Robust method for many inputs (Pintelon and Schoukens, System Identification, 2nd ed., 2012, sections 4.3 and 7.3):
-periods that repeat within a record tell the noise; different phase realisations tell noise and stochastic nonlinear
-distortion together. With experiments e, mean periods Y_e, U_e,
+Robust method for several inputs (Pintelon and Schoukens, System Identification, 2nd ed., 2012, sections 4.3 and 7.3):
+the scatter between the periods of a record gives the noise; the scatter between phase realisations gives noise and
+stochastic nonlinear distortion together. For experiments e with mean periods Y_e and U_e,
 
     G = (sum Y_e U_e^H) inv(S),   S = sum U_e U_e^H,   C = sum (Y_e - G U_e)(Y_e - G U_e)^H / (n_e - n_u).
 
-For M realisations of n_u experiments with invertible U this is the mean of the M responses Y_r inv(U_r), weighted by
-power, and C their scatter with n_u (M - 1) degrees of freedom; experiments need not come in such groups, though, nor
-is their grouping needed. Within one group of orthogonal multisines the distortion can look linear, so that only
-different groups tell it: a campaign of one group separates nothing.
+For M realisations of n_u experiments with invertible U, G is the mean of the M responses Y_r inv(U_r), weighted by
+power, and C is their scatter with n_u (M - 1) degrees of freedom. The experiments need not form such groups, and the
+grouping need not be known. Within one group of orthogonal multisines the distortion can look linear. Only different
+groups reveal it: a campaign with one group cannot separate noise and distortion.
 
-The distortion is averaged over the inputs: the covariance inv(S)^T kron C has no place for a distortion that differs
-from input to input. A measured U is allowed: its noise, with that of Y, is taken over as [I, -G] cov [I, -G]^H.
+The distortion is averaged over the inputs: the covariance inv(S)^T kron C cannot represent a distortion that differs
+from input to input. A measured U is allowed: its noise and that of Y are combined as [I, -G] cov [I, -G]^H.
 """
 
 from __future__ import annotations
@@ -52,24 +52,24 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
                               transient: Transient = "auto", smooth_lines: int | None = None) -> FrequencyResponse:
     """G from the drives on the excited lines, with total, noise and distortion covariances.
 
-    The floor's motion is not periodic and counts as noise.
+    The floor motion is not periodic and counts as noise.
 
     Parameters
     ----------
-    band_Hz : all lines by default.
-    level_V : r.m.s. level of the records to use, where the campaign has several.
-    transient : "drop" the periods that still settle (all but two at most); "remove" the transient by local polynomials
-        or rational functions through the lines between harmonics; "none"; "auto": drop where that leaves half of the
-        periods and these are settled, otherwise remove. Where a mode is narrower than some two lines of the record,
-        part of its transient stays and counts in C.
-    smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default as few as leave 2 n_y + 4 degrees
-        of freedom.
+    band_Hz : frequency band; all lines by default.
+    level_V : r.m.s. level of the records to use, if the campaign has several levels.
+    transient : "drop": drop the periods that have not settled (at least two are kept); "remove": remove the transient
+        by local polynomials or rational functions through the lines between harmonics; "none"; "auto": drop if at least
+        half of the periods remain and are settled, otherwise remove. If a mode is narrower than about two lines of the
+        record, part of its transient remains and is included in C.
+    smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default the smallest number with 2 n_y + 4
+        degrees of freedom.
 
     Raises
     ------
     InputError : no periodic records, several levels or periods, different inputs on different lines (then use
-        `best_linear_approximations`), neither repeated periods nor realisations.
-    ComputationError : experiments that cannot tell the inputs apart.
+        `best_linear_approximations`), neither repeated periods nor several realisations.
+    ComputationError : experiments that cannot separate the inputs.
     """
     found = best_linear_approximations(campaign, band_Hz=band_Hz, level_V=level_V, transient=transient,
                                        smooth_lines=smooth_lines)
@@ -83,7 +83,7 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
 def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
                                transient: Transient = "auto",
                                smooth_lines: int | None = None) -> tuple[FrequencyResponse, ...]:
-    """One response for each set of inputs that are excited on the same lines (several for zippered multisines).
+    """One response for each set of inputs that are excited on the same lines (several sets for zippered multisines).
 
     Parameters and errors as in `best_linear_approximation`.
     """
@@ -105,22 +105,22 @@ def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = Non
 
 def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slice,
                      transient: Transient) -> tuple[int, bool]:
-    """How many periods to drop, and whether to remove a transient from the rest."""
+    """Number of periods to drop, and whether to remove a transient from the others."""
     if transient not in ("auto", "drop", "remove", "none"):
         raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
     count = min(record.header.periods for record in records)
     found, settled = settled_after(records, used, keep) if transient in ("auto", "drop") else (0, False)
     if transient != "auto":
         return found, transient == "remove"
-    # Dropping for a slow transient would cost most of the data. Removal then works on all periods: what is left of a
-    # transient after some are dropped hides in the noise of a single record, but not in the mean of many.
+    # For a slow transient, dropping would discard most of the data. Removal then uses all periods: after some periods
+    # are dropped, the residual transient is hidden by the noise of a single record, but not in the mean of many.
     if settled and found <= count // 2:
         return found, False
     return 0, count >= 2
 
 
 def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:
-    """Mean periods; records with the same inputs are repetitions of one experiment, not realisations."""
+    """Mean periods; records with equal inputs count as repetitions of one experiment, not as realisations."""
     groups: list[list[PeriodMean]] = []
     for mean in means:
         for group in groups:
@@ -134,7 +134,7 @@ def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:
     parts = [(m, len(group)) for group in groups for m in group if m.covariance is not None]
     covariance, dof = None, sum(m.dof for m, _ in parts)
     if parts and len(parts) == len(means):
-        # Pooled by degrees of freedom; a mean of r records has 1/r of their covariance.
+        # Pooled by degrees of freedom; the mean of r records has 1/r of their covariance.
         each = np.zeros_like(np.asarray(parts[0][0].covariance))
         for m, _ in parts:
             each += m.dof / dof * np.asarray(m.covariance)
@@ -143,12 +143,12 @@ def _experiments(means: Sequence[PeriodMean], n_u: int) -> _Experiments:
 
 
 def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], np.ndarray]]:
-    """(inputs, lines) of each set of inputs that are excited together, by first line."""
+    """(inputs, lines) of each set of inputs that are excited together, ordered by first line."""
     power = np.mean(np.abs(data.U) ** 2, axis=0)
     noise = np.zeros_like(power)
     if data.covariance is not None:
         n_u = power.shape[1]
-        # Smoothed over lines: a few periods tell the noise of a single line badly.
+        # Smoothed over lines: a few periods give a poor noise estimate for a single line.
         raw = np.real(np.einsum("nii->ni", data.covariance))[:, :n_u]
         noise = _running_mean(raw, min(10, (len(raw) - 1) // 2))
     on = (power > SETTINGS.excited_power * power.max(axis=0)) & (power > SETTINGS.excited_over_noise * noise)
@@ -211,7 +211,7 @@ def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, freq
 
 
 def _smoothing(asked: int | None, dof: int, n_y: int, count: int) -> int:
-    """Lines to each side over which C is averaged."""
+    """Number of lines on each side over which C is averaged."""
     if asked is not None:
         if not 0 <= asked <= (count - 1) // 2:
             raise InputError(f"expected 0 to {(count - 1) // 2} lines to each side", field="smooth_lines", value=asked)

@@ -1,8 +1,9 @@
-"""Even and odd distortion of a single record, from the lines that its multisine leaves out (fast method).
+"""Even and odd distortion of a single record, from the lines that its multisine does not excite (fast method).
 
-A periodic odd multisine excites some odd harmonics only. Even nonlinearities answer on even harmonics, odd ones on the
-odd harmonics, of which those left out are the detection lines (Pintelon and Schoukens, System Identification, 2nd ed.,
-2012, section 4.3.2). Noise is told by the lines between harmonics or by repeated periods.
+A periodic odd multisine excites only some of the odd harmonics. Even nonlinearities respond on even harmonics and odd
+nonlinearities on odd harmonics; the odd harmonics that are not excited are the detection lines (Pintelon and Schoukens,
+System Identification, 2nd ed., 2012, section 4.3.2). The noise is estimated from the lines between harmonics or from
+repeated periods.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class DistortionLevels:
     """Powers of the outputs of one record, line by line.
 
     frequency_Hz : (n,) harmonics; kind : (n,) "excited", "odd" (detection) or "even"; power : (n, n_y) mean square of
-    the line's sine, squared unit of y; noise : (n, n_y) what noise alone would give there on the mean.
+    the line's sine, squared unit of y; noise : (n, n_y) expected power there of the noise alone.
     """
 
     frequency_Hz: np.ndarray
@@ -37,8 +38,10 @@ class DistortionLevels:
     output_unit: str
 
     def rms(self, kind: Kind) -> np.ndarray:
-        """(n_y,) r.m.s. of a part, noise subtracted; that of the odd distortion is scaled from the detection lines to
-        all odd lines, as it falls on the excited lines too. 0 where noise hides it."""
+        """(n_y,) r.m.s. of one kind of lines, noise subtracted; 0 where noise hides it.
+
+        The odd distortion is scaled from the detection lines to all odd lines, because excited lines contain it too.
+        """
         here = self.kind == kind
         if not np.any(here):
             return np.zeros(len(self.outputs))
@@ -49,12 +52,12 @@ class DistortionLevels:
 def distortion_levels(campaign: Campaign, record: str, *, transient: Transient = "auto") -> DistortionLevels:
     """Even and odd distortion of one record of an odd multisine with detection lines.
 
-    Only harmonics from the lowest to the highest excited one are judged. What the generator itself puts on these lines
-    counts as distortion of the rig; the commanded u has none.
+    Only harmonics from the lowest to the highest excited one are evaluated. Components that the generator itself
+    produces on these lines count as distortion of the rig; the commanded u has none.
 
     Raises
     ------
-    InputError : a record that is not periodic, excites even lines, or leaves out no odd ones; fewer than two periods.
+    InputError : a record that is not periodic, excites even lines, or excites all odd lines; fewer than two periods.
     """
     source = campaign.named(record)
     header = source.header
@@ -81,7 +84,7 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
         raise InputError("expected odd harmonics that are left out, to detect odd distortion", field=field)
     if mean.covariance is None:
         raise InputError("expected at least two settled periods, to tell the noise", field=field)
-    # |Z|^2 is over the samples of a period; a line of amplitude a has |Z|^2 = a^2 n / 4 and mean square a^2 / 2.
+    # Z is divided by sqrt(n): a line of amplitude a has |Z|^2 = a^2 n / 4 and mean square a^2 / 2.
     power = 2 / n * np.abs(mean.Z[between, n_u:]) ** 2
     noise = 2 / n * np.real(np.einsum("nii->ni", mean.covariance))[between, n_u:]
     return DistortionLevels(harmonic[between] * rate / n, kind[between], power, noise, used.outputs, used.output_unit)

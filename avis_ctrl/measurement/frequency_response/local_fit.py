@@ -4,13 +4,13 @@ Around the frequency f, with d = (line - f) / scale and for each record r,
 
     Y_r(d) = G(d) U_r(d) + T_r(d) + V_r(d),     G(d) = sum_s G_s d^s,     T_r(d) = sum_s t_rs d^s
 
-(local polynomial method: Pintelon, Schoukens, Vandersteen and Barbe, Mech. Syst. Signal Process. 24, 2010; Pintelon
-and Schoukens, System Identification, 2nd ed., 2012, section 7.2). T_r is the transient, leakage included. G and T_r
-are found by linear least squares.
+(local polynomial method: Pintelon, Schoukens, Vandersteen and Barbe, Mech. Syst. Signal Process. 24, 2010; Pintelon and
+Schoukens, System Identification, 2nd ed., 2012, section 7.2). T_r is the transient, including leakage. G and T_r are
+estimated by linear least squares.
 
-The records share G but not T_r. T_r is removed by projecting on the orthogonal complement of the polynomials over the
-window, a fixed matrix; what remains is compressed to a triangular factor per line, updated record by record. Records
-of any number and length therefore need the memory of one factor per line.
+G is common to all records, T_r is not. T_r is removed by projection onto the orthogonal complement of the polynomials
+over the window, a fixed matrix. The result is compressed to a triangular factor per line, updated record by record. The
+memory is therefore one factor per line, for any number and length of records.
 """
 
 from __future__ import annotations
@@ -25,12 +25,11 @@ from avis_ctrl.errors import ComputationError, InputError
 @dataclass(frozen=True)
 class LocalFitSettings:
     """batch : number of lines whose least-squares problems are factored at once; it limits the size of the work arrays.
-    together_bytes : memory for the spectra held at once: records are processed together up to this size, which saves
-        factorisations.
-    rank_tolerance : relative size of the part of an input that the others do not explain, below which the input counts
-        as dependent: half the digits of double precision.
-    span_tolerance : the same where the responses to the inputs need not be separated: rounding to single precision must
-        not pass for an independent direction.
+    together_bytes : memory for the spectra of records that are processed together; larger groups save factorisations.
+    rank_tolerance : relative size of the part of an input that the other inputs do not explain, below which the input
+        counts as dependent: half the digits of double precision.
+    span_tolerance : the same if the responses to the inputs need not be separated: rounding to single precision must
+        not be taken for an independent direction.
     silent : amplitude relative to the band's r.m.s. below which an input counts as silent: -100 dB, below the range of
         a 16-bit converter.
     """
@@ -47,10 +46,10 @@ SETTINGS = LocalFitSettings()
 
 @dataclass(frozen=True, eq=False)
 class LocalEstimate:
-    """Local estimates on lines; the covariance is that of `FrequencyResponse`.
+    """Local estimates on lines, with covariances as in `FrequencyResponse`.
 
     frequency_Hz : (n,); value : (n, n_y, n_u); noise : (n, n_y, n_y) covariance of V on one line of one record;
-    gram : (n, n_u, n_u) Gram matrix of the inputs' part that neither slopes nor transients explain;
+    gram : (n, n_u, n_u) Gram matrix of the part of the inputs that neither slopes nor transients explain;
     dof : complex degrees of freedom of `noise`.
     """
 
@@ -63,16 +62,16 @@ class LocalEstimate:
 
 
 def degrees_of_freedom(records: int, n_u: int, order: int, half_width: int) -> int:
-    """Equations less unknowns of one line: records share G, each has its own transient."""
+    """Number of equations minus unknowns of one line: G is common to all records, the transients are not."""
     return records * (2 * half_width - order) - (order + 1) * n_u
 
 
 def least_half_width(records: int, n_u: int, n_y: int, order: int, spacing: int = 1) -> int:
-    """Smallest half width [lines] that leaves 2 n_y + 4 degrees of freedom: below n_y the covariance is singular, and
-    its inverse is large on average by dof / (dof - n_y).
+    """Smallest half width [lines] that gives 2 n_y + 4 degrees of freedom. Below n_y the covariance is singular; above,
+    its inverse is too large on average by the factor dof / (dof - n_y).
 
-    spacing : lines from one excited line to the next (periods of a periodic record); each window then also holds
-    order + 1 excited lines and as many as G has unknowns over all records.
+    spacing : lines from one excited line to the next (number of periods of a periodic record); each window then also
+        contains order + 1 excited lines, and enough of them for the unknowns of G over all records.
     """
     half_width = order + 1
     while degrees_of_freedom(records, n_u, order, half_width) < 2 * n_y + 4:
@@ -89,7 +88,7 @@ class LocalFit:
     frequency_Hz : (n,) frequencies of the estimates; they need not lie on lines of any record.
     n_u, n_y : numbers of inputs and outputs; n_u may be 0 (noise only).
     order : degree of the polynomials, 0 to 6.
-    half_width : the window has 2 half_width + 1 lines; near the ends of the lines given it is shifted inwards.
+    half_width : the window has 2 half_width + 1 lines; near the ends of the given lines it is shifted inwards.
     scale_Hz : unit of d, about half the window.
 
     Raises
@@ -105,13 +104,13 @@ class LocalFit:
                              field="half_width", value=half_width)
         self.frequency_Hz = np.asarray(frequency_Hz, float)
         self.n_u, self.n_y, self.order, self.half_width, self.scale_Hz = n_u, n_y, order, half_width, scale_Hz
-        # Columns: [U d^R .. U d], U, Y: what G(f) needs stands in the lower corner.
+        # Columns: [U d^R .. U d], U, Y: the part needed for G(f) is in the lower right corner.
         self._lead = order * n_u
         self._size = self._lead + n_u + n_y
         self._factor = np.zeros((self.frequency_Hz.size, self._size, self._size), complex)
         self._unit: tuple[np.ndarray, np.ndarray] | None = None
         self.records = 0
-        # Orthonormal complement of the transient's polynomials over a window.
+        # Orthonormal basis of the complement of the transient's polynomials over a window.
         span = np.vander(np.linspace(-1, 1, 2 * half_width + 1), order + 1)
         self._free = np.linalg.qr(span, mode="complete")[0][:, order + 1:].T
 
@@ -120,7 +119,7 @@ class LocalFit:
         return degrees_of_freedom(self.records, self.n_u, self.order, self.half_width)
 
     def window(self, line_Hz: np.ndarray, keep: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Indices (b, m) of the lines around some of the frequencies, and d (b, m) there."""
+        """Indices (b, m) of the lines around the frequencies `keep`, and d (b, m) there."""
         width, step = 2 * self.half_width + 1, line_Hz[1] - line_Hz[0]
         centre = np.rint((self.frequency_Hz[keep] - line_Hz[0]) / step).astype(int)
         start = np.clip(centre - self.half_width, 0, line_Hz.size - width)
@@ -128,16 +127,16 @@ class LocalFit:
         return index, (line_Hz[index] - self.frequency_Hz[keep][:, None]) / self.scale_Hz
 
     def add(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
-        """Take in records of the same length.
+        """Add records of the same length.
 
         Parameters
         ----------
-        U, Y : (n_records, n_lines, n_u) and (n_records, n_lines, n_y) spectra over sqrt(samples).
+        U, Y : (n_records, n_lines, n_u) and (n_records, n_lines, n_y) spectra divided by sqrt(samples).
         line_Hz : (n_lines,) consecutive lines.
 
         Raises
         ------
-        InputError : fewer lines than a window, shapes that do not fit.
+        InputError : fewer lines than a window, shapes that do not match.
         """
         self._check(U, Y, line_Hz)
         if self._unit is None:
@@ -171,13 +170,13 @@ class LocalFit:
     def estimate(self, names: tuple[str, ...] | None = None, partial: bool = False) -> LocalEstimate:
         """G, C and S on all lines.
 
-        partial : inputs need not be told apart. S is singular then along what the inputs do not span on a line, where
-            G is not known; C and G along what they span are as with fewer inputs.
+        partial : the inputs need not be separable. S is then singular along directions that the inputs do not span on a
+            line, where G is unknown; C, and G along the spanned directions, are as with fewer inputs.
 
         Raises
         ------
-        InputError : no degrees of freedom left.
-        ComputationError : inputs that cannot be distinguished, by name, unless `partial`.
+        InputError : no degrees of freedom.
+        ComputationError : inputs that cannot be distinguished, with their names, unless `partial`.
         """
         if self.dof < 1 or self._unit is None:
             raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom are left on "
@@ -185,11 +184,12 @@ class LocalFit:
                              field="half_width", value=self.half_width)
         lead, first = self._lead, self._lead + self.n_u
         slopes, own, outputs = self._factor[:, :, :lead], self._factor[:, :, lead:first], self._factor[:, :, first:]
-        # Of each input in the window, no less than what counts as silent.
+        # Size of each input in the window, at least that of a silent input.
         size = np.maximum(np.linalg.norm(own, axis=1), SETTINGS.silent * np.sqrt(
             self.records * (2 * self.half_width - self.order)))
-        # Rows of the triangular factor below the slopes are what the inputs add to these. Where slopes depend on each
-        # other that is not so: they are then taken out by an orthonormal basis of what they span.
+        # The rows of the triangular factor below the slopes are the part of the inputs that the slopes do not explain.
+        # This is wrong if the slopes are linearly dependent; they are then projected out with an orthonormal basis of
+        # their span.
         spent: int | np.ndarray = lead
         if partial:
             left, s, _ = np.linalg.svd(slopes / np.tile(size, self.order)[:, None, :], full_matrices=False)
@@ -214,7 +214,8 @@ class LocalFit:
                              self.half_width)
 
     def _refuse(self, bad: np.ndarray, s: np.ndarray, right: np.ndarray, names: tuple[str, ...] | None) -> None:
-        """Inputs that cannot be distinguished on some lines, by singular values and right vectors of their own part."""
+        """Raise the error for indistinguishable inputs; s, right : SVD of the part of each input that is not explained.
+        """
         names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
         null = np.abs(right[np.flatnonzero(bad)[0], -1])
         f = self.frequency_Hz[bad]
@@ -236,5 +237,5 @@ def _scale(x: np.ndarray) -> np.ndarray:
 
 
 def _covariance(rows: np.ndarray) -> np.ndarray:
-    """sum e e^H over stacked rows e^T: (n, m, k) to (n, k, k)."""
+    """Sum of e e^H over stacked rows e^T: (n, m, k) to (n, k, k)."""
     return np.swapaxes(rows, 1, 2) @ rows.conj()

@@ -1,8 +1,8 @@
 """Frequency responses and noise covariances of campaigns by local models, for any excitation.
 
-Every record, or piece of a long one, has its own transient; G is shared (`local_fit`). Nothing is assumed periodic, so
-records of noise, multisines from rest and floor motion can be pooled; with a periodic excitation `best_linear`
-separates nonlinear distortion as well.
+Every record, or piece of a long record, has its own transient; G is common to all (`local_fit`). Nothing is assumed to
+be periodic, so records of noise, multisines from rest and floor motion can be pooled. For periodic excitation,
+`best_linear` also separates nonlinear distortion.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from avis_ctrl.measurement.frequency_response.spectra import (
 
 @dataclass(frozen=True, eq=False)
 class NoiseCovariance:
-    """Covariance of the outputs' noise on one line of a transform over sqrt(samples).
+    """Covariance of the output noise on one line of a transform divided by sqrt(samples).
 
     covariance : (n, n_y, n_y) Hermitian, positive definite; dof : (n,) complex degrees of freedom. A one-sided power
-    spectral density is 2 covariance over the sample rate.
+    spectral density is 2 covariance / sample rate.
     """
 
     covariance: np.ndarray
@@ -46,22 +46,22 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     """Local polynomial estimate, all records pooled (Pintelon and Schoukens 2012, section 7.2).
 
     The bias grows with the half width and the curvature of G: (half width / record length)^(order + 1). Nonlinear
-    distortion counts as noise. Memory is one triangular factor per frequency and one piece of a record.
+    distortion counts as noise. The memory needed is one triangular factor per frequency and one piece of a record.
 
-    Estimates whose windows overlap share lines, so that their errors are correlated: the covariance is that of each
+    Estimates with overlapping windows use common lines, so their errors are correlated. The covariance is that of each
     frequency by itself.
 
     Parameters
     ----------
-    band_Hz : lines to use, without line 0 (sensor offsets); all by default.
-    frequency_Hz : where to estimate; by default every line of the shortest piece.
-    order : of the polynomials, 2 to 4 is usual.
-    half_width : window of 2 half_width + 1 lines; by default the smallest that leaves 2 n_y + 4 degrees of freedom.
-    floor : the floor's velocity as additional inputs; by default where every record measured it. Records with u = 0
-        take part only then.
-    longest_piece : samples; longer records are read and used in pieces, each with its own transient.
-    partial : inputs need not be told apart, as of drives that are played together along six axes: the Gram matrix is
-        then singular along what they do not span (`FrequencyResponse.along` gives what they do).
+    band_Hz : band of the lines to use, without line 0 (sensor offsets); all lines by default.
+    frequency_Hz : frequencies of the estimates; by default every line of the shortest piece.
+    order : degree of the polynomials, usually 2 to 4.
+    half_width : window of 2 half_width + 1 lines; by default the smallest with 2 n_y + 4 degrees of freedom.
+    floor : use the floor velocity as additional inputs; by default if every record measured it. Records with u = 0 are
+        only used in this case.
+    longest_piece : maximum number of samples; longer records are used in pieces, each with its own transient.
+    partial : the inputs need not be separable, such as drives that are played together along six axes. The Gram matrix
+        is then singular along directions that they do not span (`FrequencyResponse.along` gives the spanned responses).
 
     Raises
     ------
@@ -86,10 +86,10 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
 
 
 def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -> float:
-    """Lines whose errors go together: the sum of the correlations of estimates from windows that overlap.
+    """Number of lines with correlated errors: the sum of the correlations of estimates from overlapping windows.
 
-    A local polynomial is a moving average with weights h that sum to one; over all shifts its correlations sum to
-    1 / sum h^2 lines, and lines that are estimated more sparsely share less.
+    A local polynomial is a moving average with weights h that sum to one. Its correlations over all shifts sum to
+    1 / sum h^2 lines; the number is smaller for estimates on a coarser grid.
     """
     if where.size < 2:
         return 1.0
@@ -101,16 +101,17 @@ def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -
 def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz: float | None = None,
                      band_Hz: Band | None = None, order: int = 2, half_width: int | None = None,
                      floor: bool | None = None, longest_piece: int | None = None) -> NoiseCovariance:
-    """Nonparametric noise covariance of the outputs: residuals of the local polynomial method, smoothed.
+    """Nonparametric noise covariance of the outputs: smoothed residuals of the local polynomial method.
 
-    Windows that do not overlap give independent estimates; those within +-smooth_Hz of a frequency are averaged, at
-    least as many as make it positive definite. All records count, those at rest as well (their u is 0), so records
-    should share their noise: choose them by `campaign.only`. Nonlinear distortion of driven records is part of it.
+    Windows that do not overlap give independent estimates. Those within +-smooth_Hz of a frequency are averaged, and at
+    least as many as make the result positive definite. All records are used, including records at rest (where u is 0),
+    so they should have the same noise: select them with `campaign.only`. The result includes the nonlinear distortion
+    of driven records.
 
     Parameters
     ----------
-    frequency_Hz : (n,) where it is wanted. smooth_Hz : half the smoothing band; one window by default.
-    Others as in `local_polynomial`.
+    frequency_Hz : (n,) frequencies of the result. smooth_Hz : half the smoothing band; one window by default.
+    Other parameters as in `local_polynomial`.
 
     Raises
     ------
@@ -124,8 +125,8 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     if smooth_Hz is not None and not smooth_Hz > 0:
         raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
     asked, every = data.grid(frequency_Hz, width), data.grid(None, width)
-    centres = every[width:every.size - width:2 * width + 1]  # windows that share no line
-    # What the outputs hold beside the inputs is known whether or not these are told apart.
+    centres = every[width:every.size - width:2 * width + 1]  # windows without a common line
+    # The residual of the outputs is known whether or not the inputs can be separated.
     found = data.fit(centres, order, width).estimate(data.names, partial=True)
     least = min(-(-(len(data.used.outputs) + 2) // found.dof), centres.size)
     return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * data.step_Hz, least)
@@ -151,12 +152,12 @@ def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np
 
 @dataclass(frozen=True)
 class _Data:
-    """What an estimate takes in.
+    """Data of an estimate.
 
-    pieces : (record, start, stop) with a transient each; used : channels; band : Hz; rate : of the samples, Hz;
-    step_Hz : from line to line of the shortest record's pieces; driven : places of the inputs that some record excites;
-    spacing : lines from one excited line to the next, more than one for periodic records; rank : how many directions
-    the inputs span in all.
+    pieces : (record, start, stop), each with its own transient; used : channels; band : Hz; rate : sample rate, Hz;
+    step_Hz : distance between the lines of the shortest record's pieces; driven : indices of the inputs that some
+    record excites; spacing : lines from one excited line to the next, more than one for periodic records; rank : number
+    of directions that the inputs span in total.
     """
 
     pieces: list[tuple[RecordSource, int, int]]
@@ -183,15 +184,15 @@ class _Data:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the driven inputs."""
+        """Names of the driven inputs."""
         return tuple(self.used.inputs[j] for j in self.driven)
 
     def width(self, order: int) -> int:
-        """The least half width [lines] of a window."""
+        """Minimum half width [lines] of a window."""
         return least_half_width(len(self.pieces), self.rank, len(self.used.outputs), order, self.spacing)
 
     def grid(self, frequency_Hz: np.ndarray | None, half_width: int) -> np.ndarray:
-        """(n,) the frequencies asked for, by default all lines in the band."""
+        """(n,) requested frequencies, by default all lines in the band."""
         keep = lines(round(self.rate / self.step_Hz), self.rate, self.band)
         every = np.arange(keep.start, keep.stop) * self.step_Hz
         if every.size < 2 * half_width + 1:
@@ -208,8 +209,9 @@ class _Data:
         return asked
 
     def fit(self, where: np.ndarray, order: int, half_width: int) -> LocalFit:
-        """The least-squares problems at (n,) Hz. The band is widened by half a window, so that its ends are not
-        extrapolated; pieces of one length are taken in together."""
+        """Least-squares problems at (n,) Hz. The band is widened by half a window to avoid extrapolation at its ends;
+        pieces of equal length are processed together.
+        """
         fit = LocalFit(where, len(self.driven), len(self.used.outputs), order, half_width, half_width * self.step_Hz)
         held: list[tuple[np.ndarray, np.ndarray]] = []
         line_Hz = np.zeros(0)
@@ -230,7 +232,8 @@ class _Data:
 
 
 def _driven(records: Iterable[Record], used: Channels, band: Band) -> tuple[list[int], int, int]:
-    """`driven`, `spacing` and `rank` of `_Data`: inputs that are not silent in the band, relative to their samples."""
+    """`driven`, `spacing` and `rank` of `_Data`: driven inputs are not silent in the band, relative to their samples.
+    """
     moving, spacing = np.zeros(len(used.inputs), bool), 1
     gram = np.zeros((len(used.inputs),) * 2, complex)
     for record in records:

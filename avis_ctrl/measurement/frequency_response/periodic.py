@@ -1,10 +1,10 @@
-"""Periods of periodic records: when they are settled, their mean, and the covariance of their noise.
+"""Periods of periodic records: when they have settled, their mean, and the covariance of their noise.
 
-A record starts from rest, so its first periods hold a transient. Either these are dropped (`settled_after`), or the
-transient is removed (`average(..., remove=True)`): on the lines of the whole record that lie between the harmonics of
-the period there is only transient and noise, and the transient is smooth over frequency, so that local polynomials
-through those lines give it on the harmonics (Pintelon and Schoukens, System Identification, 2nd ed., 2012, section
-7.3, robust local polynomial method), or rational functions near a sharp mode. Their residuals give the noise
+A record starts from rest, so its first periods contain a transient. Either these periods are dropped (`settled_after`),
+or the transient is removed (`average(..., remove=True)`): on the lines of the whole record between the harmonics of the
+period there is only transient and noise. The transient is smooth over frequency, so it can be interpolated on the
+harmonics with local polynomials through these lines (Pintelon and Schoukens, System Identification, 2nd ed., 2012,
+section 7.3, robust local polynomial method), or with rational functions near a sharp mode. The residuals give the noise
 covariance with many more degrees of freedom than the differences of a few periods.
 """
 
@@ -29,14 +29,14 @@ class PeriodicSettings:
         freedom per record.
     false_alarm : probability of dropping a settled period, over all blocks and outputs; small, because it costs data.
     degree : degree of the transient's polynomials, that of the local polynomial method.
-    same_level : relative difference of r.m.s. levels up to which two records count as having the same level:
-        realisations scatter.
-    excited_power, excited_over_noise : a line is excited where the mean power of an input exceeds this fraction of its
+    same_level : relative difference of r.m.s. levels up to which two records count as having the same level: the levels
+        of realisations scatter.
+    excited_power, excited_over_noise : a line is excited if the mean power of an input exceeds this fraction of its
         largest value (-60 dB), and this many times its noise (noise alone does so with a probability of at most e^-30).
     excited_amplitude : ratio of amplitudes that corresponds to `excited_power`, for a single record whose noise is not
         known.
-    repeated : power of the difference between the inputs of two experiments, relative to their power, below which the
-        experiments are repetitions of one; inputs of independent phases differ by 2.
+    repeated : power of the difference between the inputs of two experiments, relative to their power, below which they
+        are repetitions of one experiment; for inputs with independent phases the value is 2.
     dependent : eigenvalue of the inputs' Gram matrix, scaled to unit diagonal, below which the responses cannot be
         separated: they would have 10^4 times the noise.
     """
@@ -59,9 +59,9 @@ SETTINGS = PeriodicSettings()
 class PeriodMean:
     """Mean period of inputs and outputs on harmonics of the period.
 
-    Z : (n, n_u + n_y) transform of the mean period over sqrt(samples of a period), inputs first.
-    covariance : (n, n_z, n_z) noise covariance of Z, or None where there is one period only; dof : its degrees of
-    freedom; periods : kept.
+    Z : (n, n_u + n_y) transform of the mean period divided by sqrt(samples of a period), inputs first.
+    covariance : (n, n_z, n_z) noise covariance of Z, or None for a single period; dof : its degrees of freedom;
+    periods : number of periods averaged.
     """
 
     Z: np.ndarray
@@ -75,7 +75,8 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
 
     Raises
     ------
-    InputError : none, several periods, several levels without a choice (a best linear approximation belongs to one).
+    InputError : no such record, several periods, several levels without a choice (a best linear approximation is valid
+        for one level).
     """
     found = [r for r in campaign.records if r.header.excitation == "multisine" and r.header.periods >= 1]
     if not found:
@@ -99,17 +100,17 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
 
 
 def periods_of(record: RecordSource, used: Channels) -> np.ndarray:
-    """(periods, samples, n_u + n_y) whole periods; samples after the last whole one are left out."""
+    """(periods, samples, n_u + n_y) whole periods; samples after the last whole period are left out."""
     n, count = record.header.period_samples or 0, record.header.periods
     return np.hstack(used.of(record.load(0, n * count))).reshape(count, n, -1)
 
 
 def settled_after(records: Sequence[RecordSource], used: Channels, keep: slice) -> tuple[int, bool]:
-    """How many periods to drop before the outputs repeat, and whether the rest is settled.
+    """Number of periods to drop before the outputs repeat, and whether the others are settled.
 
     The power of the difference of consecutive periods, over blocks of 8 lines and all records, is compared with that of
-    the last two by an F test (0.1 % over all blocks and outputs). At least two periods are kept. With two periods
-    nothing can be compared: (0, False).
+    the last two periods by an F test (0.1 % over all blocks and outputs). At least two periods are kept. With fewer
+    than three periods no comparison is possible: (0, False).
     """
     n_u, count = len(used.inputs), min(record.header.periods for record in records)
     if count < 3:
@@ -127,16 +128,16 @@ def settled_after(records: Sequence[RecordSource], used: Channels, keep: slice) 
     if not any(moving):
         return 0, True
     last = max(p for p, yes in enumerate(moving) if yes)
-    # Where even the last difference that can be judged still moves, the reference may hold a transient too.
+    # If even the last testable difference is significant, the reference may contain a transient too.
     return last + 1, last + 1 < count - 2
 
 
 def average(record: RecordSource, used: Channels, keep: slice, drop: int, remove: bool) -> PeriodMean:
-    """Mean period after dropping some, on harmonics `keep`, with its noise covariance.
+    """Mean period on the harmonics `keep` after some periods are dropped, with its noise covariance.
 
     Raises
     ------
-    InputError : no period left; removal of the transient with fewer than two periods or too few harmonics.
+    InputError : no period remains; removal of the transient with fewer than two periods or too few harmonics.
     """
     x = periods_of(record, used)[drop:]
     count, n = x.shape[:2]
@@ -155,7 +156,7 @@ def average(record: RecordSource, used: Channels, keep: slice, drop: int, remove
 
 
 def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: str) -> PeriodMean:
-    """Whole-record lines between harmonics, `side` periods of lines to each side, carry the polynomials."""
+    """Mean period minus the transient, from polynomials over `side` harmonics of whole-record lines on each side."""
     X = fft.rfft(x, axis=0) / np.sqrt(x.shape[0])
     n_z, last = X.shape[1], (X.shape[0] - 1) // count
     side = 1
@@ -177,7 +178,7 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
     transient = np.einsum("nj,njz->nz", weight, around)
     E = free @ around
     dof = offset.size - SETTINGS.degree - 1
-    # a V instead of V, and two unknowns spent on all outputs together.
+    # The residual is a V instead of V, and has two degrees of freedom less for all outputs together.
     rows = dof * (n_z - n_u)
     shrink = np.mean(np.abs(a) ** 2, axis=1) * np.where(np.all(a == 1, axis=1), 1.0, (rows - 2) / rows)
     E[:, :, n_u:] /= np.sqrt(shrink)[:, None, None]
@@ -188,11 +189,11 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
 
 def _times_denominator(around: np.ndarray, span: np.ndarray, free: np.ndarray, n_u: int,
                        centred: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outputs around each harmonic, times a(d) = 1 + a1 d + a2 d^2 where that makes the transient a polynomial.
+    """Outputs around each harmonic, multiplied by a(d) = 1 + a1 d + a2 d^2 where this makes the transient a polynomial.
 
-    Near a sharp mode the transient is a rational function, all outputs sharing the pole. Least squares gives the
-    denominator. On noise alone it reduces the residual to 4/9 on average (1 - 5/3 d^2), so that it is used only where
-    the reduction is significantly larger; not at the ends of the band, where the harmonic is not at d = 0.
+    Near a sharp mode the transient is a rational function; all outputs have the same pole. The denominator is found by
+    least squares. On noise alone it reduces the residual to 4/9 on average (1 - 5/3 d^2). It is therefore used only
+    where the reduction is significantly larger, and not at the ends of the band, where the harmonic is not at d = 0.
 
     Returns the lines (n, m, n_z) and a (n, m), 1 where it is not used.
     """

@@ -4,9 +4,9 @@ Near a lightly damped mode every entry of G is a pole with a smooth background,
 
     G_ij(jw) = r_ij / (jw - p) + b_ij + c_ij (w - w0),     p = w_n (-zeta + j sqrt(1 - zeta^2)),
 
-with the complex conjugate pole and all other modes in the background. For a given p the other unknowns are linear, so
-the search is over p only (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973), weighted by the
-entries' variances.
+where the background includes the complex conjugate pole and all other modes. For a given p the other unknowns are
+linear, so the search is over p only (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973), weighted
+by the entries' variances.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 @dataclass(frozen=True)
 class ResonanceSettings:
     """reach : half-widths of the bands that the fit tries, in half-power bandwidths, narrow first.
-    misfit : weighted mean square residual up to which the wider band is kept: the background is still a straight line.
-    fewest_lines : smallest number of lines for a fit: three times the number of complex unknowns of an entry.
-    search : fraction of near_Hz, either way, within which the mode is searched: expected frequencies are off by a few
-        per cent.
-    false_alarm : probability that noise passes for a mode; small, because the pole is the best of many tried.
+    misfit : weighted mean square residual up to which a wider band is accepted: the background is still a straight
+        line.
+    fewest_lines : minimum number of lines for a fit: three times the number of complex unknowns of an entry.
+    search : fraction of near_Hz, on either side, within which the mode is searched: expected frequencies are off by a
+        few per cent.
+    false_alarm : probability that noise is taken for a mode; small, because the pole is the best of many trials.
     """
 
     reach: tuple[float, ...] = (1.0, 2.0, 4.0)
@@ -45,8 +46,8 @@ SETTINGS = ResonanceSettings()
 class Resonance:
     """A mode: undamped natural frequency and damping with standard deviations, residues (n_y, n_u) of G in 1/s units.
 
-    misfit : weighted mean square residual, 1 where the model explains all but the noise; standard deviations are
-    multiplied by its root where it is larger. band_Hz, lines : what was fitted.
+    misfit : weighted mean square residual, 1 if the model explains everything but the noise; if it is larger, the
+    standard deviations are multiplied by its square root. band_Hz, lines : band and number of lines of the fit.
     """
 
     frequency_Hz: float
@@ -64,13 +65,13 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
 
     Parameters
     ----------
-    near_Hz : the largest response within 5 % of it (or within width_Hz / 2) starts the search.
-    width_Hz : band of the fit around the mode; by default 1, 2 or 4 half-power bandwidths to each side,
-        the widest over which the model still explains all but the noise.
+    near_Hz : the search starts at the largest response within 5 % of it (or within width_Hz / 2).
+    width_Hz : band of the fit around the mode; by default 1, 2 or 4 half-power bandwidths to each side, the widest for
+        which the model still explains everything but the noise.
 
     Raises
     ------
-    InputError : no lines there. ComputationError : no mode inside the band.
+    InputError : too few lines there. ComputationError : no mode inside the band.
     """
     f = response.frequency_Hz
     reach = SETTINGS.search * near_Hz if width_Hz is None else width_Hz / 2
@@ -135,7 +136,7 @@ def _fit(response: FrequencyResponse, centre: float, half: float, near_Hz: float
 
 
 def _without_pole(weight: np.ndarray, G: np.ndarray, d: np.ndarray) -> float:
-    """Half the weighted square residual of the background alone."""
+    """Half the weighted sum of squared residuals of the background alone."""
     q, _ = np.linalg.qr(weight.T[:, :, None] * np.stack([np.ones(d.size), d / np.abs(d).max()], axis=1))
     right = (weight * G).T[:, :, None]
     return float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
@@ -166,9 +167,9 @@ def _result(best: object, coefficients: np.ndarray, misfit: float, scale: float,
                                         f"{decay / natural:.3g} over {f[0]:.6g} to {f[-1]:.6g} Hz",
                                cause="no resonance there, or one too broad or too close to another for a local fit",
                                next_step="look at the response, and give near_Hz and width_Hz around a single peak")
-    # Rows of J are whitened to variance 1/2.
+    # The rows of J are scaled to variance 1/2.
     covariance = np.linalg.inv(2 * J.T @ J) * max(misfit, 1.0)
-    # d(natural), d(damping) for x: natural^2 = decay^2 + turn^2, damping = decay / natural.
+    # Derivatives of natural and damping with respect to x: natural^2 = decay^2 + turn^2, damping = decay / natural.
     by_x = np.array([[turn / natural * scale, decay / natural * decay],
                      [-decay * turn / natural ** 3 * scale, decay / natural - decay ** 3 / natural ** 3]])
     spread = np.sqrt(np.diag(by_x @ covariance @ by_x.T))

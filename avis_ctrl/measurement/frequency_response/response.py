@@ -8,18 +8,18 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 
-# Eigenvalue of a Gram matrix of inputs of unit size, over the largest, below which nothing is spanned; and the share of
-# a combination of inputs that may lie outside of what is spanned.
+# Smallest eigenvalue, relative to the largest, of a direction that counts as spanned (Gram matrix of inputs of unit
+# size); and fraction of a combination of inputs that may lie outside the spanned directions.
 GRAM_TOLERANCE, SPANNED = 1e-13, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
-    """Frequency response matrix G of many inputs and outputs, estimated from Y = G U + noise.
+    """Frequency response matrix G with several inputs and outputs, estimated from Y = G U + noise.
 
-    With the noise of one experiment of covariance C and the inputs' Gram matrix S = sum U U^H over what the estimate
-    averaged, column j of the estimate's error correlates with column k as inv(S)_kj C (Pintelon and Schoukens,
-    System Identification, 2nd ed., 2012, section 2.7): covariance of vec(G) = inv(S)^T kron C.
+    Let C be the noise covariance of one experiment, and S = sum U U^H the Gram matrix of the inputs over the averaged
+    data. The covariance of the errors in columns j and k of the estimate is inv(S)_kj C (Pintelon and Schoukens, System
+    Identification, 2nd ed., 2012, section 2.7): covariance of vec(G) = inv(S)^T kron C.
 
     Attributes
     ----------
@@ -27,17 +27,17 @@ class FrequencyResponse:
     value : (n, n_y, n_u) complex, unit of y per unit of u.
     noise : (n, n_y, n_y) complex Hermitian covariance C of the total error (noise and, where it was separated,
         nonlinear distortion), E[e e^H].
-    gram : (n, n_u, n_u) complex Hermitian, S above; singular where the inputs do not span all directions, along which
-        nothing is known of G (`spanned`, `along`).
-    dof : complex degrees of freedom of the noise covariance estimate; infinite where the covariance is given.
+    gram : (n, n_u, n_u) complex Hermitian, S above; singular if the inputs do not span all directions. G is unknown
+        along the other directions (`spanned`, `along`).
+    dof : complex degrees of freedom of the noise covariance estimate; infinite if the covariance is given.
     measurement_noise : the part of `noise` that does not repeat from period to period, where separated.
-    distortion : the part of `noise` that repeats: stochastic nonlinear distortion, where separated; may be indefinite
-        by chance where there is none.
-    entry_variance : (n, n_y, n_u) E|error|^2 of each entry, for files that know no more (coherence, or variances);
-        entries then count as independent, and `noise` and `gram` are None.
-    shared : of how many neighbouring lines the errors go together, because their estimates rest on the same data: the
-        sum of their correlation over all distances; 1 for independent lines.
-    method : how it was estimated, in words.
+    distortion : the part of `noise` that repeats: stochastic nonlinear distortion, where separated; if there is none,
+        the estimate may be indefinite because of its random error.
+    entry_variance : (n, n_y, n_u) E|error|^2 of each entry, for files with only coherence or variances; the entries
+        then count as independent, and `noise` and `gram` are None.
+    shared : number of neighbouring lines with correlated errors, because their estimates use the same data: the sum of
+        the correlation over all distances; 1 for independent lines.
+    method : description of the estimator.
     """
 
     frequency_Hz: np.ndarray
@@ -93,9 +93,9 @@ class FrequencyResponse:
         return rows[:, :, None] * np.where(self.spanned(np.eye(len(self.inputs))), columns, np.inf)[:, None, :]
 
     def inverse_gram(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pseudo-inverse of the Gram matrix, and the projector (n, n_u, n_u) on what it spans in inputs of unit size.
+        """Pseudo-inverse of the Gram matrix, and the projector (n, n_u, n_u) onto its range for inputs of unit size.
 
-        Of columns of unit size, for units differ by orders.
+        The columns are scaled to unit size, because units differ by orders of magnitude.
         """
         assert self.gram is not None
         size = np.sqrt(np.real(np.einsum("nii->ni", self.gram)))
@@ -108,19 +108,18 @@ class FrequencyResponse:
                 (vectors * known[:, None, :]) @ adjoint)
 
     def spanned(self, V: np.ndarray) -> np.ndarray:
-        """(n, k) bool: whether the response to inputs played in the proportions of V (n_u, k) is known on a line."""
+        """(n, k) bool: whether the response to inputs played in the proportions of V (n_u, k) is known on each line."""
         V = np.asarray(V, float)
         if self.gram is None:
             return np.ones((len(self.frequency_Hz), V.shape[1]), bool)
         size = np.sqrt(np.real(np.einsum("nii->ni", self.gram)))
-        # A combination counts in inputs of unit size; one that holds a silent input is out of reach.
+        # Combinations are scaled to inputs of unit size; a combination with a silent input is not spanned.
         scaled = V[None] / np.where(size > 0, size, np.finfo(float).tiny ** 0.25)[:, :, None]
         left = scaled - self.inverse_gram()[1] @ scaled
         return np.asarray(np.linalg.norm(left, axis=1) < SPANNED * np.linalg.norm(scaled, axis=1))
 
     def along(self, V: np.ndarray, names: tuple[str, ...], unit: str) -> FrequencyResponse:
-        """The response to inputs played in the proportions of V (n_u, k), under names and a unit of input of their own,
-        on the lines where it is known.
+        """Response to inputs in the proportions of V (n_u, k), with new names and unit, on the lines where it is known.
 
         Raises InputError if it is known on no line, or if the columns of V are linearly dependent.
         """
@@ -147,11 +146,11 @@ class FrequencyResponse:
         return np.sqrt(np.maximum(self.variance(), 0.0))
 
     def between(self, low_Hz: float, high_Hz: float) -> FrequencyResponse:
-        """The lines of a band, ends included."""
+        """Lines inside a band, ends included."""
         return self.at((self.frequency_Hz >= low_Hz) & (self.frequency_Hz <= high_Hz))
 
     def at(self, keep: np.ndarray) -> FrequencyResponse:
-        """Some of the lines, by mask or index."""
+        """Selected lines, by mask or index."""
         by_line = {field.name: array[keep] for field in fields(self)
                    if isinstance(array := getattr(self, field.name), np.ndarray)}
         return replace(self, **by_line)

@@ -1,7 +1,7 @@
-"""From samples to spectra: which channels and records take part, and discrete Fourier transforms in a band.
+"""From samples to spectra: selection of channels and records, and discrete Fourier transforms in a band.
 
-Transforms are scaled by 1/sqrt(N), so that white noise has the same variance on every line whatever the length N of
-the record; a one-sided power spectral density is then 2/f_s times the mean square.
+Transforms are scaled by 1/sqrt(N), so that white noise has the same variance on every line for any length N of the
+record. A one-sided power spectral density is then 2/f_s times the mean square.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Band = tuple[float, float]
 class Channels:
     """The inputs and outputs of an estimate.
 
-    inputs : names, the floor's after the actuators'; floor : whether the floor's velocity is an input.
+    inputs : names, floor after actuators; floor : whether the floor velocity is an input.
     """
 
     inputs: tuple[str, ...]
@@ -41,12 +41,12 @@ def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | 
 
     Parameters
     ----------
-    records : those that take part.
-    floor : whether the floor's velocity counts as inputs; by default where every record measured it.
+    records : the records used.
+    floor : whether to use the floor velocity as inputs; by default if every record measured it.
 
     Raises
     ------
-    InputError : a record without floor channels where they are asked for, different ones.
+    InputError : a record without floor channels although they are requested, different floor channels.
     """
     first = records[0].header
     lacking = [record.header.name for record in records if not record.header.floor_names]
@@ -63,11 +63,11 @@ def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | 
 
 
 def taking_part(campaign: Campaign, floor: bool | None) -> tuple[RecordSource, ...]:
-    """Records that tell of the response: stepped sines never, records with u = 0 only where the floor is an input.
+    """Records with information on the response: never stepped sines; records with u = 0 only if the floor is an input.
 
     Raises
     ------
-    InputError : none is left.
+    InputError : no record remains.
     """
     moving = [r for r in campaign.records if r.header.excitation != "sine"]
     driven = tuple(r for r in moving if r.header.excitation in ("multisine", "noise"))
@@ -80,7 +80,7 @@ def taking_part(campaign: Campaign, floor: bool | None) -> tuple[RecordSource, .
 
 
 def checked_band(band_Hz: Band | None, sample_rate_Hz: float) -> Band:
-    """A band within 0 .. f_s/2; all of it by default."""
+    """A band within 0 .. f_s/2; the full range by default."""
     low, high = (0.0, sample_rate_Hz / 2) if band_Hz is None else band_Hz
     if not 0 <= low < high <= sample_rate_Hz / 2:
         raise InputError(f"expected 0 <= low < high <= {sample_rate_Hz / 2:g} Hz, half the sample rate",
@@ -89,7 +89,7 @@ def checked_band(band_Hz: Band | None, sample_rate_Hz: float) -> Band:
 
 
 def lines(samples: int, sample_rate_Hz: float, band_Hz: Band) -> slice:
-    """Lines of a transform of that many samples within a band; line 0 holds the sensors' offsets and stays out."""
+    """Lines inside a band of a transform of `samples` samples, without line 0 (sensor offsets)."""
     step = sample_rate_Hz / samples
     first = max(1, int(np.ceil(band_Hz[0] / step - 1e-9)))
     last = min((samples - 1) // 2, int(np.floor(band_Hz[1] / step + 1e-9)))
@@ -97,14 +97,14 @@ def lines(samples: int, sample_rate_Hz: float, band_Hz: Band) -> slice:
 
 
 def transform(x: np.ndarray, keep: slice) -> np.ndarray:
-    """Some lines of the transform along the first axis, over sqrt(N)."""
+    """Selected lines of the transform along the first axis, divided by sqrt(N)."""
     return fft.rfft(x, axis=0)[keep] / np.sqrt(x.shape[0])
 
 
 def equal_pieces(record: RecordSource, longest: int | None) -> list[tuple[int, int]]:
-    """(start, stop) of pieces of nearly the same length (the whole record where longest is None), of whole periods.
+    """(start, stop) of pieces of nearly equal length, in whole periods; the whole record if longest is None.
 
-    A short last piece would have a coarse resolution; one below half the others' length is left out.
+    A short last piece would have a coarse resolution; it is left out if it is shorter than half the others.
     """
     samples, period = record.header.samples, record.header.period_samples
     if longest is None or samples <= longest:

@@ -1,4 +1,4 @@
-"""Gates: what is examined in measured records before anything is fitted to them."""
+"""Gates: checks of measured records before any model is fitted to them."""
 
 from avis_ctrl.measurement.gates.examine import GATES, examine
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, Severity

@@ -1,20 +1,21 @@
-"""Which channels are exchanged or flipped, by comparison of measured and expected responses.
+"""Detection of exchanged or flipped channels by comparison of measured and expected responses.
 
-Measured and expected responses pass through the same estimator (H1 over the same segments of the same u, the model's y
-computed in the frequency domain), so that leakage changes both alike. A hypothesis says that the measured row i is r_i
-times the model's row p(i), and column j c_j times its column q(j). How far it agrees is, for each row,
+Both responses are computed with the same estimator (H1 over the same segments of the same u, with the model's y
+computed in the frequency domain), so that leakage affects both alike. The hypothesis is that the measured row i is r_i
+times the model's row p(i), and column j is c_j times its column q(j). The agreement of each row with the hypothesis is
 
-    a_i = Re sum_f w e^(j w t_i) sum_j M_ij (E P)_ij* / sqrt(sum w |M_i|^2  sum w |(E P)_i|^2),
+    a_i = Re sum_f w e^(j omega t_i) sum_j M_ij (E P)_ij* / sqrt(sum w |M_i|^2  sum w |(E P)_i|^2),
 
-with E the expected response in the order and signs of the hypothesis, P the projection onto the directions of u that
-are excited, and w(f) = 1 / (|E|^2 + noise), so that each frequency counts alike where the model expects something. A
-gain cancels in it, and the delay t_i is fitted: both are effects that a model may lack, and a lag is nearly a delay.
+with E the expected response in the order and signs of the hypothesis, P the projection onto the excited directions of
+u, and w(f) = 1 / (|E|^2 + noise), so that all frequencies where the model predicts a response have equal weight. The
+agreement does not depend on the gain, and the delay t_i is fitted, because a model may lack both effects; a phase lag
+is nearly a delay.
 
-What is left of the row, 1 - a_i^2, is the likelihood of the hypothesis. A model that is wrong is wrong alike at
-neighbouring frequencies, and a table's drives differ by little but a pattern: a row counts for as many independent
-complex numbers as a pattern over the excited directions times a shape over thirds of octaves has, N = directions +
-thirds - 1. Its log-likelihood ratio is N log((1 - a^2) / (1 - a'^2)), and an unrelated response agrees by more than a
-with probability (1 - a^2)^(N - 1).
+The residual of the row, 1 - a_i^2, gives the likelihood of the hypothesis. The errors of a wrong model are similar at
+neighbouring frequencies, and the responses to a table's drives differ by little more than a pattern. A row therefore
+counts as N independent complex numbers, as many as a pattern over the excited directions times a shape over
+third-octave bands: N = directions + thirds - 1. The log-likelihood ratio of two hypotheses is
+N log((1 - a^2) / (1 - a'^2)). The agreement of an unrelated response exceeds a with probability (1 - a^2)^(N - 1).
 """
 
 from __future__ import annotations
@@ -29,15 +30,16 @@ from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, thirds
 
 @dataclass(frozen=True)
 class MapSettings:
-    """What counts as evidence.
+    """Thresholds for evidence of channel faults.
 
-    chance : probability that a correct map is called wrong, shared over the alternatives, each with each delay; a stop
-        ends the work, so it is smaller than for other alarms. least_agreement : correlation of a channel with its
-        assigned response; a model below it describes less than half the power of the data, and proves nothing.
-        delay_s : range of delays that are fitted, from a u recorded late to the slowest loop. delay_step_s : a tenth of
-        a turn at 100 Hz.
-        closest : smallest value used for 1 - a^2: resonances 2.5 % away from the model's leave as much.
-    still : share of a drive in the excited directions up to which it counts as not driven: round-off of the basis.
+    chance : probability that a correct map is reported as wrong, divided among the alternatives and delays; a stop
+        interrupts the work, so it is smaller than for other alarms.
+    least_agreement : minimum correlation of a channel with its assigned response; a model below it describes less than
+        half the power of the data and provides no evidence.
+    delay_s : range of fitted delays, from a u that is recorded late to the slowest loop.
+    delay_step_s : step of the fitted delays, a tenth of a cycle at 100 Hz.
+    closest : minimum value used for 1 - a^2: the residual of resonances that are 2.5 % away from the model's.
+    still : fraction of a drive in the excited directions up to which it counts as not driven: round-off of the basis.
     """
 
     chance: float = 1e-4
@@ -49,7 +51,7 @@ class MapSettings:
 
     @property
     def delays_s(self) -> np.ndarray:
-        """(n,) the delays that are tried, none first: where all are alike it is taken."""
+        """(n,) trial delays, smallest magnitude first: zero is chosen if all fit equally well."""
         low, high = self.delay_s
         steps = np.arange(round(low / self.delay_step_s), round(high / self.delay_step_s) + 1)
         return self.delay_step_s * steps[np.argsort(np.abs(steps), kind="stable")]
@@ -60,12 +62,12 @@ SETTINGS = MapSettings()
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Inner products of measured entry (i, j) with expected entry (k, l), and what normalises them.
+    """Inner products of measured entry (i, j) with expected entry (k, l), and their normalisation.
 
-    C : (n_y, n_y, n_u, n_u), index i, k, j, l, the delay of the pair (i, k) taken out. B : (n_y, n_u, n_u), of the
-    expected entries (k, a) and (k, b). P : (n_u, n_u) projection onto what is excited. rows_M : (n_y,) norms.
-    delay_s : (n_y, n_y). delays : independent ones among those tried; closer than 1 / (2 bandwidth) they are one
-    hypothesis to the records. N : independent complex numbers in a row.
+    C : (n_y, n_y, n_u, n_u), index i, k, j, l, the delay of the pair (i, k) removed. B : (n_y, n_u, n_u), of the
+    expected entries (k, a) and (k, b). P : (n_u, n_u) projection onto the excited directions. rows_M : (n_y,) norms of
+    the measured rows. delay_s : (n_y, n_y) fitted delays. delays : number of independent trial delays; the records
+    cannot distinguish delays closer than 1 / (2 bandwidth). N : independent complex numbers in a row.
     """
 
     C: np.ndarray
@@ -80,11 +82,11 @@ class Comparison:
 
     @property
     def moving(self) -> np.ndarray:
-        """(n_u,) drives that move."""
+        """(n_u,) mask of the drives that move."""
         return np.diag(self.P) > self.settings.still
 
     def agreement(self, q: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """(n_y, n_y) of measured row i with expected row k, columns matched by q with signs c."""
+        """(n_y, n_y) agreement of measured row i with expected row k, columns matched by q with signs c."""
         own: np.ndarray = self.C[:, :, np.arange(len(q)), q] @ c
         power = np.einsum("kab,ab->k", self.B[:, q][:, :, q], self.P * np.outer(c, c))
         return np.asarray(own / np.maximum(self.rows_M[:, None] * np.sqrt(np.maximum(power, 0.0)), 1e-300))
@@ -99,22 +101,22 @@ class Comparison:
         return float(np.log(alternatives / self.settings.chance))
 
     def least(self, alternatives: int) -> float:
-        """Agreement that a channel must have with its assigned response."""
+        """Minimum agreement of a channel with its assigned response."""
         by_chance = 1 - (self.settings.chance / alternatives) ** (1 / max(self.N - 1, 1))
         return max(self.settings.least_agreement, float(np.sqrt(by_chance)))
 
     def by_chance(self, gain: float, agreement: float, alternatives: int) -> float:
-        """Probability, at most, that one of this many alternatives reaches a log-likelihood ratio and an agreement."""
+        """Upper bound on the probability that one of this many alternatives reaches this gain and agreement."""
         unrelated = max(1 - agreement ** 2, 0.0) ** max(self.N - 1, 1)
         return min(1.0, alternatives * max(float(np.exp(-gain)), unrelated))
 
 
 def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray], np.ndarray] | None = None,
             settings: MapSettings = SETTINGS) -> Comparison | None:
-    """Of measured and expected spectra of records (those of the commonest segment length); None where too few.
+    """Compare measured and expected spectra of records with the most common segment length; None if they are too few.
 
-    response : (n,) Hz -> (n, n_y, n_u) of the model. Where the voltages do not span all drives that move, what the
-        records would be with exchanged drives does not follow from them: the model says it, without leakage.
+    response : (n,) Hz -> (n, n_y, n_u) of the model. It is used (without leakage) if the voltages do not span all
+        moving drives, because the records then do not determine the outputs for exchanged drives.
     """
     if not pairs:
         return None
@@ -141,8 +143,9 @@ def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray
 
 def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
             ) -> tuple[np.ndarray, np.ndarray]:
-    """(n_y, n_y) s by which measured row i is best behind expected row k, whatever the signs of the columns; and
-    w e^(j omega delay) (n, n_y, n_y)."""
+    """(n_y, n_y) s, best-fitting delay of measured row i behind expected row k for any signs of the columns, and
+    w e^(j omega delay) (n, n_y, n_y).
+    """
     trial = settings.delays_s
     turn = np.exp(2j * np.pi * f * trial[:, None])
     products = np.einsum("f,fij,fkj->fikj", w, M, E.conj(), optimize=True)
@@ -155,12 +158,12 @@ def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings
 class Faults:
     """Measured row i is r[i] times expected row p[i], column j is c[j] times expected column q[j].
 
-    own, other : (n_y,) agreement of each row with its own expectation and with what was found for it, the rest as
-    found. columns : for each drive that was exchanged or flipped, the row that says so, and its agreement without and
-    with that. chance : for each row and column that was exchanged or flipped, the probability, at most, of so much
-    evidence by chance, among all alternatives and delays.
+    own, other : (n_y,) agreement of each row with its own expectation and with the one found for it; everything else as
+    found. columns : for each exchanged or flipped drive, the row with the strongest evidence, and its agreement without
+    and with the fault. chance : for each exchanged or flipped row and column, an upper bound on the probability of this
+    much evidence by chance, over all alternatives and delays.
     doubtful : rows ("row", i) and columns ("column", j) that would agree better in another order or sign, but without
-    evidence that is strong in absolute terms; they are not called faults.
+    strong absolute evidence; they are not reported as faults.
     """
 
     p: np.ndarray
@@ -175,14 +178,14 @@ class Faults:
 
 
 def explain(comparison: Comparison) -> Faults:
-    """The fewest exchanges and flips that explain the measured rows and columns, found one after the other.
+    """Smallest set of exchanges and flips that explains the measured rows and columns, by greedy search.
 
-    Each step takes the fault that raises the likelihood most, of all rows together, and by more than chance does among
-    all steps, an exchange by twice that. For columns one row must make up half of it, since a wrong model makes all
-    rows wrong a little. A symmetric rig turned about its axis is many exchanges at once: one by one, the simplest comes
-    first. At the end every channel that was touched must agree with what it is said to be by more than
-    `Comparison.least`, and better than with its own by more than chance does among all steps, each with each of
-    the delays; otherwise that is doubtful, and nothing is called a fault.
+    Each step takes the fault with the largest gain in the likelihood of all rows together. The gain must exceed what
+    chance produces among all steps, twice that for an exchange. For columns a single row must contribute half of this,
+    because a wrong model makes all rows slightly wrong. A symmetric rig turned about its axis is many exchanges at
+    once: one by one, the simplest comes first. At the end every affected channel must agree with its assigned response
+    by more than `Comparison.least`, and better than with its own response by more than chance produces among all steps
+    and delays. Otherwise the channel is doubtful, and no fault is reported.
     """
     n_y, n_u = len(comparison.rows_M), len(comparison.P)
     order, sign = {"row": np.arange(n_y), "column": np.arange(n_u)}, {"row": np.ones(n_y), "column": np.ones(n_u)}
@@ -209,7 +212,7 @@ def explain(comparison: Comparison) -> Faults:
 
 def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
             alternatives: int) -> Faults:
-    """What was found, if the evidence for all of it is strong; otherwise no fault, and the doubtful channels."""
+    """The faults, if the evidence for all of them is strong; otherwise no fault, and the doubtful channels."""
     n_y, n_u = len(p), len(q)
     rows, straight, ones = np.arange(n_y), np.arange(n_u), np.ones(n_y)
     least, evidence = comparison.least(alternatives), comparison.evidence(alternatives)
@@ -238,7 +241,7 @@ def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray,
 
 
 def cycle_of(order: np.ndarray, start: int) -> list[int]:
-    """The places that an exchange moves around, from one of them."""
+    """The cycle of the permutation `order` that contains `start`."""
     found, k = [start], int(order[start])
     while k != start:
         found.append(k)
@@ -247,13 +250,13 @@ def cycle_of(order: np.ndarray, start: int) -> list[int]:
 
 
 def _agreements(comparison: Comparison, order: dict[str, np.ndarray], sign: dict[str, np.ndarray]) -> np.ndarray:
-    """(n_y,) of each row with the expectation that order and sign give it."""
+    """(n_y,) agreement of each row with the expectation that order and sign assign to it."""
     a = comparison.agreement(order["column"], sign["column"])
     return np.asarray(sign["row"] * a[np.arange(len(a)), order["row"]])
 
 
 def _steps(n_y: int, n_u: int) -> list[tuple[str, int, int, tuple[float, float]]]:
-    """(row or column, i, k, signs): flips have i = k."""
+    """All elementary faults (row or column, i, k, signs); flips have i = k."""
     signs = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
     steps = [(what, i, i, (-1.0, 1.0)) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)]
     return steps + [(what, i, k, flips) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)
@@ -271,7 +274,7 @@ def _after(order: dict[str, np.ndarray], sign: dict[str, np.ndarray], what: str,
 
 
 def _fewest(r: np.ndarray, c: np.ndarray, live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same signs, or all of them exchanged where that means fewer flips; inputs that never moved have no sign."""
+    """The same signs, or all of them reversed if this means fewer flips; inputs that never moved have no sign."""
     flipped = np.sum(r < 0) + np.sum(c[live] < 0)
     if 2 * flipped > len(r) + np.sum(live):
         return -r, np.where(live, -c, 1.0)

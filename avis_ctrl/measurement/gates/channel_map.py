@@ -1,4 +1,4 @@
-"""Gates that compare each channel with what the model expects of it: exchanged channels and polarity."""
+"""Gates that compare each channel with its response in the model: exchanged channels and polarity."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from avis_ctrl.measurement.gates.finding import (
 )
 from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
 
-ORDER, POLARITY = "channel order", "polarity"  # what the findings go under
+ORDER, POLARITY = "channel order", "polarity"  # gate names of the findings
 
 
 @dataclass(frozen=True)
 class CopySettings:
-    """different : largest r.m.s. of the difference of two channels, after scaling, relative to either's, at which one
-        is a copy of the other: independent noise of sensors is larger.
-    alike : the same of the model's channels, up to which a motion explains that two sensors read alike: parameters that
-        are off by a few per cent make symmetric sensors differ by as much.
+    """different : r.m.s. of the difference of two channels, after scaling, relative to either's, below which one is a
+        copy of the other: independent sensor noise is larger.
+    alike : the same for the model's channels: below it a motion explains that two sensors read alike. Parameter errors
+        of a few per cent make symmetric sensors differ by this much.
     """
 
     different: float = 1e-3
@@ -43,7 +43,7 @@ COPIES = CopySettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """u (samples, n_u), y and what the model expects of it (samples, n_y) of a driven record; wrap: of one period."""
+    """u (samples, n_u), y and the model's y (samples, n_y) of a driven record; wrap: they are one period."""
 
     record: str
     copies: list[tuple[int, int, float, float]]
@@ -57,14 +57,15 @@ class _Kept:
 class ChannelMap(Gate):
     """Exchanged, mislabelled and copied channels ("channel order"), and flipped signs ("polarity").
 
-    Without a model, copies only: a channel that equals another one times one constant within 0.1 % of its r.m.s. in
-    every record. A motion along one axis makes sensors of a symmetric table read alike, in the records of that motion;
-    where the model expects that of every record, it is a note.
+    Without a model, only copies are detected: a channel that equals a constant times another channel within 0.1 % of
+    its r.m.s. in every record. A motion along one axis makes the sensors of a symmetric table read alike. If the model
+    predicts this for every record, the finding is a note.
 
-    With a model: the fewest exchanges and flips that explain the measured rows (sensors) and columns (drives), see
-    `explain`; for settings and the probability of a false stop see `MapSettings`. If another order fits better without
-    such evidence, that is a note. Flipping all sensors cannot be told from flipping all drives: the explanation with
-    fewer flips is named, and the sentence says so where both have equally many.
+    With a model: the smallest set of exchanges and flips that explains the measured rows (sensors) and columns
+    (drives), see `explain`; for settings and the probability of a false stop see `MapSettings`. If another order fits
+    better without sufficient evidence, the finding is a note. Flipping all sensors cannot be distinguished from
+    flipping all drives: the explanation with fewer flips is reported. If both have equally many, the message states
+    this.
     """
 
     name = "channel map"
@@ -216,11 +217,11 @@ def _sign_picture(faults: Faults, campaign: Campaign, comparison: Comparison) ->
 
 
 def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str, ...], wrap: bool) -> np.ndarray:
-    """(samples, n_y) the model's y, from rest; periodic where `wrap`."""
+    """(samples, n_y) y of the model, starting from rest; periodic if `wrap`."""
     n = len(u) if wrap else 2 * len(u)
     f = np.fft.rfftfreq(n, 1 / rate)
     U = np.fft.rfft(u, n, axis=0)
-    # Lines 60 dB down need no response of the model.
+    # The model's response is not needed on lines 60 dB below the largest.
     power = np.sum(np.abs(U) ** 2, axis=1)
     keep = power > 1e-6 * power.max(initial=0.0)
     keep[0] = False
@@ -233,8 +234,9 @@ def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str,
 
 
 def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
-    """Measured and expected spectra, with segments as long as all records together allow: records that drive one axis
-    after the other are short, but many."""
+    """Measured and expected spectra, with the longest segments that all records together allow: records that drive one
+    axis after the other are short, but many.
+    """
     held = [(k, k.u, k.y, k.model) for k in kept if k.u is not None and k.y is not None and k.model is not None]
     if not held:
         return []
@@ -245,18 +247,18 @@ def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
 
 
 def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) -> list[int] | None:
-    """Rows of the model in the order of the campaign's channels; None where they do not correspond."""
+    """Rows of the model in the order of the campaign's channels; None if they do not correspond."""
     if expected is None:
         return list(range(rows)) if rows == len(names) else None
     return [expected.index(n) for n in names] if set(names) <= set(expected) and len(expected) == rows else None
 
 
-# Two samples are always alike up to a constant and a factor; this many are not by chance.
+# Two samples always agree up to an offset and a factor; this many do not agree by chance.
 FEWEST_ALIKE = 8
 
 
 def _copies(seen: Excerpt) -> list[tuple[int, int, float, float]]:
-    """(i, k, scale, rest): channels with y_k = scale y_i up to a constant, within `CopySettings.different`."""
+    """(i, k, scale, relative difference): y_k = scale y_i + constant, within `CopySettings.different`."""
     y = seen.first.y - seen.first.y.mean(axis=0)
     if len(y) < FEWEST_ALIKE:
         return []
@@ -266,7 +268,7 @@ def _copies(seen: Excerpt) -> list[tuple[int, int, float, float]]:
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:
-    """R.m.s. of b less the best multiple of a, relative to b's; infinite where either is zero."""
+    """R.m.s. of b minus the best multiple of a, relative to b's; infinite if either is zero."""
     aa, bb = float(a @ a), float(b @ b)
     return max(0.0, 1 - float(a @ b) ** 2 / (aa * bb)) ** 0.5 if aa > 0 and bb > 0 else np.inf
 

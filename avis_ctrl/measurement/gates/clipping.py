@@ -1,4 +1,4 @@
-"""Gates for samples that the converter could not show: clipping and over-range levels."""
+"""Gate for samples that the converter could not represent: clipping and over-range levels."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
 
-# A noise-free sine's top code is hit up to 2.42 times as often as the next one.
+# The top code of a noise-free sine occurs up to 2.42 times as often as the next code.
 SINE_TOP = 2.42
 
 
 @dataclass(frozen=True)
 class ClippingSettings:
-    """flatter : samples at the top over those of the next values below which nothing is concluded [1]: tops flatter
-        than a sine's, as two tones may make, reach 5.3 (fourth order).
-    steps : that the signal's range has at least; a few codes of noise at rest have no tops.
-    widths : of the top by the signal's range, beside the value itself [1]: noise after the clipping rounds a flat top.
-    wrong_unit : part of the samples at or beyond the range from which the unit is wrong [1].
-    level_spread : of an over-range level, by the jump into it [1].
-    unusual : that jump over the median change over two samples, at least [1].
+    """flatter : ratio of samples at the top to samples at the next values, below which nothing is concluded [1]: tops
+        that are flatter than a sine's, such as those of two tones, reach 5.3 (fourth order).
+    steps : minimum number of different values of the signal; noise at rest with a few codes has no tops.
+    widths : widths of the top relative to the signal's range, besides the value itself [1]: noise added after the
+        clipping rounds a flat top.
+    wrong_unit : fraction of samples at or beyond the range above which the unit is wrong [1].
+    level_spread : maximum spread of an over-range level, relative to the jump into it [1].
+    unusual : minimum ratio of this jump to the median change over two samples [1].
     """
 
     flatter: float = 8.0
@@ -40,7 +41,7 @@ SETTINGS = ClippingSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """How one channel of a record ends: samples `count` at `value`, why they count as clipped, and some time signal."""
+    """Extremes of one channel of a record: `count` samples at `value`, the reason, and part of the signal."""
 
     record: str
     channel: str
@@ -57,18 +58,18 @@ class _Ends:
 
 
 class Clipping(Gate):
-    """Flat tops.
+    """Flat tops and over-range levels.
 
-    At a known range: samples within half a step of its ends; none are expected, so that two are an alarm. More than
-    half of all samples there are no clipping but a wrong unit or scale.
-    At any range, also below its known end, as of a preamplifier that saturates: `repeated_extreme`, a binomial test
-    at 1 % shared over ends, channels and records. It needs about 40 samples at one end, 8 for each period of a periodic
-    record, and a level that is flat within 1/64 of the signal's range; a single clipped peak stays hidden. Of
-    campaigns of tests/measurement/gates_rig.py (20 of multisines, 20 of noise) none gave an alarm, and of 24000 to
-    40000 samples clipped at both ends at 80 to 98 % of the peak all were found from 82 samples on.
-    And levels outside the signal: runs entered and left by jumps of opposite sign, larger than 20 times the spread
-    within, at the record's very end of range (an instrument's "out of range" output); 3 samples suffice, an unclipped
-    signal has no such runs.
+    At a known range: samples within half a step of its ends. None are expected, so two of them raise an alarm. If more
+    than half of all samples lie there, the cause is not clipping but a wrong unit or scale.
+    At any range, also below its known end (as with a saturating preamplifier): `repeated_extreme`, a binomial test at
+    1 %, divided among ends, channels and records. It needs about 40 samples at one end, 8 for each period of a periodic
+    record, and a level that is flat within 1/64 of the signal's range; a single clipped peak is not detected. Simulated
+    campaigns (tests/measurement/gates_rig.py, 20 of multisines, 20 of noise) gave no false alarm. In records of 24000
+    to 40000 samples, clipped at both ends at 80 to 98 % of the peak, clipping was always found from 82 samples on.
+    Levels outside the signal: runs that are entered and left by jumps of opposite sign, larger than 20 times the spread
+    within the run, at the very end of the record's range (an instrument's "out of range" output). Three samples
+    suffice; an unclipped signal has no such runs.
     """
 
     name = "clipping"
@@ -107,7 +108,7 @@ class Clipping(Gate):
                     value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
 
     def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
-        """Most samples at or beyond the range, in some record."""
+        """Finding for records with most samples at or beyond the range."""
         row = max(rows, key=lambda r: r.count)
         assert row.t is not None and row.x is not None and expectation.y_range_V is not None
         return Finding(
@@ -122,7 +123,7 @@ class Clipping(Gate):
                     (Series(row.channel, row.t, row.x),), (Limit("converter", expectation.y_range_V[1]),)))
 
     def _finding(self, of: list[_Ends]) -> Finding:
-        """Of the records in which one channel is clipped."""
+        """Finding for the records in which one channel is clipped."""
         row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
         assert row.t is not None and row.x is not None
@@ -141,7 +142,7 @@ class Clipping(Gate):
 
 def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple[float, float] | None,
           lsb: float | None, free: bool, periods: int = 1) -> _Ends:
-    """Judge one channel; `free` looks for repeated extremes, over-range levels and a wrong unit too."""
+    """Check one channel; `free` also searches for repeated extremes, over-range levels and a wrong unit."""
     peak = float(np.max(np.abs(x)))
     best = _Ends(record, channel, len(x), peak)
     if np.ptp(x) == 0:
@@ -188,12 +189,13 @@ def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple
 
 
 def repeated_extreme(x: np.ndarray, periods: int = 1) -> tuple[float, float, float]:
-    """The largest value, the chance that an unclipped signal repeats it so often, and the width of the flat top.
+    """Largest value, probability that an unclipped signal repeats it so often, and width of the flat top.
 
-    Samples at the top are counted against the fullest of the five next values, or bins of the same width below it:
-    a parabola, the top of a smooth signal, has 1 / (sqrt 2 - 1) = 2.42 times as many. Above 8 times, where no smooth
-    top reaches, the chance is that of the binomial distribution with 2.42 / 3.42, shared over the widths. A peak that
-    recurs in every period counts once for each, so that the next values count at least `periods`.
+    The number of samples at the top is compared with the largest number at one of the five next values, or in one of
+    the bins of the same width below it. The top of a smooth signal is a parabola, for which the ratio is
+    1 / (sqrt 2 - 1) = 2.42. Above a ratio of 8, which no smooth top reaches, the probability is that of the binomial
+    distribution with 2.42 / 3.42, multiplied by the number of widths. A peak that recurs in every period counts once
+    per period, so the count of the next values is at least `periods`.
     """
     values, counts = np.unique(x, return_counts=True)
     top, extent = float(values[-1]), float(values[-1] - values[0])
@@ -214,13 +216,13 @@ def repeated_extreme(x: np.ndarray, periods: int = 1) -> tuple[float, float, flo
         if n >= max(5.0, SETTINGS.flatter * others):
             p = len(trials) * float(stats.binom.sf(n - 1, n + others, SINE_TOP / (1 + SINE_TOP)))
             best = min(best, (top, p, width), key=lambda b: b[1])
-            if p < FALSE_ALARM / 1000:  # the narrowest that is beyond doubt counts the samples best
+            if p < FALSE_ALARM / 1000:  # the narrowest significant width gives the best count
                 break
     return best
 
 
 def over_range(x: np.ndarray) -> np.ndarray:
-    """(samples,) mask of runs at the top that are entered by a jump up and left by a jump down."""
+    """(samples,) mask of runs at the top that are entered by an upward jump and left by a downward jump."""
     mask = np.zeros(len(x), bool)
     top, low = float(np.max(x)), float(np.min(x))
     if top == low:

@@ -1,4 +1,4 @@
-"""Gate for channels that carry nothing: constant, stuck at a code, or noise alone while others respond."""
+"""Gate for channels without a signal: constant, stuck at a code, or noise alone while others respond."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
 @dataclass(frozen=True)
 class DeadSettings:
-    """stuck_samples, stuck_factor : least length of a stuck run, in samples and over any other run of the channel [1].
-    responds : factor by which the median channel exceeds what chance may do where others count as dead [1].
+    """stuck_samples, stuck_factor : minimum length of a stuck run, in samples and relative to all other runs [1].
+    responds : minimum ratio of the median channel to the limit for noise alone, for others to count as dead [1].
     """
 
     stuck_samples: int = 50
@@ -43,13 +43,13 @@ class _Kept:
 
 
 class DeadChannel(Gate):
-    """Sensors that do not sense and drives that are never driven.
+    """Sensors without a signal and drives that are never driven.
 
-    Constant channels and stuck codes need no statistics. A channel is noise alone where its largest multiple coherence
-    over the driven lines is what chance gives (beta distribution of n_u and K - n_u, 1 % shared over channels, records
-    and lines) while half of the channels respond, in terms of coherence / (1 - coherence); that is judged over all
-    driven records. Of a sine record the fitted sine's power is judged against the residual, by F(2, samples - 3). False
-    alarms come from small signals only.
+    Constant channels and stuck codes need no statistics. A channel counts as noise alone if its largest multiple
+    coherence over the driven lines is within the limit for noise (beta distribution of n_u and K - n_u, 1 % divided
+    among channels and lines) while half of the channels respond, in terms of coherence / (1 - coherence); all driven
+    records are considered. In a sine record, the power of the fitted sine is compared with the residual by
+    F(2, samples - 3). Only small signals can cause false alarms.
     """
 
     name = "dead channel"
@@ -85,7 +85,7 @@ class DeadChannel(Gate):
 
     def _sensors(self, kept: list[_Kept], campaign: Campaign, rms: np.ndarray, picture: Picture) -> Iterator[Finding]:
         responses = [k.response for k in kept if k.response is not None]
-        # Drift looks like a slow sine: of many sine records the middle one counts.
+        # Drift looks like a slow sine: for sine records the median is used.
         sines = all(record.header.excitation == "sine" for record in campaign.records)
         excess = (np.median if sines else np.max)(responses, axis=0) if responses else None
         for j, name in enumerate(campaign.y_names):
@@ -137,7 +137,7 @@ def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _excess(seen: Excerpt) -> np.ndarray | None:
-    """(n_y,) largest coherence / (1 - coherence) over the driven lines, divided by what chance gives at 1 %."""
+    """(n_y,) largest coherence / (1 - coherence) over the driven lines, relative to its 1 % limit for noise alone."""
     if not seen.driven:
         return None
     if seen.header.excitation == "sine":
@@ -157,7 +157,7 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
 
 
 def _sine_excess(seen: Excerpt) -> np.ndarray:
-    """(n_y,), the same for a sine: power of the fitted sine by that of the residual, against F(2, samples - 3)."""
+    """(n_y,) the same for a sine: power of the fitted sine over that of the residual, relative to F(2, samples - 3)."""
     piece = seen.first
     n_u = piece.u.shape[1]
     fit = fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), n_u, seen.header.sample_rate_Hz)

@@ -1,4 +1,4 @@
-"""All gates over a campaign, each record loaded once."""
+"""Run all gates on a campaign; each record is loaded once."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 
 GATES: tuple[type[Gate], ...] = (Clipping, Spikes, DeadChannel, ChannelMap, SteppedSine, MissingSamples, Hum,
                                  SignalToNoise, Coherence, Periodicity, Comparison)
-# What rows that do not belong together spoil.
+# Gates that missing or doubled samples of any record affect.
 CONSEQUENCES = ("signal to noise", "coherence", "periodicity", "repeatability", "level dependence", "spikes")
-# The same where no record is without them.
+# Gates that these affect only if every record has them.
 OF_ALL = ("channel order", "polarity")
 
 
 def examine(campaign: Campaign, expectation: Expectation | None = None, longest: int = LONGEST) -> tuple[Finding, ...]:
-    """What the gates say of a campaign, at least one finding of each, with a picture.
+    """Findings of all gates on a campaign, at least one per gate, with pictures.
 
-    Of a record longer than `longest` samples four evenly spread pieces of that many samples together are looked at; the
-    sentences of warnings and the notes then say so.
+    Records longer than `longest` samples are examined in four evenly spaced pieces with this many samples in total; the
+    sentences of all findings then state this.
 
     Parameters
     ----------
-    expectation : what is known of the rig; gates that need a model say that they had none.
+    expectation : what is known of the rig; gates that need a model report its absence.
 
     Raises
     ------
@@ -62,10 +62,11 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
 
 
 def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Finding]:
-    """Findings that follow from missing samples say so and are notes: the cause stops, and they are to be judged again.
+    """Turn findings that follow from missing samples into notes that state this; missing samples are themselves a stop.
 
-    Only gates that compare rows with the commanded voltage or with each other, of the records concerned or of all;
-    what all records say together of channels and signs only where samples miss in each, of `names`.
+    Only gates that compare samples with the commanded voltage or with each other are affected, for the records
+    concerned or for all records. Channel order and polarity are judged over all records together; they are affected
+    only if samples are missing in every record in `names`.
     """
     records = {r for f in findings if f.gate == MissingSamples.name and f.severity == "stop" for r in f.records}
     said = (f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}: "
@@ -85,7 +86,7 @@ def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Find
 
 
 def after_clipping(findings: list[Finding]) -> list[Finding]:
-    """Spikes of a clipped channel are corners of its flat tops; its noise is not its own where the unit is wrong."""
+    """Turn consequences of clipping into notes: spikes at the corners of flat tops, and noise if the unit is wrong."""
     clipped = {(f.channels[0], r) for f in findings if f.gate == Clipping.name and f.severity == "stop"
                for r in f.records}
     scaled = {name for f in findings if f.gate == Clipping.name and f.severity == "stop" and f.limit for name in

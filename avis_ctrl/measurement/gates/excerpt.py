@@ -1,4 +1,4 @@
-"""What the gates look at: a record, or evenly spread pieces of one that is too long to hold in memory."""
+"""Data for the gates: a record, or evenly spaced pieces of a record that is too long for memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PIECES = 4
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """A record's header with the pieces that were loaded; one piece where the record is short."""
+    """A record's header with the loaded pieces; a short record is one piece."""
 
     header: RecordHeader
     pieces: tuple[Record, ...]
@@ -32,17 +32,17 @@ class Excerpt:
 
     @property
     def periodic(self) -> bool:
-        """At least two whole periods in the first piece."""
+        """Whether the first piece contains at least two whole periods."""
         period = self.header.period_samples
         return period is not None and len(self.first.y) >= 2 * period
 
     @property
     def driven(self) -> bool:
-        """Some commanded voltage moves."""
+        """Whether some commanded voltage moves."""
         return self.header.excitation not in ("rest", "floor") and any(np.ptp(p.u, axis=0).any() for p in self.pieces)
 
     def periods(self, what: str = "y") -> np.ndarray:
-        """(periods, samples, channels) of u or y, over all pieces; the last, broken period is left out."""
+        """(periods, samples, channels) of u or y, over all pieces, without an incomplete last period of a piece."""
         length = self.header.period_samples or 0
         arrays = [getattr(piece, what) for piece in self.pieces]
         cut = [a[: len(a) // length * length].reshape(-1, length, a.shape[1]) for a in arrays]
@@ -50,7 +50,9 @@ class Excerpt:
 
 
 def excerpt(record: RecordSource, longest: int = LONGEST) -> Excerpt:
-    """The record, or four evenly spread pieces of at most `longest` samples together, cut between periods."""
+    """The record, or four evenly spaced pieces of at most `longest` samples in total, cut between periods; one piece if
+    a period is longer than a quarter of `longest`.
+    """
     samples, period = record.header.samples, record.header.period_samples or 1
     if samples <= longest:
         return Excerpt(record.header, (record.load(),))
@@ -63,13 +65,13 @@ def excerpt(record: RecordSource, longest: int = LONGEST) -> Excerpt:
 
 
 class Gate(ABC):
-    """One question put to a campaign: `look` at each record once, then `conclude`."""
+    """One check of a campaign: `look` at each record once, then `conclude`."""
 
     name: ClassVar[str]
 
     @abstractmethod
     def look(self, seen: Excerpt, expectation: Expectation) -> Any:
-        """What is kept of a record; small."""
+        """What `conclude` needs of a record; small."""
 
     @abstractmethod
     def conclude(self, kept: list[Any], campaign: Campaign, expectation: Expectation) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""What a gate says of a campaign: a sentence with numbers, and plain data for its plot."""
+"""Findings of a gate on a campaign: a sentence with numbers, and plain data for its plot."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from avis_ctrl.errors import InputError
 Severity = Literal["ok", "note", "warning", "stop"]
 SEVERITIES: tuple[str, ...] = ("ok", "note", "warning", "stop")
 Response = Callable[[np.ndarray, tuple[str, ...]], np.ndarray]
-# Chance that a gate raises an alarm on clean data of one campaign, over all its channels and records.
+# Probability that a gate raises an alarm on clean data of one campaign, over all its channels and records.
 FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """most_points : of a line in a plot: a panel is no more than some hundred pixels wide, each with two points."""
+    """most_points : maximum number of points of a line: a panel is some hundred pixels wide, with two points per pixel.
+    """
 
     most_points: int = 2000
 
@@ -31,7 +32,7 @@ SETTINGS = PictureSettings()
 class Series:
     """A curve of a picture: x and y of equal length; style "line", "points" or "bars".
 
-    Of a longer line the smallest and the largest point of each of `most_points` / 2 bins are kept.
+    Longer lines are reduced to the smallest and the largest point of each of `most_points` / 2 bins.
     """
 
     name: str
@@ -59,9 +60,9 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """Plain data for a plot. Labels carry the unit; scales are "linear" or "log".
+    """Plain data for a plot. Labels include the unit; scales are "linear" or "log".
 
-    x_names : of the places 0, 1, 2 ... along x, where these are channels; empty otherwise.
+    x_names : names of the positions 0, 1, 2 ... along x if these are channels; otherwise empty.
     """
 
     title: str
@@ -76,15 +77,15 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """One sentence of a gate.
+    """One result of a gate.
 
     Attributes
     ----------
     gate : name of the gate.
-    severity : "ok", "note" (know it), "warning" (results suffer), "stop" (results would be wrong).
+    severity : "ok", "note" (for information), "warning" (results suffer), "stop" (results would be wrong).
     sentence : measured numbers, likely cause, next step.
-    channels, records : that it concerns; empty where it concerns all.
-    value, limit : the number judged and what it was judged against.
+    channels, records : affected channels and records; empty if all are affected.
+    value, limit : the tested number and its limit.
     """
 
     gate: str
@@ -99,22 +100,22 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """What is known of the rig before its records are looked at; every field may be absent.
+    """What is known about the rig before its records are examined; every field may be absent.
 
     Attributes
     ----------
     y_range_V : lowest and highest value that the converter reports, unit of y.
-    y_lsb_V : its step.
+    y_lsb_V : step of the converter, unit of y.
     drive_limits_V : largest commanded voltage of each drive, by name.
-    sensor_noise_rms_V : of each channel, white at the sample rate, unit of y.
-    u_names, y_names : channels that the rig has.
+    sensor_noise_rms_V : noise of each channel, white at the sample rate, unit of y.
+    u_names, y_names : channels of the rig.
     u_unit, y_unit : their units.
-    response : response(omega (n,) rad/s, inputs) -> (n, n_y, n_u) complex, from commanded volts to y, rows in the
-        order of `y_names` (or of the campaign's channels where that is absent).
+    response : response(omega (n,) rad/s, inputs) -> (n, n_y, n_u) complex, from commanded volts to y, rows in the order
+        of `y_names` (or of the campaign's channels if `y_names` is absent).
 
     Raises
     ------
-    InputError : a range whose ends are exchanged, limits that are not positive.
+    InputError : range ends in the wrong order, limits that are not positive.
     """
 
     y_range_V: tuple[float, float] | None = None
@@ -144,7 +145,7 @@ def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
 
 
 def times(ratio: float, most: float = 1000.0) -> str:
-    """"3.1 times", or "over 1000 times": larger numbers say nothing more."""
+    """"3.1 times", or "over 1000 times": larger numbers carry no more information."""
     return f"over {most:g} times" if ratio > most else f"{ratio:.1f} times" if ratio < 100 else f"{ratio:.0f} times"
 
 

@@ -1,12 +1,12 @@
 """Quick H1 estimates by Welch's method, for the gates only.
 
-G = S_yu inv(S_uu) over Hann segments with half overlap (Bendat and Piersol, Random Data, 4th ed., 2010, chapter 7).
-Of a periodic record the mean of its periods is taken, after the first, and segments wrap around its end, so that
-a period that repeats is not counted as new data.
+G = S_yu inv(S_uu) over Hann segments with half overlap (Bendat and Piersol, Random Data, 4th ed., 2010, chapter 7). For
+a periodic record the mean of all periods after the first is used, and segments wrap around its end, so that repeated
+periods do not count as new data.
 
 Voltages that always move together (six logical axes played through eight drives, one axis after the other) span fewer
-directions than there are drives. Only these directions are estimated: with the rows of V an orthonormal basis of them,
-u = V^T a, G V^T is estimated from a, and what is called G is (G V^T) V, which is zero across them.
+directions than there are drives. Only these directions are estimated. The rows of V are an orthonormal basis of them:
+u = V^T a, and G V^T is estimated from a. The reported G is (G V^T) V, which is zero in the other directions.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from scipy import signal
 
 from avis_ctrl.measurement.gates.excerpt import Excerpt
 
-# Number of independent segments that one of many half-overlapping Hann segments counts for: 1 / (1 + 2 rho^2), with
-# rho = 1/6 the correlation of the window with itself shifted by half its length.
+# Independent segments per half-overlapping Hann segment: 1 / (1 + 2 rho^2), where rho = 1/6 is the correlation of the
+# window with itself shifted by half its length.
 OVERLAP = 1 / 1.056
 
 
 @dataclass(frozen=True)
 class H1Settings:
-    """most_samples : largest number of samples read from a record, for speed: 31 segments for up to four inputs.
+    """most_samples : maximum number of samples used of a record, for speed: 31 segments for up to four inputs.
     driven : power of u at a line relative to the strongest line, below which the line counts as not driven: at -30 dB
-        most of u and y has leaked from other lines.
+        most of u and y is leakage from other lines.
     direction : power of a direction of the voltages relative to the strongest direction, with all drives scaled to
-        equal r.m.s., below which it counts as not excited: voltages rounded to four digits leave less.
-    at_line : the same at a single line, relative to the line's own strongest direction: the response in a weaker one
-        would have more than 100 times the noise.
+        equal r.m.s., below which it counts as not excited: rounding of the voltages to four digits gives less.
+    at_line : the same at a single line, relative to the line's own strongest direction: the response in a weaker
+        direction would have more than 100 times the noise.
     """
 
     most_samples: int = 1 << 16
@@ -46,9 +46,9 @@ SETTINGS = H1Settings()
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Sums over segments of one record.
+    """Windowed spectra of the segments of a record.
 
-    f : (n,) Hz; U : (K, n, n_u), Y : (K, n, n_y) windowed spectra of the segments, scaled to r.m.s. per sqrt(Hz).
+    f : (n,) Hz; U : (K, n, n_u), Y : (K, n, n_y), scaled to r.m.s. per sqrt(Hz).
     """
 
     f: np.ndarray
@@ -57,11 +57,11 @@ class Spectra:
 
     @property
     def count(self) -> int:
-        """Independent segments, about."""
+        """Approximate number of independent segments."""
         return max(1, int(len(self.U) * OVERLAP))
 
     def driven(self) -> np.ndarray:
-        """(n,) lines at which the inputs have power; never the mean."""
+        """(n,) mask of lines at which the inputs have power, without the mean (lines 0 and 1)."""
         power = np.sum(np.abs(self.U) ** 2, axis=(0, 2))
         mask = power > SETTINGS.driven * np.max(power[1:], initial=0.0)
         mask[:2] = False
@@ -70,9 +70,10 @@ class Spectra:
 
 @dataclass(frozen=True, eq=False)
 class H1:
-    """f (n,) Hz, G (n, n_y, n_u), noise (n, n_y) residual power, covariance (n, n_u, n_u) of a row of G by the noise
-    there, coherence (n, n_y) multiple, dof complex degrees of freedom of the noise, basis (n_u, rank) orthonormal
-    directions of u that are excited, power (n,) of u."""
+    """H1 estimate: f (n,) Hz, G (n, n_y, n_u), noise (n, n_y) residual power, covariance (n, n_u, n_u) of a row of G
+    divided by its noise, coherence (n, n_y) multiple, dof complex degrees of freedom of the noise, basis (n_u, rank)
+    orthonormal excited directions of u, power (n,) of u.
+    """
 
     f: np.ndarray
     G: np.ndarray
@@ -85,16 +86,16 @@ class H1:
 
     @property
     def rank(self) -> int:
-        """How many directions of u are excited."""
+        """Number of excited directions of u."""
         return self.basis.shape[1]
 
     def unbiased_coherence(self) -> np.ndarray:
-        """(n, n_y) coherence less what chance gives it."""
+        """(n, n_y) coherence with its bias removed."""
         return self.coherence - (1 - self.coherence) * self.rank / self.dof
 
 
 def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
-    """u, y and whether they wrap around: the mean period after the first, or the first piece of the record."""
+    """u, y, and whether they wrap around: the mean period after the first, or the start of the record."""
     if seen.periodic:
         u, y = seen.periods("u"), seen.periods("y")
         if u.shape[1] <= SETTINGS.most_samples:
@@ -108,13 +109,13 @@ def moving(u: np.ndarray) -> int:
 
 
 def segment_length(samples: int, inputs: int) -> int:
-    """A power of two that leaves at least 6 segments for each input and 24 in all, half overlapping."""
+    """Segment length, a power of two, with at least 6 segments for each input and 24 in total at half overlap."""
     wanted = max(24, 6 * inputs)
     return max(16, 1 << int(np.log2(max(16.0, 2 * samples / (wanted + 1)))))
 
 
 def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: bool) -> Spectra:
-    """Spectra of half-overlapping Hann segments; none of a record that is shorter than one."""
+    """Spectra of half-overlapping Hann segments; no segments if the record is shorter than one."""
     if wrap:
         u, y = (np.concatenate([a, a[: length // 2]]) for a in (u, y))
     window = signal.get_window("hann", length)
@@ -143,10 +144,9 @@ def directions(U: np.ndarray) -> np.ndarray:
 
 
 def h1(of: list[Spectra]) -> H1 | None:
-    """Over the segments of some records of equal segment length; None where there are too few for the inputs.
+    """H1 over the segments of records with equal segment length; None if they are too few for the inputs.
 
-    Inputs that do not move have a zero column. Lines are left out that are not driven, or not in every direction in
-    which the others are.
+    Inputs that do not move have a zero column. Only lines that are driven in all excited directions are kept.
     """
     U, Y = np.concatenate([s.U for s in of]), np.concatenate([s.Y for s in of])
     joint = Spectra(of[0].f, U, Y)
@@ -159,7 +159,7 @@ def h1(of: list[Spectra]) -> H1 | None:
         return None
     reduced = U @ basis
     gram = np.einsum("kfi,kfj->fij", reduced.conj(), reduced)
-    # Each direction over its own size in the whole band: one drive played much louder hides none of the others.
+    # Each direction is divided by its size in the whole band, so that a much louder drive does not hide the others.
     size = np.sqrt(np.real(np.einsum("fii->i", gram[keep])))
     power = np.linalg.eigvalsh(gram / np.outer(size, size))
     keep &= power[:, 0] > SETTINGS.at_line * power[:, -1]
@@ -181,7 +181,7 @@ def h1(of: list[Spectra]) -> H1 | None:
 
 
 def octaves(f: np.ndarray) -> list[np.ndarray]:
-    """Masks of octave bands over the frequencies; bands with fewer than 3 lines join the next."""
+    """Masks of octave bands over the frequencies; bands with fewer than 3 lines are extended."""
     if not len(f):
         return []
     edges = [f[0]]
@@ -196,6 +196,6 @@ def octaves(f: np.ndarray) -> list[np.ndarray]:
 
 
 def thirds(f: np.ndarray) -> list[np.ndarray]:
-    """Masks of thirds of octaves that hold a line."""
+    """Masks of the third-octave bands that contain a line."""
     place = np.floor(3 * np.log2(f / f[0]) + 1e-9).astype(int)
     return [place == k for k in np.unique(place)]

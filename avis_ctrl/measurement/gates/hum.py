@@ -1,4 +1,4 @@
-"""Gate for lines of the mains: narrow lines at 50 or 60 Hz and their harmonics above the local noise floor."""
+"""Gate for mains hum: narrow lines at 50 or 60 Hz and their harmonics above the local noise floor."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ MAINS_HZ = (50.0, 60.0)
 
 @dataclass(frozen=True)
 class HumSettings:
-    """harmonics : of 50 and of 60 Hz that are tested.
-    tolerance : within which the mains stays of its nominal frequency [1].
-    reference, guard : bins on either side that tell the floor, and bins left out next to the line's.
-    least_ratio : of a line's power to its floor [1]: floors are not quite flat.
-    large : part of the channel's r.m.s. from which a line is a warning [1].
+    """harmonics : number of multiples of 50 and of 60 Hz that are tested.
+    tolerance : maximum relative deviation of the mains frequency from its nominal value [1].
+    reference, guard : bins on either side that give the floor, and bins left out next to those of the line.
+    least_ratio : minimum ratio of a line's power to its floor [1]: floors are not quite flat.
+    large : fraction of the channel's r.m.s. above which a line is a warning [1].
     """
 
     harmonics: int = 6
@@ -36,7 +36,7 @@ SETTINGS = HumSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A tested line: p by the F test, the line's r.m.s., ratio of its power to the local floor."""
+    """A tested line: p-value of the F test, r.m.s. of the line, ratio of its power to the local floor."""
 
     channel: int
     mains_Hz: float
@@ -61,9 +61,9 @@ class Hum(Gate):
 
     Power spectra are means over K Hann segments without overlap (K from 4 to 32). The largest bin within the tolerance
     is compared with the reference bins on either side; the louder side is the floor. Their ratio is F(2K, 2 m K)
-    distributed for m bins of a locally flat floor, so that 1 % shared over bins, lines, channels and records controls
+    distributed for m bins of a locally flat floor, so that 1 % divided among bins, lines, channels and records controls
     false alarms. Lines that the commanded u drives (bins with more than 1e-6 of the median power of its driven bins)
-    are passed over: they are the experiment. A line is a warning where it is large, otherwise a note.
+    belong to the experiment and are skipped. A large line is a warning, otherwise a note.
     """
 
     name = "hum"
@@ -119,12 +119,12 @@ class Hum(Gate):
 
 
 def _length(samples: int, rate: float) -> int:
-    """Segments of about 4 s, 4 of them at least and 32 at most."""
+    """Segment length of about 4 s, for at least 4 and at most 32 segments."""
     return int(np.clip(4 * rate, samples // 32, max(samples // 4, 2)))
 
 
 def _driven(Pu: np.ndarray, excitation: str) -> np.ndarray:
-    """(n,) bins in which u puts lines: of a noise excitation none, since its spectrum is smooth."""
+    """(n,) mask of bins in which u has lines: none for noise excitation, because its spectrum is smooth."""
     power = Pu.sum(axis=1)
     if excitation == "noise" or not power.any():
         return np.zeros(len(power), bool)
@@ -133,7 +133,7 @@ def _driven(Pu: np.ndarray, excitation: str) -> np.ndarray:
 
 
 def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: float, K: int) -> list[_Line] | None:
-    """The line at `at` in each channel; empty beyond the band, None where u drives it."""
+    """The line at `at` Hz in each channel; empty beyond the band, None if u drives it."""
     df = f[1]
     width = max(1, int(np.ceil(SETTINGS.tolerance * at / df)))
     middle = round(at / df)
@@ -151,7 +151,7 @@ def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: 
         if floor <= 0:
             continue
         ratio = float(P[peak, j] / floor)
-        # The largest of 2 width + 1 bins; neighbouring Hann bins are dependent, which makes the bound safe.
+        # The largest of 2 width + 1 bins; neighbouring Hann bins are correlated, which makes the bound conservative.
         p = min(1.0, (2 * width + 1) * float(stats.f.sf(ratio, 2 * K, 2 * K * SETTINGS.reference)))
         around_peak = P[max(peak - 2, 0) : peak + 3, j] - floor
         lines.append(_Line(j, mains, float(f[peak]), p, ratio, float(np.sqrt(max(around_peak.sum(), 0.0) * df))))

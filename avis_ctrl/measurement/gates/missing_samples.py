@@ -1,4 +1,4 @@
-"""Gate for samples that were lost or repeated, and for records whose clocks contradict each other."""
+"""Gate for lost or repeated samples, and for records with contradictory clocks."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, moving, segment_leng
 
 @dataclass(frozen=True)
 class MissingSamplesSettings:
-    """block_rows : rows of the shortest repeated block, equal in every channel: with noise in one channel that is no
+    """block_rows : rows of the shortest repeated block, equal in every channel: with noise in one channel this is no
         coincidence.
-    jump_samples : smallest step of the delay that counts: only whole samples are lost.
-    longest_samples : largest delay in the search, either way, and largest step: segments without a clear delay scatter
-        over the whole range of the search.
-    explains : least decrease of the residual's mean logarithm when the step is undone: a tenth of its power. Steps that
-        come from a delay of the model that varies with frequency increase it when undone.
-    both_sides : least ratio of a line's mean drive powers before and after the step, the smaller to the larger, for the
-        line to show the step: on one side alone it cannot be distinguished from the phase of the response.
-    showing : least fraction of all lines that must show a step. A swept sine drives each line once: only the few around
-        the instant lie on both sides, and each of them only for a moment.
+    jump_samples : minimum step of the delay: only whole samples are lost.
+    longest_samples : maximum delay in the search, in either direction, and maximum step: segments without a clear delay
+        scatter over the whole range of the search.
+    explains : minimum decrease of the residual's mean logarithm when the step is undone: a tenth of its power. Steps
+        caused by a delay of the model that varies with frequency increase it when undone.
+    both_sides : minimum ratio of a line's mean drive powers before and after the step, the smaller to the larger, for
+        the line to show the step: on one side alone it cannot be distinguished from the phase of the response.
+    showing : minimum fraction of all lines that must show a step. A swept sine drives each line once: only the few
+        lines around the instant are driven on both sides, and each of them only for a moment.
     """
 
     block_rows: int = 16
@@ -55,12 +55,14 @@ class MissingSamples(Gate):
     """Lost samples, repeated blocks, overlapping records.
 
     Lost samples shift y against the commanded u. In each segment the delay of y behind H1 u is fitted to the phase of
-    the driven lines, weighted by the residual; the largest step between means of the segments before and after any
-    instant is tested (Student's t with the segments' own scatter, 1 % shared over instants, records and the three
-    estimates of H1; few segments), and must explain the record. A delay that runs away is no step. In a swept sine the
-    delay changes with the frequency, and so with time: steps are not looked for there. Where rows were lost from u and
-    y together, a periodic u shows it: each period is compared with the first by circular correlation, exactly, for u is
-    commanded. A repeated block is rows equal in every channel of y to earlier ones, not a whole number of periods away.
+    the driven lines, weighted by the residual. The largest step between the medians of the segments before and after
+    any instant is tested (Student's t with the scatter of the few segments, 1 % divided among instants, records and the
+    three estimates of H1). The step must also explain the record. A steadily growing delay is not a step. In a swept
+    sine the delay changes with frequency, and thus with time, so no steps are reported.
+
+    If samples were lost from u and y together, a periodic u shows it: each period is compared with the first by
+    circular correlation, which is exact, because u is commanded. A repeated block consists of rows that equal earlier
+    rows in every channel of y, not a whole number of periods away.
     """
 
     name = "missing samples"
@@ -88,7 +90,7 @@ class MissingSamples(Gate):
                     limit=SETTINGS.jump_samples, picture=_picture(longest))]
 
     def _faults(self, k: _Kept, level: float) -> Iterator[Finding]:
-        """Of one record."""
+        """Findings on one record."""
         rate, name, picture = k.header.sample_rate_Hz, k.header.name, _picture(k)
         if k.block:
             at, back, n = k.block
@@ -132,10 +134,10 @@ class MissingSamples(Gate):
 
 
 def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
-    """t (K,) s of segments' middles, delay (3, K) in samples of y behind H1 u, H1 from all, the first and the second
-    half.
+    """t (K,) s of the segments' centres, and delay (up to 3, K) in samples of y behind H1 u, with H1 from all segments,
+    the first half and the second half.
 
-    A step in the middle spoils an H1 of all segments; of the halves one is whole.
+    A step in the record corrupts the H1 of all segments, but at least one half is free of it.
     """
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
@@ -153,13 +155,13 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
-    """(K,) samples by which each segment of y is behind H1 u."""
+    """(K,) delay in samples of each segment of y behind H1 u."""
     keep = np.isin(of.f, estimate.f)
     expected = np.einsum("fij,kfj->kfi", estimate.G, of.U[:, keep])
     cross = of.Y[:, keep] * expected.conj() / np.maximum(estimate.noise, 1e-300)
     weight = np.abs(expected) ** 2 / np.maximum(estimate.noise, 1e-300)
     omega = 2 * np.pi * estimate.f[None, :, None] / rate
-    # Gauss-Newton of sum weight |Y / expected - exp(-j omega d)|^2, from the best of a scan over whole samples.
+    # Gauss-Newton on sum weight |Y / expected - exp(-j omega d)|^2, initialised at the best whole number of samples.
     scan = np.arange(-SETTINGS.longest_samples, SETTINGS.longest_samples + 1)
     summed = np.sum(cross, axis=2)
     power = np.real(summed @ np.exp(1j * omega[0] * scan))
@@ -171,11 +173,11 @@ def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
 
 
 def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
-    """By how much the residual of H1 falls where a step of the delay is undone; mean logarithm over lines and channels.
+    """Decrease of the H1 residual when a step of the delay is undone: mean logarithm over lines and channels.
 
-    The step is of `size` samples, at t[where] or half a segment before or after: rows are put in, or taken out. Only
-    lines that are driven before and after it count (`both_sides` of the settings); if these are too few (`showing`),
-    nothing is explained.
+    The step has `size` samples, at t[where] or half a segment before or after; rows are inserted or removed. Only lines
+    that are driven before and after it count (`both_sides` of the settings); if these are too few (`showing`), the
+    result is -inf.
     """
     rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
     u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
@@ -201,16 +203,16 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
 
 
 def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
-    """(index, size in samples) of the most significant step of the delay; None where none is."""
+    """(index, size in samples) of the most significant step of the delay; None if no step is significant."""
     n = len(delay)
     best: tuple[float, int, float] | None = None
     for k in range(2, n - 1):
         a, b = delay[:k], delay[k:]
-        # Medians: the first segment holds the transient, and the one across the step belongs to neither.
+        # Medians: the first segment contains the transient, and the segment across the step belongs to neither side.
         size = float(np.median(b) - np.median(a))
         scatter = 1.4826 * np.concatenate([np.abs(a - np.median(a)), np.abs(b - np.median(b))])
         sigma = max(float(np.median(scatter)), 1e-6)
-        # 1.57: variance of a median by that of a mean; 1.5: half-overlapping segments are not quite independent.
+        # 1.57: variance of a median over that of a mean; 1.5: half-overlapping segments are not quite independent.
         t = abs(size) / (sigma * np.sqrt(1.57 * 1.5 * (1 / len(a) + 1 / len(b))))
         if best is None or t > best[0]:
             best = float(t), k, size
@@ -220,7 +222,7 @@ def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
 
 
 def runs_away(delay: np.ndarray, where: int) -> bool:
-    """A straight line leaves less of the delay than a step at `where`: two clocks that differ, and no lost samples."""
+    """Whether a straight line fits the delay better than a step at `where`: two different clocks, not lost samples."""
     x = np.arange(len(delay))
     line = delay - np.polyval(np.polyfit(x, delay, 1), x)
     step = delay - np.where(x < where, np.median(delay[:where]), np.median(delay[where:]))
@@ -228,7 +230,7 @@ def runs_away(delay: np.ndarray, where: int) -> bool:
 
 
 def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | None:
-    """(where, how far back, rows) of the longest block equal to earlier rows; None where there is none."""
+    """(start, distance back, rows) of the longest block equal to earlier rows; None if there is none."""
     moving, rows = np.ptp(y, axis=0) > 0, SETTINGS.block_rows
     if not moving.any() or len(y) < 2 * rows:
         return None
@@ -241,7 +243,7 @@ def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | 
     order = np.argsort(hashed, kind="stable")
     same = np.flatnonzero(np.diff(hashed[order]) == 0)
     later, back = order[same + 1], order[same + 1] - order[same]
-    # Rows that stand still are for the dead-channel gate.
+    # Constant rows are left to the dead-channel gate.
     lively = np.lib.stride_tricks.sliding_window_view(changed, rows).sum(axis=1)[later] > rows // 2
     if period:
         lively &= back % period != 0
@@ -254,7 +256,7 @@ def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | 
 
 
 def _clock(seen: Excerpt) -> np.ndarray | None:
-    """(periods,) samples by which each period of u is shifted against the first; None where u is not periodic."""
+    """(periods,) shift in samples of each period of u against the first; None if u is not periodic."""
     if not seen.periodic or not seen.driven:
         return None
     u = seen.periods("u")

@@ -1,4 +1,4 @@
-"""Gate for periodic records: how many periods hold the transient of the start, and whether the rest repeats."""
+"""Gate for periodic records: how many periods contain the initial transient, and whether the others repeat."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from avis_ctrl.measurement.gates.finding import (
 
 @dataclass(frozen=True)
 class PeriodicitySettings:
-    """smooth : lines over which the noise level is averaged.
-    drift : part of the signal below which a steady drift over the last half of the record is passed [1].
+    """smooth : number of lines over which the noise level is averaged.
+    drift : fraction of the signal below which a steady drift over the last half of the record is accepted [1].
     """
 
     smooth: int = 9
@@ -37,7 +37,7 @@ SETTINGS = PeriodicitySettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """T (periods, n_y): mean over lines of |difference from the reference|^2 by its variance, 1 on average."""
+    """T (periods, n_y): mean over lines of |difference from the reference|^2 / its variance; 1 on average for noise."""
 
     record: str
     period_s: float
@@ -49,14 +49,14 @@ class _Kept:
 
 
 class Periodicity(Gate):
-    """Each period against the mean of the last half, line by line and channel by channel.
+    """Comparison of each period with the mean of the last half, line by line and channel by channel.
 
-    Differences pass a Hann window, which keeps low frequencies from leaking into all lines. With noise variances from
-    the periods of the reference, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R
-    reference periods; 1 % is shared over periods, channels and records. Periods up to the last one before the reference
-    that fails are to be dropped: a note, for a rig that starts at rest always has a transient. Where the reference's
-    first period itself fails against the others, or where the reference's periods change steadily (slope against what
-    it leaves, F(L, L (R - 2)), and more than 1 % of the signal), the response drifts: a warning.
+    Differences are Hann-windowed, which keeps low frequencies from leaking into all lines. With noise variances from
+    the reference periods, smoothed over 9 lines, T is F(L, L (R - 1)) distributed for L independent lines and R
+    reference periods; 1 % is divided among periods, channels and records. All periods up to the last failing one before
+    the reference should be dropped: a note, because a rig that starts at rest always has a transient. If a period of
+    the reference itself fails, or if the periods of the reference change steadily (slope against its residual,
+    F(L, L (R - 2)), and more than 1 % of the signal), the response drifts: a warning.
     """
 
     name = "periodicity"
@@ -109,7 +109,7 @@ class Periodicity(Gate):
                     f"noise alone {limit:.2f}).", value=float(k.T.max()), limit=limit, picture=picture)]
 
     def _unsettled(self, k: _Kept, drop: int, limit: float, campaign: Campaign, picture: Picture) -> Finding | None:
-        """Periods of the reference itself differ."""
+        """Finding if periods of the reference itself differ."""
         P = len(k.T)
         reference = P - P // 2
         if drop <= reference:
@@ -140,7 +140,7 @@ class Periodicity(Gate):
 
 
 def windowed(difference: np.ndarray) -> np.ndarray:
-    """(..., lines, n_y) spectra of Hann-windowed differences (..., samples, n_y), every second line, no mean."""
+    """(..., lines, n_y) spectra of Hann-windowed differences (..., samples, n_y): every second line, no mean."""
     n = difference.shape[-2]
     window = np.hanning(n + 1)[:-1, None] * np.sqrt(8 / 3)
     return np.fft.rfft(difference * window, axis=-2)[..., 2:-1:2, :]
@@ -154,14 +154,14 @@ def smoothed(power: np.ndarray, width: int = SETTINGS.smooth) -> np.ndarray:
 
 
 def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """T (P, n_y), relative difference (P, n_y), lines and reference periods of y (P, samples, n_y)."""
+    """T (P, n_y), relative difference (P, n_y), numbers of lines and of reference periods for y (P, samples, n_y)."""
     P = len(y)
     R = P // 2
     reference = y[P - R :].mean(axis=0)
     of = windowed(y[P - R :] - reference)
     variance = smoothed(np.sum(np.abs(of) ** 2, axis=0) / (R - 1))
     rms = np.maximum((reference - reference.mean(axis=0)).std(axis=0), 1e-300)
-    # A computed record without any noise repeats only to rounding.
+    # A simulated record without noise repeats only up to rounding.
     variance = np.maximum(variance, (1e-9 * (rms + 1e-3 * np.abs(reference).max(axis=0))) ** 2 * y.shape[1] + 1e-300)
     T, relative = np.zeros((P, y.shape[2])), np.zeros((P, y.shape[2]))
     for p in range(P):
@@ -173,14 +173,14 @@ def compared(y: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int]:
 
 
 def unbiased(dof: int) -> float:
-    """Mean of a power by its smoothed variance is 1 / (1 - 1 / m), m = dof times lines smoothed over: F's mean."""
+    """Correction of T for the smoothed variance: F has the mean 1 / (1 - 1 / m), m = dof times lines smoothed over."""
     return 1 - 1 / (SETTINGS.smooth * dof)
 
 
 def trend(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Linear drift over periods y (R, samples, n_y): T (n_y,) of its lines by the variance left, relative size (n_y,).
+    """Linear drift over periods y (R, samples, n_y): T (n_y,) of its lines against the residual, relative size (n_y,).
 
-    T is F(L, L (R - 2)) distributed without drift; the size is from the first period to the last, free of noise.
+    Without drift, T is F(L, L (R - 2)) distributed. The size is from the first period to the last, noise subtracted.
     """
     R = len(y)
     x = np.arange(R) - (R - 1) / 2

@@ -1,4 +1,4 @@
-"""Gates that compare records with each other: repeatability at one level, dependence on the level."""
+"""Gates that compare records with each other: repeatability at one level, and level dependence."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 @dataclass(frozen=True)
 class ComparisonSettings:
     """common : cosine of the angle between directions of the voltages above which they count as common to two records:
-        1.4 mrad, more than rounding the voltages to four digits turns them.
+        1.4 mrad, more than the rotation caused by rounding the voltages to four digits.
     excited : power of u at a line relative to the median of the driven lines, below which the line counts as the edge
         of the band: u and y are small there, and leakage into them differs from record to record.
-    told : ratio of T to its limit above which the message says "far more than noise explains" instead of the number.
-    notable, large : difference relative to the response that is worth a note, because gains are known to 1 % at best,
-        and one that is worth a warning.
+    told : ratio of T to its limit above which the message states "far more than noise explains" instead of the number.
+    notable, large : difference relative to the response above which it is a note, because gains are known to 1 % at
+        best, and above which it is a warning.
     blind : noise of the comparison relative to the response, above which it hides changes that matter.
-    apart : smallest ratio of two levels that are compared: closer ones show leakage and drift, not nonlinearity.
+    apart : minimum ratio of two levels that are compared: closer levels show leakage and drift, not nonlinearity.
     """
 
     common: float = 1 - 1e-6
@@ -52,7 +52,7 @@ SETTINGS = ComparisonSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Mean:
-    """Mean period after the first, u and y (samples, channels), with the variance of its windowed lines."""
+    """Mean of the periods after the first, u and y (samples, channels), with the variance of its windowed lines."""
 
     u: np.ndarray
     y: np.ndarray
@@ -62,7 +62,7 @@ class _Mean:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """mean : of a periodic record."""
+    """Data of one record; mean : for periodic records only."""
 
     record: str
     kind: str
@@ -74,9 +74,10 @@ class _Kept:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Of two records (or levels): T (n_y,) mean |difference|^2 by variance in the octave that stands out most, divided
-    by what noise alone exceeds with 1 % probability, relative (n_y,) difference there, free of noise, band_Hz (n_y, 2)
-    where that is."""
+    """Difference of two records (or levels): T (n_y,) mean |difference|^2 / variance in the most significant octave,
+    divided by its 1 % limit for noise alone; relative (n_y,) difference there, noise subtracted; band_Hz (n_y, 2) of
+    this octave.
+    """
 
     a: str
     b: str
@@ -89,16 +90,17 @@ class Difference:
 
 
 class Comparison(Gate):
-    """Records of one kind of excitation: of one level against the first of them (repeatability), and of levels at least
-    a factor 1.4 apart (level dependence; closer ones show leakage and drift rather than nonlinearity).
+    """Comparison of records with one kind of excitation: at one level, each with the first (repeatability); and of
+    levels at least a factor 1.4 apart (level dependence; closer levels show leakage and drift rather than
+    nonlinearity).
 
-    Where two records repeat one periodic u up to a factor, their mean periods are compared line by line against the
+    If two records repeat one periodic u up to a factor, their mean periods are compared line by line against the
     variance between periods (Hann-windowed, smoothed over 9 lines): T, the mean over the L lines of an octave, is
-    F(L, L (P - 1)). Otherwise their H1 estimates are, with their covariance: T = mean of d* inv(V) d over every second
-    line of an octave, F(n_u L, K L) distributed; of levels over all records of a level. 1 % is shared over octaves,
-    pairs and channels, by either gate. Of H1 from different u leakage at resonances is the largest part of V: small
-    shifts of lightly damped resonances stay hidden. What is significant but below 1 % of the response (free of noise)
-    is passed; above 5 % is a warning.
+    F(L, L (P - 1)) distributed. Otherwise their H1 estimates are compared, with the covariance V of the difference d:
+    T = mean of d* inv(V) d over every second line of an octave is F(n_u L, (K - n_u) L) distributed. Levels are
+    compared over all their records. Each gate divides 1 % among octaves, pairs and channels. With H1 from different u,
+    V is mainly leakage at resonances: small shifts of lightly damped resonances remain hidden. A significant difference
+    below 1 % of the response (noise subtracted) is accepted; above 5 % it is a warning.
     """
 
     name = "repeatability"
@@ -132,7 +134,7 @@ class Comparison(Gate):
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
-    """Sentence and records."""
+    """Sentence and records of the finding."""
     return (f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to "
             f"{percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig drifted or "
             "was changed in between; treat its parameters as uncertain by this amount, or use only one of the two."
@@ -150,7 +152,7 @@ def _nonlinear(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[
 def _judged(gate: str, differences: list[Difference], campaign: Campaign,
             said: Callable[[Difference, np.ndarray, tuple[str, ...]], tuple[str, tuple[str, ...]]], agreed: str,
             untested: str) -> list[Finding]:
-    """What stands out, or that nothing does; a note where that means little."""
+    """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
         return [Finding(gate, "ok", untested, picture=Picture(gate.capitalize(), "frequency [Hz]",
                                                               "relative difference [-]", ()))]
@@ -181,7 +183,7 @@ def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
 
 
 def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list[_Kept]]:
-    """Records of one excitation and level: leakage, and so the bias of H1, differs between kinds."""
+    """Records by excitation and level; leakage, and so the bias of H1, differs between kinds of excitation."""
     groups: dict[tuple[str, float], list[_Kept]] = {}
     for k in kept:
         if k is not None:
@@ -190,12 +192,12 @@ def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list
 
 
 def _rounded(level: float) -> float:
-    """To two digits: what scatters by a few percent in r.m.s. does not make a new level."""
+    """Level rounded to two digits: records whose r.m.s. scatters by a few per cent have the same level."""
     return float(f"{level:.2g}")
 
 
 def difference(a: _Kept, b: _Kept, level: float) -> Difference | None:
-    """Two records; None where they cannot be compared."""
+    """Difference of two records; None if they cannot be compared."""
     names = f"record {a.record}", f"record {b.record}"
     if (found := _same_input(a, b, level, names)) is not None or len(a.of.f) != len(b.of.f):
         return found
@@ -214,7 +216,7 @@ def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | Non
 
 
 def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Difference | None:
-    """Where u of b is u of a times a constant: y of b against y of a times it."""
+    """If u of b is a multiple of u of a: y of b compared with the same multiple of y of a; otherwise None."""
     first, second = a.mean, b.mean
     if first is None or second is None or first.u.shape != second.u.shape:
         return None
@@ -238,15 +240,16 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
 
 
 def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
-    """Noise of the difference by the response, r.m.s. in the octave where it is largest."""
+    """Noise of the difference relative to the response, r.m.s. in the octave where it is largest."""
     return max(
         float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f))
 
 
 def _by_band(f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int,
              level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n_y,) of the octave that stands out most: mean ratio by the limit of F(n_u L, dof L), relative excess, and its
-    ends (n_y, 2)."""
+    """(n_y,) in the most significant octave: mean ratio over the limit of F(n_u L, dof L), relative excess, ends (n_y,
+    2).
+    """
     bands = octaves(f)
     T, relative, ends = (np.zeros((ratio.shape[1], *more)) for more in ((), (), (2,)))
     for band in bands:
@@ -261,7 +264,7 @@ def _by_band(f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndar
 
 
 def _compared(first: list[Spectra], second: list[Spectra], level: float, names: tuple[str, str]) -> Difference | None:
-    """By H1 over the spectra of each; None where there are too few segments."""
+    """Difference of the H1 estimates over two sets of spectra; None if there are too few segments."""
     a, b = h1(first), h1(second)
     if a is None or b is None:
         return None
@@ -287,11 +290,11 @@ def _compared(first: list[Spectra], second: list[Spectra], level: float, names: 
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n_u, m) orthonormal basis of the directions that two records share: others cannot be compared."""
+    """(n_u, m) orthonormal basis of the directions that two records have in common; only these can be compared."""
     left, cosine, _ = np.linalg.svd(a.T @ b, full_matrices=False)
     return np.asarray(a @ left[:, cosine > SETTINGS.common])
 
 
 def beyond_chance(T: float) -> str:
-    """How far a statistic is beyond its 1 % limit, in words."""
+    """How far a statistic exceeds its 1 % limit, in words."""
     return "far more than noise explains" if SETTINGS.told < T else f"{T:.1f} times the 1 % limit of noise alone"

@@ -1,4 +1,4 @@
-"""Gates for how much of y comes from u: signal-to-noise ratio and multiple coherence, by channel and band."""
+"""Gates for the part of y that u explains: signal-to-noise ratio and multiple coherence, by channel and band."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from avis_ctrl.measurement.gates.periodicity import smoothed
 
 @dataclass(frozen=True)
 class QualitySettings:
-    """low_dB, poor_dB : signal to noise below which a band is a note, and all bands a warning [dB].
+    """low_dB, poor_dB : signal-to-noise ratio below which one band is a note, and all bands are a warning [dB].
     low_coherence : mean coherence of a band below which it is a note [1].
-    same_level : factor of the largest level within which records are taken together [1].
-    noise_factor : noise at rest over the stated one from which it is a warning [1].
+    same_level : records within this factor of the largest level are pooled [1].
+    noise_factor : ratio of the noise at rest to the stated noise above which it is a warning [1].
     """
 
     low_dB: float = 10.0
@@ -35,8 +35,9 @@ SETTINGS = QualitySettings()
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """f (n,) Hz; snr (n, n_y) signal power by noise power of one period; segment_s : of a record that is not periodic,
-    whose segments leak, 0 of a periodic one; noise_rms (n_y,) : at rest."""
+    """f (n,) Hz; snr (n, n_y) signal power / noise power of one period; segment_s : segment length of a record that is
+    not periodic (its segments leak), 0 for a periodic record; noise_rms (n_y,) : at rest.
+    """
 
     f: np.ndarray
     snr: np.ndarray | None
@@ -45,13 +46,13 @@ class _Noise:
 
 
 class SignalToNoise(Gate):
-    """Signal by noise in octave bands.
+    """Signal-to-noise ratio in octave bands.
 
-    Of a periodic record: power of the mean of the periods after the first by the variance between them, over the driven
-    lines; of others coherence / (1 - coherence) without its bias. No alarm is raised by a test: the numbers are
-    estimates with an error of less than 1 dB where a band holds 30 lines x periods. Where the sensors' noise is known,
-    records at rest are compared with it above half the Nyquist frequency: chance has no part, the degrees of freedom
-    are thousands.
+    For a periodic record: power of the mean of the periods after the first over the variance between them, on the
+    driven lines; otherwise coherence / (1 - coherence) with its bias removed. There is no statistical test: the numbers
+    are estimates with an error of less than 1 dB if a band contains 30 lines x periods. If the sensor noise is known,
+    records at rest are compared with it above half the Nyquist frequency; the random error is negligible with thousands
+    of degrees of freedom.
     """
 
     name = "signal to noise"
@@ -119,7 +120,7 @@ class SignalToNoise(Gate):
 
 @dataclass(frozen=True, eq=False)
 class _Coherence:
-    """u (samples, n_u), y (samples, n_y) of a driven record; wrap: of one period."""
+    """u (samples, n_u), y (samples, n_y) of a driven record; wrap: they are one period."""
 
     level: float
     rate: float
@@ -131,12 +132,12 @@ class _Coherence:
 class Coherence(Gate):
     """Multiple coherence of each channel with all inputs, over the driven records near the largest level.
 
-    Records near the largest level count together, which leaves long segments; the lowest frequency is that of the
-    second line of a segment, and the sentence says so where the voltage begins lower. Estimates are freed of their
-    bias, gamma^2 - (1 - gamma^2) n_u / (K - n_u), and averaged over thirds of octaves: what is drawn is what is judged.
-    A channel that is low in all bands by more than chance (normal approximation of the mean, 1 % shared over bands and
-    channels) is a warning. Segments leak where a mode decays longer than they last, which lowers the coherence there
-    without any fault; the sentence states their length.
+    Records near the largest level are pooled, which allows long segments. The lowest frequency is that of the second
+    line of a segment; if the voltage begins lower, the message states this. The bias of the estimates is removed,
+    gamma^2 - (1 - gamma^2) n_u / (K - n_u), and they are averaged over third-octave bands: the plotted values are those
+    that are tested. A channel that is significantly low in all bands (normal approximation of the mean, 1 % divided
+    among bands and channels) is a warning. If a mode rings longer than the segments, leakage lowers the coherence there
+    without any fault; the message states the length of the segments.
     """
 
     name = "coherence"
@@ -184,7 +185,7 @@ class Coherence(Gate):
 
     def _low(self, names: tuple[str, ...], group: list[int], middle: np.ndarray, mean: np.ndarray, surely: bool,
              seconds: float, below: str, picture: Picture) -> Finding:
-        """One channel that is low everywhere, or all those that are low somewhere."""
+        """Finding on one channel that is low everywhere, or on all channels that are low somewhere."""
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
@@ -204,13 +205,13 @@ class Coherence(Gate):
 
 
 def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
-    """H1 over records, of the longest segments that leave enough of them, and their length in s."""
+    """H1 over records, with the longest segments that are numerous enough, and their length in s."""
     if not chosen:
         return None, 0.0
     n_u = int(np.count_nonzero(np.max([np.ptp(k.u, axis=0) for k in chosen], axis=0)))
     shortest, samples = min(len(k.u) for k in chosen), sum(len(k.u) for k in chosen)
     length = 1 << int(np.log2(max(16, shortest)))
-    # Segments as long as leaves enough of them: twice the inputs and some.
+    # The longest segments that are numerous enough: twice the number of inputs plus 8.
     rate = chosen[0].rate
     while length >= 16:
         enough = 2 * samples / length >= 2 * n_u + 8
@@ -221,7 +222,7 @@ def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
 
 
 def _lowest_driven(chosen: list[_Coherence]) -> float:
-    """Hz: the lowest line of the whole record at which some voltage has a thousandth of its largest power."""
+    """Lowest frequency [Hz] of the whole records at which the voltages have a thousandth of their largest power."""
     lowest = []
     for k in chosen:
         power = np.sum(np.abs(np.fft.rfft(k.u - k.u.mean(axis=0), axis=0)) ** 2, axis=1)
@@ -230,7 +231,7 @@ def _lowest_driven(chosen: list[_Coherence]) -> float:
 
 
 def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
-    """Driven lines (n,) Hz, signal by noise power (n, n_y), and the length of segments [s] where they leak, else 0."""
+    """Driven lines (n,) Hz, signal power / noise power (n, n_y), and segment length [s] if segments leak, else 0."""
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), None, 0.0
     rate = seen.header.sample_rate_Hz
@@ -241,7 +242,8 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         keep[0] = False
         P = len(Y)
         noise = np.sum(np.abs(Y - Y.mean(axis=0)) ** 2, axis=0)[keep] / (P - 1)
-        # Neighbouring lines share their noise level: a mean over nine lines keeps the ratio from dividing by chance.
+        # Neighbouring lines have the same noise level: a mean over nine lines avoids division by a value that is small
+        # by chance.
         noise = smoothed(noise)
         signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
@@ -256,7 +258,7 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
 
 
 def _high_noise(seen: Excerpt) -> np.ndarray | None:
-    """(n_y,) r.m.s. of white noise with the density that the channel has above half the Nyquist frequency, at rest."""
+    """(n_y,) r.m.s. at rest of white noise with the channel's density above half the Nyquist frequency."""
     if seen.header.excitation != "rest":
         return None
     y = seen.first.y[: 1 << 16]

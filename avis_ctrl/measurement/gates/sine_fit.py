@@ -1,4 +1,4 @@
-"""A sine fitted to all channels of a record, and a second-order response fitted to a few frequencies."""
+"""Fit of a sine to all channels of a record, and of a second-order response to a few frequencies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KINDS = {0: "low-pass (displacement)", 1: "band-pass (velocity)", 2: "high-pass 
 
 @dataclass(frozen=True, eq=False)
 class SineFit:
-    """f Hz; X (channels,) complex amplitudes, u then y; rest (channels,) residual r.m.s.; samples."""
+    """f Hz; X (channels,) complex amplitudes, u before y; rest (channels,) residual r.m.s.; samples."""
 
     record: str
     f: float
@@ -25,7 +25,7 @@ class SineFit:
 
 @dataclass(frozen=True, eq=False)
 class SecondOrder:
-    """b s^k / (s^2 + 2 damping w0 s + w0^2); misfit: median relative error over the frequencies."""
+    """b s^k / (s^2 + 2 damping w0 s + w0^2); misfit : median relative error over the frequencies."""
 
     k: int
     corner_Hz: float
@@ -34,7 +34,7 @@ class SecondOrder:
 
 
 def fit_sine(record: str, x: np.ndarray, n_u: int, rate: float) -> SineFit:
-    """Amplitudes of all channels at the frequency of the strongest of the first n_u, refined by least squares."""
+    """Amplitudes of all channels at the frequency of the purest sine in the first n_u, refined by least squares."""
     n = len(x)
     t = np.arange(n) / rate
     centred = x - x.mean(axis=0)
@@ -60,7 +60,8 @@ def fit_sine(record: str, x: np.ndarray, n_u: int, rate: float) -> SineFit:
 
 
 def second_order(f: np.ndarray, H: np.ndarray) -> SecondOrder:
-    """The best of low-pass, band-pass and high-pass, by least squares of relative errors, from many corners."""
+    """The best of low-pass, band-pass and high-pass, by robust least squares of relative errors from several corners.
+    """
     s = 2j * np.pi * f
     best: SecondOrder | None = None
     for k in KINDS:
@@ -69,7 +70,7 @@ def second_order(f: np.ndarray, H: np.ndarray) -> SecondOrder:
             w0, damping = np.exp(q[0]), np.exp(q[1])
             G = s**k * w0 ** (2 - k) / (s * s + 2 * damping * w0 * s + w0 * w0)
             ratio = G / H
-            # The gain (real, of either sign) that fits best.
+            # With the best-fitting gain (real, of either sign).
             return ratio * (np.sum(ratio.real) / np.sum(np.abs(ratio) ** 2)) - 1
 
         def errors(q: np.ndarray) -> np.ndarray:

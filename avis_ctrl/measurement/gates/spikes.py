@@ -1,4 +1,4 @@
-"""Gate for spikes: single samples far outside what their neighbours lead to."""
+"""Gate for spikes: single samples far from the interpolation of their neighbours."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, times
 
-# Cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6, and what a spike of 1 leaves.
+# Departure from the cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6. These are
+# also the five departures around a spike of height 1.
 SHAPE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6
-# What a corner leaves: of a flat top, or of the signal's slope.
+# Departures around a corner of a flat top or of the signal's slope.
 CORNER = np.array([0.0, -1.0, 2.0, -1.0, 0.0])
 
 
 @dataclass(frozen=True)
 class SpikeSettings:
-    """factor : a spike over the median departure around it [1]: 13.5 standard deviations of Gaussian noise. Noise that
-        grows with the signal, as of a real laser sensor, reaches 15 times.
-    steps : a spike over the converter's step [1].
-    around : samples over which the median departure is taken.
-    left : departures left beside a spike once it is taken out, at most, by the spike [1].
+    """factor : minimum ratio of a spike to the median departure around it [1]: 13.5 standard deviations of Gaussian
+        noise. Noise that grows with the signal, such as that of a real laser sensor, reaches 15 times.
+    steps : minimum ratio of a spike to the converter's step [1].
+    around : number of samples over which the median departure is taken.
+    left : maximum residual departure around a spike after its removal, relative to the spike [1].
     """
 
     factor: float = 20.0
@@ -36,7 +37,7 @@ SETTINGS = SpikeSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """Of one channel of a record: spikes, the largest one's sample, time s, value, what its neighbours lead to."""
+    """Spikes in one channel of a record: number; sample, time [s], value and interpolated value of the largest."""
 
     record: str
     channel: str
@@ -53,11 +54,11 @@ class _Kept:
 class Spikes(Gate):
     """Single samples away from the cubic through their four neighbours.
 
-    The departure is compared with the median departure around, so that quiet and loud stretches are judged alike;
-    chance never reaches the limit (1e-40 for each sample). A smooth signal leaves a small departure, one with power up
-    to the Nyquist frequency a large one: the message states the least spike that would be found. Neighbours must fit
-    the cubic once the sample is taken out, and better than a corner does, as of a flat top; steps, lost samples and
-    runs of two or more are for other gates. The outer four samples of a piece are not judged.
+    The departure is compared with the median departure around it, so that quiet and loud parts are treated alike; noise
+    alone never reaches the limit (1e-40 for each sample). Departures are small for a smooth signal and large for a
+    signal with power up to the Nyquist frequency: the message states the smallest spike that would be found. A single
+    spike must explain the departures around it, and better than a corner, such as that of a flat top; steps, lost
+    samples and runs of two or more are left to other gates. The outer four samples of a piece are not tested.
     """
 
     name = "spikes"
@@ -105,7 +106,7 @@ class Spikes(Gate):
 
 
 def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Samples (m,) that are spikes, their departure by the median one around (m,), and that median (blocks,)."""
+    """Indices (m,) of spikes, ratios (m,) of their departure to the median around, and this median (blocks,)."""
     if len(x) < 16 or np.ptp(x) == 0:
         return np.zeros(0, int), np.zeros(0), np.zeros(0)
     r = np.concatenate([np.zeros(2), departure(x), np.zeros(2)])
@@ -115,7 +116,7 @@ def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndar
     floor = SETTINGS.steps * lsb / SETTINGS.factor + 1e-12 * float(np.max(np.abs(x)))
     blocks = np.array_split(np.abs(r), max(1, len(r) // SETTINGS.around))
     spread = np.maximum([np.median(block) for block in blocks], floor)
-    # A stretch that has just become loud is judged by itself and by its neighbours.
+    # A part that has just become loud is compared with the largest median of itself and its neighbours.
     wide = np.max([spread, np.append(spread[1:], 0), np.append(0, spread[:-1])], axis=0)
     ratio = np.abs(r) / np.repeat(wide, [len(block) for block in blocks])
     near = np.flatnonzero(ratio > SETTINGS.factor)
@@ -130,18 +131,18 @@ def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndar
 
 
 def jump_corner(here: np.ndarray) -> float:
-    """Sum of squares that the best corner leaves of five departures: at the middle sample or between it and another."""
+    """Residual sum of squares of five departures, less the best corner at the middle sample or next to it."""
     trials = [np.column_stack([CORNER, np.roll(CORNER, shift)]) for shift in (-1, 1)]
     sums = []
     for A in trials:
         c = np.linalg.lstsq(A, here, rcond=None)[0]
-        if c[0] * c[1] < 0:  # opposite corners are no corner
+        if c[0] * c[1] < 0:  # corners of opposite sign are not one corner
             c = np.array([CORNER @ here / (CORNER @ CORNER), 0.0])
         sums.append(float(np.sum((here - A @ c) ** 2)))
     return min(sums)
 
 
 def departure(x: np.ndarray) -> np.ndarray:
-    """(n - 4,) of each sample from the cubic through its two neighbours on either side."""
+    """(n - 4,) difference of each sample from the cubic through its two neighbours on either side."""
     return np.convolve(x, SHAPE, "valid")
 

@@ -2,7 +2,7 @@
 
     x = Re(X exp(j w t)) + mean,     H = X_channel / X_drive
 
-Over the frequencies H is smooth, and each kind of channel has its own shape: a drive is proportional to the other
+H is a smooth function of frequency, and each kind of channel has its own shape: a drive is proportional to the other
 drives, a sensor on a mass-spring system follows b s^k / (s^2 + 2 zeta w0 s + w0^2).
 """
 
@@ -21,13 +21,13 @@ from avis_ctrl.measurement.gates.sine_fit import KINDS, SineFit, fit_sine, secon
 
 @dataclass(frozen=True)
 class SteppedSineSettings:
-    """residual, residual_factor : a residual is off above this part of the sine and so many times the median of its
-        neighbours, two on either side [1].
-    ratio, ratio_factor : a ratio is off where it leaves the line between its neighbours by this part, and by so many
-        times the median departure [1].
+    """residual, residual_factor : a residual is too large above this fraction of the sine and this many times the
+        median of its neighbours, two on either side [1].
+    ratio, ratio_factor : a ratio is off if it differs from the line between its neighbours by this fraction and by this
+        many times the median departure [1].
     constant : relative spread below which a channel's ratio is constant [1].
-    second_order : misfit below which it is of second order [1].
-    fewest : records.
+    second_order : misfit below which a ratio is of second order [1].
+    fewest : minimum number of records.
     """
 
     residual: float = 0.1
@@ -43,14 +43,14 @@ SETTINGS = SteppedSineSettings()
 
 
 class SteppedSine(Gate):
-    """Records and labels of a stepped-sine campaign.
+    """Bad records and wrong labels of a stepped-sine campaign.
 
-    A record is bad where a channel's residual after the sine exceeds 10 % of the sine and 4 times the median of its
-    neighbours' in frequency, or where |H| leaves the straight line (in logarithms) between its neighbours by 15 % and
-    by 6 times the median departure of that channel. A recorded drive whose ratio to another drive is not constant but
-    follows a second-order response is a sensor's output. Channels without the sine are for the dead-channel gate. These
-    are limits of engineering, not tests: records are few, and residuals are distortion rather than noise, so that no
-    false-alarm rate is claimed.
+    A record is bad if a channel's residual after the sine exceeds 10 % of the sine and 4 times the median of its
+    neighbours in frequency. It is also bad if the residual exceeds twice this median, and |H| departs from the straight
+    line (in logarithms) between its neighbours by 15 % and by 6 times the median departure of the channel. A recorded
+    drive whose ratio to another drive is not constant but follows a second-order response is a sensor's output.
+    Channels without the sine are left to the dead-channel gate. These are engineering limits, not statistical tests:
+    the records are few, and residuals are distortion rather than noise, so no false-alarm rate is claimed.
     """
 
     name = "stepped sine"
@@ -115,7 +115,7 @@ class SteppedSine(Gate):
                 around = [i for i in range(max(0, k - 2), min(len(f), k + 3)) if i != k]
                 near = float(np.median(rest[around, j]))
                 noisy = rest[k, j] > max(SETTINGS.residual, SETTINGS.residual_factor * near)
-                # A bad neighbour makes its neighbours depart too: the largest departure around counts.
+                # A bad record makes its neighbours depart too: only the largest departure around counts.
                 astray = abs(off[k]) > max(SETTINGS.ratio, SETTINGS.ratio_factor * usual) and abs(off[k]) >= np.max(
                     np.abs(off[max(0, k - 1) : k + 2]))
                 if not noisy and not (astray and rest[k, j] > 2 * near):
@@ -133,13 +133,13 @@ class SteppedSine(Gate):
 
 
 def _drive(rest: np.ndarray, live: list[int], n_u: int) -> int:
-    """The recorded drive that is the cleanest sine."""
+    """Index of the recorded drive that is the purest sine."""
     among = [j for j in live if j < n_u] or live
     return min(among, key=lambda j: float(np.median(rest[:, j])))
 
 
 def _departure(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(n,) of each point from the straight line between its neighbours; 0 at the ends."""
+    """(n,) difference of each point from the straight line between its neighbours; 0 at the ends."""
     d = np.zeros(len(x))
     share = (x[1:-1] - x[:-2]) / (x[2:] - x[:-2])
     d[1:-1] = y[1:-1] - (y[:-2] + share * (y[2:] - y[:-2]))

@@ -1,1 +1,1 @@
-"""The report of `avis gap`: its content, one file a section."""
+"""Report of `avis gap` (disagreement of simulation and measurement), one module per section."""

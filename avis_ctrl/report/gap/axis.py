@@ -1,4 +1,4 @@
-"""What the report of `avis gap-axis` says."""
+"""Contents of the report of `avis gap-axis`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avis_ctrl.report.sections.provenance import document_of, provenance_table
 
 
 def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Document:
-    """The report of a gap of one axis; source : name of the measurement."""
+    """The report of the gap of a single-axis model. source : name of the measurement."""
     told = {"seconds": round(gap.seconds, 2), **provenance}
     return document_of(
         f"Gap between a model of one axis and its measurement: {gap.kind}", f"Measurement: {source}", told,

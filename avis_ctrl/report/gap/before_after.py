@@ -1,4 +1,4 @@
-"""The gap before and after: residual over noise, frequency responses, and the stages."""
+"""The gap before and after adding effects: residual over noise, frequency responses, and the stages."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
 PAIRS = 3
-# Of a row of a stage's name under its bar, so that four stand beside each other on a phone.
+# Letters per row of a stage's name under its bar, so that four names fit side by side on a phone.
 LETTERS = 13
 
 
 def before_after(found: GapFinding) -> Section:
-    """Number and picture, on held-out data, and measured responses with both models over them."""
+    """Errors on held-out data as figures and numbers, and measured responses compared with both models."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.heat is not None and gap.heat.before.size:
@@ -35,7 +35,7 @@ def before_after(found: GapFinding) -> Section:
 
 
 def spectrum(heat: HeatMap, named: bool) -> Figure:
-    """Residual power over noise power by frequency: mean of all channels, and the worst one."""
+    """Residual power over noise power by frequency: mean of all channels, and worst channel."""
     edges = edges_of(heat)
     sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
     panels = []
@@ -50,7 +50,7 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
 
 
 def edges_of(heat: HeatMap) -> np.ndarray:
-    """(n_bands + 1,) Hz; a first band from zero begins at half of its end, for the axis is logarithmic."""
+    """Band edges (n_bands + 1,) [Hz] for a logarithmic axis: a first edge of zero becomes half the second one."""
     edges = np.asarray(heat.bands_Hz, float)
     return np.append(edges[1] / 2, edges[1:]) if edges[0] <= 0 else edges
 
@@ -67,7 +67,7 @@ def _worst(values: np.ndarray) -> np.ndarray:
 
 
 def ladder(gap: Gap) -> Figure:
-    """Error of each stage as a bar, with the line of what noise alone would leave."""
+    """Error of each stage as a bar, and the error due to noise alone as a line."""
     values = np.array([100 * one.nrmse for one in gap.stages])
     place, axis = places([textwrap.fill(rung(one.name, k), LETTERS) for k, one in enumerate(gap.stages)])
     noise = 100 * gap.noise_nrmse
@@ -84,7 +84,7 @@ def ladder(gap: Gap) -> Figure:
 
 
 def rung(name: str, k: int) -> str:
-    """A stage's name under its bar."""
+    """Name of a stage under its bar; an added effect has a plus."""
     return name if name in ("nominal", "re-identified") or k == 0 else f"+ {wording.titled(name)}"
 
 
@@ -103,7 +103,7 @@ def _stages(gap: Gap) -> Table:
 
 
 def responses(seen: GapOverlay, named: bool) -> list[Piece]:
-    """The pairs of input and output that disagree most, and in words what is drawn."""
+    """Description and figure of the input-output pairs that disagree most."""
     pairs, who = worst_pairs(seen), "updated" if named else "re-identified"
     text = (f"Frequency responses from records {', '.join(seen.records)}, some of which were fitted. Points: "
             f"{seen.method}. Shown are the {len(pairs)} paths on which the re-identified model is furthest off, in "
@@ -131,7 +131,7 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
 
 
 def worst_pairs(seen: GapOverlay) -> list[tuple[int, int]]:
-    """(output, input) by mean squared distance of the re-identified model in standard deviations, the worst first."""
+    """The worst outputs, each with its worst input, by mean squared error of the re-identified model over variance."""
     with np.errstate(divide="ignore", invalid="ignore"):
         far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std ** 2
     size = np.mean(np.where(np.isfinite(far), far, 0.0), axis=0)

@@ -8,12 +8,12 @@ from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, table
 from avis_ctrl.study.gap import GapFinding
 
 FIRST = 12
-# Parameters of a candidate that a row has room for.
+# Maximum number of a candidate's parameters in a row.
 MOST = 4
 
 
 def candidates(found: GapFinding) -> Section:
-    """Candidates that were refitted, the most probable first."""
+    """Candidates that were fitted but not named, the most probable first."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
         return Section("Rejected candidates", "considered", (Paragraph(_none(found)),))

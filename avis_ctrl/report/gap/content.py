@@ -1,4 +1,4 @@
-"""What the report of a gap says, once for all renderers."""
+"""Contents of the gap report, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from avis_ctrl.study.gap import GapFinding
 
 
 def measurement(found: GapFinding) -> Section:
-    """The records, and how they were divided."""
+    """The records, and their division into fitted and held-out ones."""
     use = {one.name: "held out" if one.held_out else "fitted" for one in found.gap.records}
     how = found.gap.held_out.rstrip(".")
     return Section("Measurement", "measurement", (records(found.measured, use, f"Held out: {how}" if how else ""),

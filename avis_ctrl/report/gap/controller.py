@@ -1,4 +1,4 @@
-"""What the named effects do to the controller."""
+"""Influence of the named effects on the controller."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def controller(found: GapFinding) -> Section | None:
-    """The previous controller on both models beside a new one; None where no design was asked for."""
+    """The previous controller with both models, and a new one; None if no design was requested."""
     effect = found.design
     if effect is None:
         return None
@@ -35,7 +35,7 @@ def controller(found: GapFinding) -> Section | None:
 
 
 def loops(effect: DesignEffect) -> list[tuple[str, str, LoopFigures]]:
-    """Controller, model and figures of the loops that were computed."""
+    """Controller, model and results of the loops that were computed."""
     every = (("previous", "re-identified", effect.before), ("previous", "updated", effect.after),
              ("new", "updated", effect.new))
     return [(who, model, one) for who, model, one in every if one is not None]
@@ -52,7 +52,7 @@ def _yes(stable: bool) -> Mark:
 
 
 def _bounds(effect: DesignEffect) -> Figure:
-    """mu of each loop as a bar; none where the loop is not stable."""
+    """Upper bound of mu of each loop as a bar; an unstable loop has no bar."""
     drawn = loops(effect)
     mu = np.array([one.mu_upper for _, _, one in drawn])
     place, axis = places([f"{who} on\n{model}" for who, model, _ in drawn])

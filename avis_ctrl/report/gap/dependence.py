@@ -1,4 +1,4 @@
-"""Dependence on level and time, and coherence."""
+"""Dependence of the residual on level and time, and coherence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avis_ctrl.study.gap import GapFinding
 
 @dataclass(frozen=True)
 class DependenceSettings:
-    """least_drawn : fraction of the power below which nothing is drawn [1]: -90 dB."""
+    """least_drawn : smallest fraction of the power that is drawn [1], -90 dB."""
 
     least_drawn: float = 1e-9
 
@@ -42,7 +42,7 @@ HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the dr
 
 
 def dependence(found: GapFinding) -> Section:
-    """The residual of each record by level and by time, and fractions of power."""
+    """The residual of each record by level and by time, and the decomposition of the power of the outputs."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.records:
@@ -57,7 +57,7 @@ def dependence(found: GapFinding) -> Section:
 
 
 def by_record(gap: Gap) -> Figure:
-    """Residual over noise of every record, by level and by time; held-out records filled."""
+    """Residual over noise of every record, by level and by time; filled markers for held-out records."""
     panels = (_panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
               _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s))
     return Figure("gap_records", "Residual of each record, relative to the noise. Filled: held-out records; open: "
@@ -93,7 +93,7 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
 
 
 def coherence(shares: tuple[PowerShares, ...]) -> list[Piece]:
-    """The highest level as figure and table; the lowest one folded."""
+    """Decomposition of the power at the highest level as figure and table, and at the lowest level in a fold."""
     lowest, top = shares[0], shares[-1]
     pieces: list[Piece] = [Paragraph(_explained(top)), figure(top, "gap_coherence"), _whole(top)]
     if len(shares) > 1:
@@ -112,7 +112,7 @@ def _explained(one: PowerShares) -> str:
 
 
 def figure(one: PowerShares, name: str) -> Figure:
-    """A panel for each output, fractions on a logarithmic axis."""
+    """One panel per output, with fractions of its power on a logarithmic axis."""
     edges = np.asarray(one.bands_Hz, float)
     positive = np.concatenate([np.ravel(v) for v in one.shares.values()])
     positive = positive[np.isfinite(positive) & (positive > SETTINGS.least_drawn)]
@@ -134,7 +134,7 @@ def _drawn(share: np.ndarray) -> np.ndarray:
 
 
 def _whole(one: PowerShares) -> Table:
-    """Fractions of the power of all bands together."""
+    """Fractions of the power over all bands together."""
     keys = [key for key in LOOKS if key in one.whole]
     rows = [(output, *(words.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
             for k, output in enumerate(one.outputs)]

@@ -1,4 +1,4 @@
-"""The named effects with their parameters, and what became of the rig's own."""
+"""Parameters of the named effects, and of the rig with and without the effects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avis_ctrl.study.gap import GapFinding
 
 
 def parameters(found: GapFinding) -> Section:
-    """Sizes with standard deviations, how each effect was confirmed, and the rig's parameters with and without."""
+    """Sizes with standard deviations, confirmation of each effect, and the rig's parameters with and without them."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.effects or gap.traces:
@@ -47,7 +47,7 @@ def _sizes(gap: Gap) -> Table:
 
 
 def _told(one: NamedEffect) -> str:
-    """What the effect is, what it looks like, and what confirmed it."""
+    """Description of an effect: what it is, its influence on the responses, and its confirmation."""
     effect = wording.known(one.name)
     text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."
     if effect is not None:
@@ -85,7 +85,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
 
 
 def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
-    """Parameters that no record determines one by one."""
+    """Parameters that no record determines individually."""
     if not groups:
         return []
     told = "; ".join(words.joined(list(group)) for group in groups)
@@ -94,7 +94,7 @@ def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
 
 
 def _always(gap: Gap) -> list[Piece]:
-    """Second-order terms that every model holds, which are no effect."""
+    """Second-order terms of large rotations, which are part of every model and not an effect."""
     own = [(name, value) for name, value in zip(gap.updated.names, gap.updated.values, strict=True)
            if name.startswith(f"{LargeMotion.name}@")]
     if not own:
@@ -111,7 +111,7 @@ def _always(gap: Gap) -> list[Piece]:
 
 
 def _deviations(gap: Gap) -> dict[str, float]:
-    """Standard deviations of the updated model's parameters, those that are known."""
+    """Known standard deviations of the updated model's parameters, by name."""
     names = gap.updated.names
     if gap.covariance is None or gap.covariance.shape != (len(names), len(names)):
         return {}

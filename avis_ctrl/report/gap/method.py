@@ -1,4 +1,4 @@
-"""How the figures of a gap were computed, and where it is written down."""
+"""Methods by which a gap is analysed, and their sources."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SOURCES = (
 
 
 def method(gap: Gap) -> Section:
-    """Short account of the method with its formulas."""
+    """Summary of the method with its formulas."""
     pieces: list[Piece] = [
         Paragraph("Model of a record. On line k, with spectra Y of the outputs and U of drives and floor:"),
         Formula("Y_k = G(omega_k, theta, t, a) U_k + T_k x + (E circle.small G) U_k + n_k",

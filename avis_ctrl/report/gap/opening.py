@@ -1,4 +1,4 @@
-"""The page that is read alone: one sentence, what it rests on, and the named effects in one table."""
+"""Summary page: the verdict in one sentence, the numbers behind it, and a table of the named effects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from avis_ctrl.report.gap.remaining import next_step
 from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
 
-# Parameters of an effect that a row has room for; all of them stand in the section on parameters.
+# Maximum number of an effect's parameters in a row; the section on parameters lists all.
 MOST = 5
 CHANCES = (" The probability takes into account the other candidates, the tolerances, and causes outside the library; "
            "for hum, a converter and floor motion it is one minus the p-value of the signal. No probability above 99 % "
@@ -46,7 +46,7 @@ def opening(found: GapFinding) -> Section:
 
 
 def sentence(gap: Gap) -> str:
-    """The finder's own first sentence; of the effects where it has none."""
+    """First sentence of the finder, or a sentence on the effects if there is none."""
     if gap.sentences:
         return wording.said(gap.sentences[0])
     if not gap.effects:
@@ -57,7 +57,7 @@ def sentence(gap: Gap) -> str:
 
 
 def in_numbers(gap: Gap) -> str:
-    """The gap before and after on held-out data, beside that of noise alone."""
+    """Error of each stage on held-out data, compared with that of noise alone."""
     if not gap.stages:
         return ""
     told = [f"{words.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
@@ -91,7 +91,7 @@ def _stage(name: str) -> str:
 
 
 def named(gap: Gap | AxisGap, remark: str) -> Table:
-    """The named effects with their sizes; traces last. remark : on their probabilities."""
+    """The named effects with their sizes, traces (very small effects) last. remark : on their probabilities."""
     rows = [(f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}", one.location,
              wording.quantities(one.parameters, MOST), words.percent(np.nan if one.share is None else one.share),
              wording.probability(one.probability),

@@ -1,4 +1,4 @@
-"""Where model and measurement disagree: a map of channel and frequency, and the places that stand out."""
+"""Where model and measurement disagree: a map of channels and frequencies, and a table of the main places."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from avis_ctrl.report.gap.before_after import edges_of
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
 
-# Colours begin at half of the noise's power and end at ten times it or more.
+# The colour scale runs from half the noise power to at least ten times the noise power.
 LOWEST, LEAST_TOP = 0.5, 10.0
 LETTERS = 20
 
 
 def places(found: GapFinding) -> Section:
-    """Heat map before and after, and the table of places before naming."""
+    """Heat map before and after adding effects, and table of the places before."""
     gap = found.gap
     pieces: list[Piece] = []
     if gap.heat is not None and gap.heat.before.size:
@@ -42,7 +42,7 @@ def _nowhere(gap: Gap) -> str:
 
 
 def heat_map(heat: HeatMap, named: bool) -> Figure:
-    """Channels over frequency, re-identified and updated, on one colour scale."""
+    """Residual by channel and frequency of the re-identified and the updated model, on one colour scale."""
     known = np.concatenate([heat.before.ravel(), heat.after.ravel()])
     known = known[np.isfinite(known) & (known > 0)]
     top = float(10 ** np.ceil(np.log10(max(LEAST_TOP, known.max(initial=LEAST_TOP))) - 1e-9))
@@ -58,12 +58,12 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
 
 
 def _short(name: str) -> str:
-    """As many letters as fit beside a map."""
+    """A name shortened to fit beside a map."""
     return name if len(name) <= LETTERS else f"{name[:LETTERS - 1]}…"
 
 
 def table_of(listed: Sequence[Where], caption: str) -> Table:
-    """Bands and paths with their fraction of the excess over noise."""
+    """Table of bands and paths with their fraction of the residual power beyond noise."""
     rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value))
             for one in listed]
     return table(f"{caption}Fraction: of the power beyond noise. Over noise: power of the residual relative to "

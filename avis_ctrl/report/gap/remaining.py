@@ -25,7 +25,7 @@ def remaining(found: GapFinding) -> Section:
 
 
 def detectable(gap: Gap) -> Table:
-    """The size at which each effect would differ from zero by five standard deviations; its best and worst place."""
+    """Size at which each effect would differ from zero by five standard deviations, at its best and worst place."""
     groups: dict[tuple[str, str, str], list[Detectable]] = {}
     for one in gap.detectable:
         groups.setdefault((one.name, one.parameter, one.unit), []).append(one)
@@ -49,7 +49,7 @@ def _seen(one: Detectable) -> str:
 
 
 def _left(gap: Gap) -> str:
-    """How much remains, beside what, and how it grows."""
+    """Size of the residual relative to response and noise, and its growth with level."""
     if gap.raised:
         return (f"The held-out residual is the measured noise. That of {words.joined(list(gap.raised))} is above the "
                 "rig file's ambient level.")
@@ -68,7 +68,7 @@ def _left(gap: Gap) -> str:
 
 
 def next_step(found: GapFinding) -> str:
-    """The experiment that would tell more, or that none is needed."""
+    """The most informative next experiment, or a statement that none is needed or none was found."""
     gap = found.gap
     if gap.next_experiment:
         return wording.said(gap.next_experiment)

@@ -1,4 +1,4 @@
-"""Words for verdicts, effects, parameters and ratios, the same in every section."""
+"""Wording of verdicts, effects and parameters, the same in every section."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLAIMS = {
                    "of the library that meets all conditions for a name explains the difference. The updated model has "
                    "tolerances only.",
 }
-# What it claims where the noise of some sensors is all that has no name.
+# The claim if only the increased noise of some sensors is unexplained.
 RAISED = ("Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "
           "name for that. As a whole, the residual of the model{with_effects} on the held-out data is the measured "
           "noise.")
@@ -42,23 +42,23 @@ def claim(gap: Gap) -> str:
 
 
 def titled(name: str) -> str:
-    """An effect's name as read."""
+    """Name of an effect in text."""
     return name.replace("_", " ")
 
 
 def known(name: str) -> Effect | None:
-    """The effect of the library, None for one that acts on the signals alone."""
+    """The effect of this name in the library; None for an effect that acts only on the signals."""
     return library().get(name)
 
 
 def what_it_is(effect: NamedEffect) -> str:
-    """The effect's title in words."""
+    """Title of an effect."""
     listed = known(effect.name)
     return effect.title or (listed.title if listed else titled(effect.name))
 
 
 def probability(value: float) -> str:
-    """A probability in per cent; certainty is never stated."""
+    """A probability in per cent, never 0 or 100."""
     if not np.isfinite(value):
         return "not computed"
     if value > 0.999:
@@ -67,7 +67,7 @@ def probability(value: float) -> str:
 
 
 def quantity(one: Reported) -> str:
-    """value ± standard deviation unit."""
+    """A value with its standard deviation and unit."""
     size, std, unit = with_prefix(one.value, one.std, one.unit)
     value, sigma = words.with_std(size, std)
     unit = "" if unit in ("", "1") else f" {words.unit(unit)}"
@@ -77,16 +77,16 @@ def quantity(one: Reported) -> str:
 
 
 def quantities(parameters: Mapping[str, Reported], most: int | None = None) -> str:
-    """Name = value ± std unit, of each, or of the first ones."""
+    """Parameters with name, value, standard deviation and unit; at most `most` of them."""
     told = [f"{spoken(name, one.unit)} {quantity(one)}" for name, one in parameters.items()]
     return "; ".join([*told[:most], *([f"and {len(told) - most} more"] if most and len(told) > most else [])])
 
 
 def said(text: str) -> str:
-    """A sentence of the finder as printed: begins large, ends in a stop, with signs instead of their typed form."""
+    """A sentence of the finder as printed: capital first letter, full stop at the end, ± in place of +-."""
     text = text.replace(" +- ", " ± ").strip()
     first = text.partition(" ")[0].rstrip(":;,.")
-    # An effect's name is written as it is.
+    # The name of an effect is not capitalised.
     text = text if "_" in first else text[:1].upper() + text[1:]
     return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
@@ -98,5 +98,5 @@ def place(one: Where) -> str:
 
 
 def candidate(one: Considered) -> str:
-    """Name and place; a pair's names are written with a plus."""
+    """Name and place of a candidate."""
     return f"{titled(one.name)} ({one.location})" if one.location else titled(one.name)

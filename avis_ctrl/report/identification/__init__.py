@@ -1,1 +1,1 @@
-"""The identification report: its content, one file a section."""
+"""Identification report, one module per section."""

@@ -1,4 +1,4 @@
-"""The estimates of different methods beside each other, and what the Kalman filter's tuning hides."""
+"""Comparison of the estimates of different methods, and the influence of the Kalman filter's tuning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TITLE = "Comparison of identification methods"
 
 
 def ways(found: Identification) -> Section:
-    """Maximum likelihood, the extended Kalman filter where it ran, and the sequential fit."""
+    """Maximum likelihood, the extended Kalman filter if it was run, and the sequential fit."""
     result = found.kalman
     if result is None:
         note = found.kalman_note or "the extended Kalman filter was not run"
@@ -38,7 +38,7 @@ def _sequential(found: Identification) -> Paragraph:
 
 
 def _differences(found: Identification, result: EkfResult) -> np.ndarray:
-    """(combinations, 5): both values, both standard deviations, and the difference over the root of their squares."""
+    """(combinations, 5): value, std (likelihood), value, std (Kalman), and the difference in standard deviations."""
     information, order = found.information, list(result.names)
     rows = []
     for one in found.identifiability.combinations:
@@ -94,7 +94,7 @@ def _figure(found: Identification, result: EkfResult, title: str, index: list[in
     for k in index:
         name = result.names[k]
         likely = float(information.values[information.names.index(name)])
-        # The prior's band, at the first point, would hide what the data say.
+        # The wide band of the prior at the first point would hide the estimates.
         low = float(np.min(curves.lower[1:, k], initial=likely))
         high = float(np.max(curves.upper[1:, k], initial=likely))
         pad = 0.05 * (high - low) or 1.0
@@ -117,7 +117,7 @@ def _figure(found: Identification, result: EkfResult, title: str, index: list[in
 
 
 def _names(found: Identification, result: EkfResult) -> list[str]:
-    """Records in the order of the innovations."""
+    """Names of the records in the order of the innovations."""
     records = [r.header.name for r in found.split.fitted.records] if found.split else []
     count = len(result.innovations)
     return records if len(records) == count else [str(k + 1) for k in range(count)]

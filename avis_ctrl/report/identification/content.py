@@ -1,4 +1,4 @@
-"""What the identification report says, once for all renderers."""
+"""Contents of the identification report, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from avis_ctrl.study.identified_uncertainty import InDesign
 
 
 def document(found: Identification, in_design: InDesign | None = None) -> Document:
-    """The report of an identification; in_design : what a design makes of it, where that was computed."""
+    """The report of an identification. in_design : the uncertainty model for a design, if it was computed."""
     return document_of(
         f"Identification of the rig {found.rig.name}", "From measurements to a rig with known uncertainty",
         found.provenance, (opening(found), parameters(found), measurements(found), gates(found.findings),

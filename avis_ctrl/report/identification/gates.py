@@ -1,4 +1,4 @@
-"""What the gates say of the records: what warns first, what is well in small."""
+"""Results of the gates (automatic data checks): warnings first, passed checks in small figures."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
 
 @dataclass(frozen=True)
 class GateFigureSettings:
-    """together : panels of a figure: three rows of two fill a page. letters : that fit beside each other under a panel
-    of half the width, in the legend's size.
+    """together : panels per figure; three rows of two fill a page. letters : number of letters that fit side by side
+    under a panel of half the width, at the font size of the legend.
     """
 
     together: int = 6
@@ -56,7 +56,7 @@ def gates(findings: Sequence[Finding]) -> Section:
 
 
 def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
-    """(gate, severity, text): what differs by channel only in its first sentence shares the rest."""
+    """(gate, severity, text), findings that differ only in their first sentence merged."""
     grouped: dict[tuple[str, str, str], list[str]] = {}
     for f in findings:
         first, _, rest = f.sentence.partition(". ")
@@ -66,7 +66,7 @@ def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
 
 
 def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
-    """Each picture once, with the sentences that it belongs to; those without data are left out."""
+    """Each picture once, with the sentences that refer to it; pictures without data are omitted."""
     seen: dict[tuple, tuple[Picture, list[str]]] = {}
     for finding in findings:
         p = finding.picture
@@ -78,7 +78,7 @@ def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
 
 
 def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
-    # Those with a curve for each channel share a legend; among others it would name what they do not have.
+    # Pictures with a curve per channel are kept apart: their legend would list channels that the others lack.
     many = [p for p in pictures if len(p.series) > 2]
     few = [p for p in pictures if len(p.series) <= 2]
     groups = [of[k:k + SETTINGS.together] for of in (many, few) for k in range(0, len(of), SETTINGS.together)]
@@ -88,7 +88,7 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
 
 
 def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:
-    """Pictures as panels of one figure: a name has the same look in all of them."""
+    """Pictures as panels of one figure; a name has the same style in all of them."""
     names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
     limits = list(dict.fromkeys(one.name for p in pictures for one in p.limits))
     columns = min(columns, len(pictures))
@@ -97,9 +97,9 @@ def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int
 
 
 def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int = SETTINGS.letters) -> Panel:
-    """A picture; names, limits : in the order of their styles; letters : that fit beside each other under it."""
+    """A picture as panel. names, limits : in the order of their styles. letters : that fit side by side under it."""
     curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
-    if len(picture.series) == 1:  # title and axis say what it is
+    if len(picture.series) == 1:  # title and axis label suffice
         curves = tuple(replace(curve, label="") for curve in curves)
     x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names, letters))
     panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)),
@@ -110,7 +110,7 @@ def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], lett
 
 
 def _named(names: Sequence[str], letters: int) -> tuple[tuple[float, str], ...]:
-    """Names as ticks, in as many rows as keep them from each other."""
+    """Names as tick labels, staggered over enough rows that they do not overlap."""
     rows = 1 + sum(len(name) + 1 for name in names) // letters
     return tuple((float(k), "\n" * (k % rows) + name) for k, name in enumerate(names))
 
@@ -129,7 +129,7 @@ def _curve(series: Series, style: Style) -> Curve:
 
 
 def _line(limit: Limit, panel: Panel, style: Style) -> Curve:
-    """A straight line across the data."""
+    """A limit as a straight line across the data."""
     if limit.axis == "x":
         low, high = _span(panel, "y")
         return Curve(np.array([limit.value, limit.value]), np.array([low, high]), limit.name, style)
@@ -146,7 +146,7 @@ def _span(panel: Panel, which: str) -> tuple[float, float]:
 
 
 def _framed(panel: Panel) -> Panel:
-    """A logarithmic axis of frequencies runs from its first to its last point; few whole numbers are ticks."""
+    """Ranges of the axes: a logarithmic x axis spans the data; on a linear one a few whole numbers become ticks."""
     if panel.x.scale == "log":
         low, high = _span(panel, "x")
         return replace(panel, x=replace(panel.x, range=(low / 1.1, high * 1.1)), y=_with_range(panel))

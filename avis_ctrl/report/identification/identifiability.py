@@ -11,7 +11,7 @@ from avis_ctrl.study.identification import Identification
 
 
 def identifiability(found: Identification) -> Section:
-    """Rank, the determined combinations with their standard deviations, and the rest in sentences."""
+    """Rank, the determined combinations with their standard deviations, and the others in sentences."""
     report = found.identifiability
     information = report.information
     missing = len(information.names) - report.rank

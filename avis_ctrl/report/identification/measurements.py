@@ -1,4 +1,4 @@
-"""What was measured: records, channels, and what the reader had to assume."""
+"""The measurements: records, channels, and assumptions made in reading the file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DISTORTIONS: tuple[Kind, ...] = ("even", "odd")
 
 
 def measurements(found: Identification) -> Section:
-    """Records with what each was used for."""
+    """The records and their use, channels and distortion; or the frequency responses."""
     measured = found.measured
     if isinstance(measured, FrequencyResponse):
         return Section("Measurements", "measurements", _response(measured))
@@ -36,14 +36,14 @@ def _records(found: Identification, campaign: Campaign) -> Table:
 
 
 def distortion(campaign: Campaign) -> Table | None:
-    """Even and odd distortion of the records that show it: odd multisines with detection lines."""
+    """Even and odd distortion of the multisines with detection (unexcited) lines; None if there are none."""
     rows = []
     for record in campaign.records:
         if record.header.excitation != "multisine" or record.header.periods < 2:
             continue
         try:
             levels = distortion_levels(campaign, record.header.name)
-        except InputError:  # every line is excited: nothing to detect distortion with
+        except InputError:  # every line is excited: no line to detect distortion on
             continue
         linear = levels.rms("excited")
         cells = []

@@ -1,4 +1,4 @@
-"""How the figures of an identification were computed, and where it is written down."""
+"""Methods by which an identification was computed, and their sources."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TOLERANCES = (
 
 
 def method(found: Identification) -> Section:
-    """Short account of the method with its formulas."""
+    """Summary of the method with its formulas."""
     pieces: list[Piece] = [
         Paragraph("Model. The spectra of the sensor signals follow from the rig's equations of motion with their "
                   "physical parameters theta, the hold and delay h of the drives, and the response s of the sensor "

@@ -1,4 +1,4 @@
-"""What came out, on one page; and every parameter."""
+"""Summary page of an identification, and the table of all parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TOGETHER = "only in combination"
 
 
 def opening(found: Identification) -> Section:
-    """The page that is read alone: verdict, what was measured, modes, errors, the next measurement."""
+    """Summary page: verdict, measurements, modes, errors, and the next measurement."""
     v = found.validation
     pieces: list[Piece] = [_sentence(found), _measured(found)]
     if v.modes:
@@ -29,7 +29,7 @@ def opening(found: Identification) -> Section:
 
 
 def parameters(found: Identification) -> Section:
-    """Every parameter, how far the tolerances moved, and what the deviations include."""
+    """All parameters, changes of the values with tolerances, and what the standard deviations include."""
     fit = found.campaign_fit
     notes = [*([found.caution] if fit.tolerances else []), *fit.notes]
     return Section("Parameters", "parameters", (_parameters(found), _changes(found), *tolerances(fit.tolerances),

@@ -1,4 +1,4 @@
-"""Measured frequency responses with those of the start and of the identified model over them."""
+"""Measured frequency responses compared with those of the start model and of the identified model."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from avis_ctrl.study.identification import Identification
 
 START, MODEL = Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
 OUTPUTS_TOGETHER = 3
-# Points of a measured response in the overview.
+# Maximum number of points of a response in the overview.
 MOST_SMALL = 90
 
 
 def responses(found: Identification) -> Section:
-    """The strongest input of each output in full, all pairs in small."""
+    """Large figures of the strongest input of each output, and small ones of all pairs."""
     seen = found.validation.overlay
     if seen is None:
         return Section("Frequency responses", "responses", (Paragraph(
@@ -54,7 +54,7 @@ def responses(found: Identification) -> Section:
 
 
 def strongest(seen: ResponseOverlay) -> list[tuple[int, int]]:
-    """Output and its input with the largest gain by the mean logarithm; the floor only where there is no other."""
+    """Each output with its input of largest gain (mean logarithm); floor inputs only if there are no drives."""
     with np.errstate(divide="ignore"):
         gain = np.mean(np.log(np.abs(seen.model)), axis=0)
     return [(i, max(drives(seen), key=lambda j: gain[i, j])) for i in range(len(seen.outputs))]
@@ -70,7 +70,7 @@ def _bode(seen: ResponseOverlay, pairs: list[tuple[int, int]], number: int) -> F
 def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     f, measured, model = seen.frequency_Hz, seen.measured[:, i, j], seen.model[:, i, j]
     base = np.unwrap(np.angle(model))
-    # All beside the identified model's phase: a jump of a full turn is no difference.
+    # Phases are unwrapped relative to that of the identified model.
     shown = {name: np.rad2deg(base + np.angle(value / model)) for name, value in
              (("measured", measured), ("start", seen.start[:, i, j]))}
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))

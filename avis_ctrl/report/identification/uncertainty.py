@@ -1,4 +1,4 @@
-"""What a controller design makes of the identification's uncertainty."""
+"""Uncertainty model that a controller design derives from an identification."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TITLE = "Uncertainty for design"
 
 
 def uncertainty(found: Identification, made: InDesign | None) -> Section:
-    """Directions of the parameters, and the filter over the measured spread."""
+    """Directions of the parameters, and the filter that covers the measured spread."""
     if made is None:
         return Section(TITLE, "uncertainty", (Paragraph(
             "The uncertainty model for a controller design was not computed with this report; the covariance is in "

@@ -1,4 +1,4 @@
-"""The identified model against what no fit has seen."""
+"""Validation of the identified model on held-out data."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Piece, Section, Ta
 from avis_ctrl.study.identification import Identification
 
 BEFORE, AFTER, FLOOR = Style("#e69f00"), Style("#0072b2"), Style("#7a7a7a")
-# Records drawn one by one; a long record comes in many pieces.
+# Maximum number of held-out records with individual figures; a long record is split into many pieces.
 MOST_DRAWN = 3
 
 
@@ -22,7 +22,7 @@ def validation(found: Identification) -> Section:
     pieces: list[Piece] = [Paragraph(words.sentence(v.verdict), "verdict", v.passed), _records(found)]
     drawn = v.held_out[:MOST_DRAWN]
     for one in drawn:
-        # The errors of the first one are in the summary.
+        # The errors of the first record are in the summary.
         pieces += [_chi_square(one, v.outputs), *([errors(one, v.outputs)] if one is not drawn[0] else []),
                    _nrms(one, v.outputs)]
         if one.whiteness is not None:
@@ -117,7 +117,7 @@ def modes(found: Identification) -> Table:
 
 
 def _measured_modes(found: Identification) -> list[Piece]:
-    """The identified modes beside measured ones, with standard deviations."""
+    """Identified and measured modes with standard deviations."""
     rows = found.validation.modes
     frequency = [(r.shape, _pair(r.frequency_Hz, r.frequency_std_Hz),
                   _pair(r.measured_frequency_Hz, r.measured_frequency_std_Hz), _sigma(r.frequency_sigma)) for r in rows]

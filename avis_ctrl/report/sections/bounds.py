@@ -1,4 +1,4 @@
-"""Bounds of mu over frequency, robust stability, and the worst plants in physical words."""
+"""Bounds of mu over frequency, robust stability, and the worst plants in physical terms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pick = Callable[[ControllerResult], Bound]
 
 
 def bounds(result: DesignResult) -> Section:
-    """mu of the weighted performance and of stability alone, and what reaches them."""
+    """mu of the weighted performance and of stability alone, and the perturbations that attain the lower bounds."""
     pieces: list[Piece] = [certificate(result)]
     pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu, performance", "mu of the weighted performance",
                        "Below 1 (dashed line) every weighted requirement holds for every plant of the uncertainty "
@@ -28,7 +28,7 @@ def bounds(result: DesignResult) -> Section:
 
 
 def certificate(result: DesignResult) -> Paragraph:
-    """Both bounds of mu, and whether the upper one is proved between the computed frequencies."""
+    """Both bounds of mu, and whether the upper bound is guaranteed between the computed frequencies."""
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
     between = ("The upper bound is guaranteed at every frequency, also between the computed points."
@@ -75,7 +75,7 @@ def _stability(result: DesignResult) -> Table:
 
 
 def stable_for_the_set(c: ControllerResult) -> Mark:
-    """Whether the loop is stable for every plant of the uncertainty set, as far as that is proved."""
+    """Robust stability of the loop: yes, no, or not shown if the bounds of mu do not decide."""
     if not c.stable or c.stability.lower >= 1:
         return Mark("no", False)
     return Mark("yes", True) if c.stability.upper < 1 else Mark("not shown", False)

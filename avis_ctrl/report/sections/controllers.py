@@ -35,7 +35,7 @@ def controllers(result: DesignResult) -> Section:
 
 
 def _system(c: ControllerResult) -> StateSpace:
-    assert c.K is not None  # the caller leaves the passive rig out
+    assert c.K is not None  # callers exclude the passive rig
     return c.K
 
 
@@ -54,7 +54,7 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
 
 
 def _offset(percent: float) -> str:
-    """Part of a drive's range; below a millionth it is rounding."""
+    """Fraction of a drive's range in per cent; values up to 1e-4 % are round-off, shown as zero."""
     return f"{words.number(percent if percent > 1e-4 else 0.0)} %"
 
 

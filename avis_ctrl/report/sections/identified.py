@@ -1,4 +1,4 @@
-"""What a design takes from an identification: directions of parameters, and the spread of the measured response."""
+"""Uncertainty of a design from an identification: parameter directions, and spread of the measured response."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identified_uncertainty import JUDGED_HZ, InDesign
 
-# Parameters shown for each direction.
+# Maximum number of parameters shown for each direction.
 SHOWN = 5
 
 
 def identified(result: DesignResult) -> list[Piece]:
-    """Directions, what they leave, and the spread with its weight; nothing where the design names no identification."""
+    """Directions, remaining uncertainty, and spread with its weight; empty if the design uses no identification."""
     found, content = result.plant.identified, result.design.uncertainty.identification
     if found is None or content is None:
         return []
@@ -56,7 +56,7 @@ def _percent(share: np.ndarray) -> str:
 
 
 def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str, str]) -> list[Piece]:
-    """The bounded directions with the parameters that they change most; nothing where none is bounded."""
+    """The bounded directions with the parameters that they change most; empty if no direction is bounded."""
     rows = []
     for direction, effect in zip(found.directions, found.found.effect, strict=True):
         sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal.get(one[0]) or 1.0)))
@@ -71,7 +71,7 @@ def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str
 
 
 def spread(found: InDesign) -> Figure:
-    """The measured spread of the response, its bound, and the filter above it."""
+    """The measured spread of the response, its bound, and the filter that covers it."""
     s, weight = found.spread, found.weight
     f = np.geomspace(min(JUDGED_HZ[0], s.frequency_Hz[0]), max(JUDGED_HZ[-1], s.frequency_Hz[-1]), 400)
     omega = 2 * np.pi * f

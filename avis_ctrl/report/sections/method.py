@@ -1,4 +1,4 @@
-"""How the figures were computed, and where it is written down."""
+"""Methods by which the results were computed, and their sources."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOURCES = (
 
 
 def method(result: DesignResult) -> Section:
-    """Short account of the method with its formulas."""
+    """Summary of the method with its formulas."""
     return Section("Method", "method", (
         Paragraph("Rig. The equations of motion in the payload's velocity v and its displacement r relative to the "
                   "floor, with floor velocity v_f, actuator voltages u, forces f, and matrices that depend on the "

@@ -1,4 +1,4 @@
-"""What made this report: versions, hash of the inputs, seed, time."""
+"""Provenance of a report: versions, hash of the inputs, seed, computing time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs
 
 @dataclass(frozen=True)
 class ProvenanceSettings:
-    """most_values : that a row of the table has room for; longer ones are in the JSON file."""
+    """most_values : maximum number of values in a table row; longer lists are only in the JSON file."""
 
     most_values: int = 12
 
@@ -31,7 +31,7 @@ def provenance(result: DesignResult) -> Section:
 
 
 def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
-    """What made a result."""
+    """Table of the provenance of a result."""
     rows = [(NAMES.get(key, key), _said(value))
             for key, value in made.items() if value is not None]
     return Section("Provenance", "provenance", (table(caption, ("what", "value"), rows, "ll"),))

@@ -1,4 +1,4 @@
-"""The rig: drawing, parameters, modes, drives and sensors, and what the model with few coordinates leaves out."""
+"""The rig: drawing, parameters, modes, drives and sensors, and the error of the reduced ("small") model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.study.design_result import DesignResult
 
-# By what a sensor measures: its kind, the unit of its gain, and a factor with the unit of its limit.
+# By measured quantity: kind of sensor, unit of its gain, and scale factor and unit of its limit.
 _KINDS = {"velocity": ("geophone", "V s/m", 1e3, "mm/s"), "acceleration": ("accelerometer", "V s²/m", 1.0, "m/s²"),
          "displacement": ("position sensor", "V/m", 1e3, "mm")}
 _NUMBERED = re.compile(r"(?P<group>[A-Za-z_]+)(?P<number>\d+)\.(?P<rest>.+)")
@@ -40,7 +40,7 @@ def _parameters(one: Rig) -> list[Piece]:
         if match := _NUMBERED.fullmatch(name):
             rows = grouped.setdefault(match["group"], {})
             rows.setdefault(match["rest"], {})[int(match["number"])] = p
-        elif not name.startswith("actuator."):  # the table of drives has the force constants
+        elif not name.startswith("actuator."):  # the force constants are in the table of drives
             plain.append((name, _value(p.value), words.unit(p.unit), p.description))
     found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
     for group, rows in grouped.items():
@@ -103,7 +103,7 @@ def _sensors(one: Rig) -> Table:
 
 
 def _placed(position: np.ndarray, direction: np.ndarray) -> tuple[str, str]:
-    """Place and direction; a direction along an axis by its name."""
+    """Position and direction as text; a direction along an axis is named after the axis."""
     along = int(np.argmax(np.abs(direction)))
     axis = ("−" if direction[along] < 0 else "+") + "xyz"[along]
     skewed = abs(direction[along]) < 1 - 1e-9
@@ -111,7 +111,7 @@ def _placed(position: np.ndarray, direction: np.ndarray) -> tuple[str, str]:
 
 
 def _corner(s: Sensor) -> str:
-    """Corner and damping ratio of the sensor with its filters, and of a geophone's suspension where that differs."""
+    """Corner and damping ratio of the sensor with its filters, and of a geophone's suspension if different."""
     if not s.poles:
         return "none"
     poles, side = np.array(s.poles), "high-pass" if s.zeros else "low-pass"
@@ -157,7 +157,7 @@ def _reduction(result: DesignResult) -> list[Piece]:
 
 
 def _largest(error: ReductionError) -> str:
-    """Where the design model is worst, and whether that is at an entry that matters."""
+    """Frequency and channel at which the error of the design model is largest, and its size."""
     out, name = max(error.max_dB, key=lambda channel: error.max_dB[channel])
     k, j = error.keep.index(out), error.inputs.index(name)
     place = int(np.argmax(error.relative[:, k, j]))

@@ -1,4 +1,4 @@
-"""The closed loop of the nonlinear rig, simulated: pass or fail by plant, spectrum against prediction."""
+"""Simulation of the closed loop with the nonlinear rig: verdict for each plant, spectrum against prediction."""
 
 from __future__ import annotations
 

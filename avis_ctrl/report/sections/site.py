@@ -1,4 +1,4 @@
-"""What the site's floor motion, forces on the payload and sensor noise do."""
+"""Effects of the site's floor motion, of forces on the payload and of sensor noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def site(result: DesignResult) -> Section:
 
 
 def _settled(result: DesignResult) -> list[ControllerResult]:
-    """The controllers whose nominal loop has a steady motion."""
+    """The controllers with a stable nominal loop, for which stationary motion exists."""
     return [c for c in result.controllers if c.stable]
 
 

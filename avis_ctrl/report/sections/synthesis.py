@@ -24,7 +24,7 @@ def synthesis(result: DesignResult) -> Section:
     both = np.concatenate([gamma, mu])
     both = both[np.isfinite(both) & (both > 0)]
     low, top = float(np.min(both, initial=1.0)), float(np.max(both, initial=1.0))
-    # The first gamma, before any scaling, is often a hundred times the last.
+    # The first gamma, before any scaling, is often a hundred times the final one.
     shown = Axis("gamma, mu", "log", (0.7 * low, 1.5 * top)) if top > 8 * low else \
         Axis("gamma, mu", "linear", (0.0, 1.1 * top))
     values = Panel(marked, shown, (

@@ -1,4 +1,4 @@
-"""How far each value of the rig file with a tolerance moved in a fit."""
+"""Changes, in a fit, of the values of the rig file that have a tolerance."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 
 @dataclass(frozen=True)
 class Shown:
-    """How many rows are shown, and from how many tolerances on a value counts as far from the rig file."""
+    """rows : maximum number of table rows. far : change, in tolerances, beyond which a value counts as far off."""
 
     rows: int = 10
     far: float = 3.0
 
 
 def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece]:
-    """How far the values moved: all together in a sentence, the largest movements in a table."""
+    """Changes of the values: a summary of all, and a table of the largest."""
     if not found:
         return []
     moved = np.array([one.moved for one in found])

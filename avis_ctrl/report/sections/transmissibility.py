@@ -1,4 +1,4 @@
-"""Floor to payload: nominal, sampled and worst case, and each axis alone."""
+"""Transmissibility from floor to payload: nominal, sampled plants and worst case, and each axis alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _against_skyhook(result: DesignResult) -> Table:
 
 
 def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
-    """The target of the synthesis, with its steps [dB]."""
+    """Target of the synthesis [dB], with its steps."""
     limits = result.design.transmissibility
     f = omega / (2 * np.pi)
     inside = (f >= limits.band_Hz[0]) & (f <= limits.band_Hz[1])
@@ -39,7 +39,7 @@ def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
 
 
 def left_out(result: DesignResult) -> str:
-    """Which controllers a figure of the nominal loop cannot show."""
+    """Sentence on the controllers that a figure of the nominal loop omits, because their loop is unstable."""
     unstable = [c.title for c in result.controllers if not c.stable]
     return f" Not shown, because the nominal loop is unstable: {words.joined(unstable)}." if unstable else ""
 
@@ -54,7 +54,7 @@ def _sigma(c: ControllerResult) -> Curve:
 
 
 def upper_bound(c: ControllerResult, label: str) -> Curve:
-    """Worst-case transmissibility where its bound was computed, marked: between the points it may lie higher."""
+    """Upper bound of the worst case, marked at the computed frequencies; between them it may be higher."""
     b = c.worst_peak
     order = np.argsort(b.frequencies)
     return Curve(b.frequencies[order] / (2 * np.pi), in_dB(b.upper_curve[order]), label, STYLES["plain"],
@@ -70,7 +70,7 @@ def _panel(curves: list[Curve], bands: list[Band], title: str, ranged: tuple[flo
 
 
 def summary_figure(result: DesignResult) -> Figure:
-    """The delivered controller beside the table without control, with the bound over the whole set."""
+    """The delivered controller compared with the table without control, and its bound over the whole set."""
     mu, passive = result.controller("mu"), result.controller("passive")
     curves = [*(_sigma(c) for c in (passive, mu) if c.stable), upper_bound(mu, "mu synthesis, worst case of the set"),
               _limit(result)]
@@ -89,7 +89,7 @@ def _nominal(result: DesignResult) -> Figure:
 
 
 def _with_bounds(result: DesignResult) -> list[ControllerResult]:
-    """mu, and of its tuned rivals those that were asked for and made."""
+    """The mu controller, and the tuned controllers "skyhook" and "loops" if they were computed."""
     return [c for name in ("mu", "skyhook", "loops") for c in result.controllers if c.name == name]
 
 

@@ -1,4 +1,4 @@
-"""What was asked, what was measured; and the controllers beside each other."""
+"""Task and results of a design, and a comparison of all controllers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avis_ctrl.study.verdict import all_axes, first_sentence
 
 
 def verdict(result: DesignResult) -> Section:
-    """The page that is read alone: what was asked, whether it is met, the certificate, and one figure."""
+    """Summary page: the task, the verdict on each requirement, the certificate, and one figure."""
     rows = [(r.name, Mark("met" if r.met else "NOT MET", r.met), words.quantity(r.value, r.unit),
              f"{r.comparison} {words.quantity(r.limit, r.unit)}") for r in result.requirements]
     met = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
@@ -34,7 +34,7 @@ def _sentence(result: DesignResult) -> Paragraph:
 
 
 def _asked(result: DesignResult, judged: bool) -> Paragraph:
-    """The task; judged : a table of requirements follows."""
+    """The task. judged : whether a table of requirements follows."""
     design, uncertain = result.design, result.design.uncertainty.parameters_percent
     low, high = design.transmissibility.band_Hz
     spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
@@ -84,7 +84,7 @@ def comparison(result: DesignResult) -> Section:
         ("largest voltage, once in 10 min", lambda c: _settled(c, _volts(c.site.volts_peak))),
         ("fastest pole", lambda c: f"{words.number(c.fastest_pole_Hz)} Hz" if c.K is not None else "none"),
     ]
-    # The delivered one first: on a narrow page the last columns are read least.
+    # The delivered controller first: on a narrow page the last columns are the least read.
     controllers = sorted(result.controllers, key=lambda c: c.name != "mu")
     body = [(name, *(value(c) for c in controllers)) for name, value in rows]
     notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
@@ -98,14 +98,14 @@ def comparison(result: DesignResult) -> Section:
 
 
 def _remarks(result: DesignResult) -> list[Piece]:
-    """What the requirements' figures stand for."""
+    """Notes on the requirements and on the result."""
     rows = [(r.name, r.note) for r in result.requirements if r.note]
     told: list[Piece] = [table("Notes to the requirements of the summary.", ("requirement", "note"), rows, "ll")]
     return [*(told if rows else []), *(Paragraph(note, "note") for note in result.notes)]
 
 
 def _settled(c: ControllerResult, text: str) -> str:
-    """A figure of the nominal loop, which an unstable loop does not have."""
+    """Text for a result of the nominal loop; "unstable" if the loop has no such result."""
     return text if c.stable else "unstable"
 
 

@@ -1,4 +1,4 @@
-"""Faults that add a signal made of the record to volts or outputs, in proportion to one parameter."""
+"""Faults that add a signal computed from the record to volts or outputs, in proportion to one parameter."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ ALL = "all motors"
 class AddedSignal(UnnamedFault):
     """A row of `ADDED`.
 
-    where : places on a table. parameter : the strength. signal : (samples, channels) on all channels for a strength of
-    one; None for a class of its own. to : what it is added to.
+    where : places on a table. parameter : the strength. signal : (samples, channels) on all channels for unit strength;
+    None for subclasses. to : the signals to which it is added.
     """
 
     name: str
@@ -34,7 +34,7 @@ class AddedSignal(UnnamedFault):
     nonlinear = True
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Results of other processes are sent by name: the functions of a row cannot be.
+        # Results pass between processes by name, because the functions of a row cannot be pickled.
         return _row, (self.name,)
 
     def places(self, model: Table) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ class AddedSignal(UnnamedFault):
         return (self.parameter(model),)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
-        """In one channel, or in all where the place is none of them."""
+        """In one channel, or in all of them if the place is not a channel."""
         assert self.signal is not None
         signal, names = self.signal, record.actuators if self.to == "volts" else record.sensors
         own = np.array(names) == place if place in names else 1.0
@@ -53,7 +53,7 @@ class AddedSignal(UnnamedFault):
 
 
 class DriveCrosstalk(AddedSignal):
-    """One motor gets a share of another one's voltage."""
+    """A fraction of one motor's voltage acts on another motor."""
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         k, i = (record.actuators.index(name) for name in place.split("/"))
@@ -63,7 +63,7 @@ class DriveCrosstalk(AddedSignal):
 
 
 class DeadZone(AddedSignal):
-    """No force within +-w, sign(u) (|u| - w) beyond: u less u clipped at w."""
+    """No force within +-w, sign(u) (|u| - w) beyond: u minus u clipped at w."""
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         w, k = values["half_width_V"], [place in (ALL, name) for name in record.actuators]
@@ -73,7 +73,7 @@ class DeadZone(AddedSignal):
 
 
 def largest_volts(model: Table) -> float:
-    """Largest r.m.s. of a voltage in any record; one where none is known."""
+    """Largest r.m.s. voltage in any record; 1 if none is known."""
     return max((one.largest_volts for one in model.motion.values()), default=1.0) or 1.0
 
 
@@ -91,14 +91,14 @@ def _strength(unit: str, words: str, size: float) -> EffectParameter:
 
 def _force_law(name: str, title: str, term: str, unit: str, power: int, law: Callable[[np.ndarray], np.ndarray]
                ) -> AddedSignal:
-    """Force of one motor, or of all, that is not in proportion to its voltage."""
+    """Force of one motor, or of all, that is not proportional to the voltage."""
     return AddedSignal(name, title, f"the force of {{place}} not in proportion to voltage, with a term in {term}",
                       _motors, lambda model: _strength(unit, term, 0.01 / largest_volts(model) ** power),
                       lambda record: law(record.volts))
 
 
 def _by_deflection(name: str, title: str, words: str, unit: str, power: int) -> AddedSignal:
-    """Force constants by a power of the motors' deflection."""
+    """Force constants that depend on a power of the motors' deflection."""
     def where(model: Table) -> tuple[str, ...]:
         known = [one for one in model.motion.values() if len(one.driven_rows) == one.volts.shape[1]]
         return (ALL,) if known else ()
@@ -109,7 +109,7 @@ def _by_deflection(name: str, title: str, words: str, unit: str, power: int) -> 
 
 
 def _reading_law(name: str, title: str, words: str, parameter: EffectParameter, power: int) -> AddedSignal:
-    """One sensor whose reading holds a power of itself."""
+    """One sensor whose reading contains a power of itself."""
     return AddedSignal(name, title, words, lambda model: model.sensors.names if _read(model) else (),
                        lambda model: parameter, lambda record: (record.y - record.y.mean(0)) ** power, "output")
 
@@ -120,13 +120,13 @@ def _dead_zone(model: Table) -> EffectParameter:
 
 
 def _drift(record: RecordMotion) -> np.ndarray:
-    """All force constants times (t - middle)/(length of the campaign)."""
+    """Volts times (t - middle)/(length of the campaign): a drift of all force constants."""
     begin, end = record.campaign_s
     return record.volts * ((record.time_s - (begin + end) / 2) / (end - begin))[:, None]
 
 
 def _other_clock(record: RecordMotion) -> np.ndarray:
-    """t dy/dt: y(t (1 + e)) to first order."""
+    """t dy/dt, the first-order change in y(t (1 + e))."""
     t = np.arange(len(record.y)) / record.sample_rate_Hz
     return t[:, None] * np.gradient(record.y, 1 / record.sample_rate_Hz, axis=0)
 

@@ -1,4 +1,4 @@
-"""What the faults beyond the library have in common: they are never named."""
+"""Common base of the faults outside the library; they are never named."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from avis_ctrl.gap.table_model import active
 
 
 class UnnamedFault(Effect):
-    """One that is never named. words : for a sentence, with {place}, {into} and {source} of a pair, and values."""
+    """A fault that is never named. words : for a sentence, with {place}, {into} and {source} of a pair, and values."""
 
     outside = True
     looks_like = "not in the library"
@@ -36,7 +36,7 @@ class Late(UnnamedFault):
         return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Half of the lateness each: to first order delay and lag are one. Nothing is earlier than it was sent."""
+        """Half of the total lateness each, because delay and lag are equal to first order. It cannot be negative."""
         took = score.reduction(score.of_effect(active(self, score.model, place))[:1])
         half = float(took.coefficients[0]) / 2
         return [Seed((half, half), took.chi2, took.rank)] if half > 0 else []

@@ -1,4 +1,4 @@
-"""Linear faults of single sensors and motors that the library has no name for."""
+"""Linear faults of single sensors and motors that have no name in the library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from avis_ctrl.gap.operators import Operators
 
 
 def mix(ops: Operators, into: str, shares: Values) -> None:
-    """Shares of other sensors' signals in one."""
+    """Add fractions of other sensors' signals to one sensor."""
     j, gain = ops.sensor(into), ops.base.sensors.sensitivity * ops.sensor_gain
     rows = np.array(ops.rows)
     for name, share in shares.items():
@@ -21,7 +21,7 @@ def mix(ops: Operators, into: str, shares: Values) -> None:
 
 
 class SensorCrosstalk(UnnamedFault):
-    """One output holds a share of another output's signal."""
+    """One output contains a fraction of another output's signal."""
 
     name = "sensor_crosstalk"
     title = "a fraction of one sensor's signal in another's"
@@ -39,7 +39,7 @@ class SensorCrosstalk(UnnamedFault):
 
 
 class SensorCrosstalkOfAll(UnnamedFault):
-    """One output holds shares of all others: a common ground, or a sensor somewhere else on the payload."""
+    """One output contains fractions of all others: a common ground, or a sensor elsewhere on the payload."""
 
     name = "sensor_crosstalk_of_all"
     title = "fractions of all sensors' signals in one"
@@ -57,7 +57,7 @@ class SensorCrosstalkOfAll(UnnamedFault):
 
 
 class SensorLate(Late):
-    """One output is later than the others: a low pass, a delay of its own."""
+    """One output is later than the others: a low-pass filter or a delay of its own."""
 
     name = "sensor_late"
     title = "one sensor is later than the others (a low pass or a delay of its own)"
@@ -84,7 +84,7 @@ class MotorLate(Late):
 
 
 class SensorResonance(UnnamedFault):
-    """One output holds a resonance of its sensor's holder: times 1 + share s^2/(s^2 + 2 zeta w s + w^2)."""
+    """One output shows a resonance of its sensor's holder: times 1 + share s^2/(s^2 + 2 zeta w s + w^2)."""
 
     name = "sensor_resonance"
     title = "a resonance of one sensor (a spurious mode, its holder)"

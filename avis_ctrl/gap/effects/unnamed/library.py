@@ -1,12 +1,12 @@
-"""Physics and faults that the library has no name for, refitted beside its candidates.
+"""Physics and faults that have no name in the library, fitted in competition with its candidates.
 
-The library is fixed; what can go wrong on a table is not. A fault without a name looks like some effect that has one:
-crosstalk of two sensors like a tilted sensor, a dead zone like a lower force constant. Of candidates from the library
-alone the nearest would win, and be named in the place of the fault. Here stands what an engineer would think of beside
-the library, in few parameters: where one of these explains the data better, nothing is named, and the verdict says in
-words what the table behaves like. None of them is ever named or part of a model that is handed out.
+The library is finite; the faults that a table can have are not. An unnamed fault resembles some named effect: crosstalk
+of two sensors resembles a tilted sensor, a dead zone a lower force constant. With candidates from the library alone,
+the closest one would win and be named in place of the fault. This module contains the faults that an engineer would
+consider beyond the library, in few parameters. If one of them explains the data better, nothing is named, and the
+verdict describes how the table behaves. They are never named and never part of an exported model.
 
-They act as all effects do.
+They act on the table as all effects do.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from avis_ctrl.gap.effects.unnamed.table import Gyroscope, QuadraticDrag, Quadra
 
 
 def unnamed_faults() -> dict[str, UnnamedFault]:
-    """Every one of them by name."""
+    """All unnamed faults by name."""
     every = (SensorCrosstalk(), SensorCrosstalkOfAll(), SensorLate(), SensorResonance(), MotorLate(), *ADDED.values(),
              QuadraticStiffness(), QuadraticDrag(), Gyroscope())
     return {one.name: one for one in every}

@@ -1,4 +1,4 @@
-"""Physics of payload and mounts that the library has no name for."""
+"""Physics of payload and mounts that has no name in the library."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avis_ctrl.gap.record_motion import RecordMotion
 
 
 class QuadraticStiffness(UnnamedFault, CubicStiffness):
-    """Force -k2 d^2 at every vertical mount: an air spring is stiffer in than out."""
+    """Force -k2 d^2 at every vertical mount: an air spring is stiffer in compression than in extension."""
 
     name = "quadratic_stiffness"
     title = "mounts of unlike stiffness up and down"
@@ -27,7 +27,7 @@ class QuadraticStiffness(UnnamedFault, CubicStiffness):
 
 
 class QuadraticDrag(UnnamedFault, OfMounts):
-    """Force -c |v| v on the payload at the table's centre, v its velocity against the chassis: air."""
+    """Air drag: force -c |v| v on the payload at the table's centre, v its velocity relative to the chassis."""
 
     name = "quadratic_drag"
     title = "drag in proportion to the square of velocity"
@@ -48,7 +48,7 @@ class QuadraticDrag(UnnamedFault, OfMounts):
 
 
 class Gyroscope(UnnamedFault):
-    """Moment h x w of a rotor with angular momentum h on the payload: s W, W skew-symmetric, on the rotations."""
+    """Moment h x w of a rotor with angular momentum h on the payload: s W on the rotations, W skew-symmetric."""
 
     name = "gyroscope"
     title = "a rotor on the payload"
