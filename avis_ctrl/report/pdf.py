@@ -44,7 +44,7 @@ def render(document: Document) -> bytes:
     figures = [one for one in document.figures() if isinstance(one, Figure)]
     drawn = dict(zip(map(id, figures), each(matplotlib_backend.svg, figures), strict=True))
     content = {"title": document.title, "subtitle": document.subtitle, "stamp": document.stamp, "sections": [
-        {"title": s.title, "alone": s.alone, "pieces": [_piece(p, drawn) for p in s.pieces]}
+        {"title": s.title, "anchor": s.anchor, "alone": s.alone, "pieces": [_piece(p, drawn) for p in s.pieces]}
         for s in document.sections]}
     template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
     # Sans-serif text of the drawings uses the font bundled with matplotlib, the same on every machine.
