@@ -175,5 +175,7 @@ def test_wrong_files_in_one_line(path, case, bom):
 def test_hints_that_contradict_the_time_stamps(path):
     path.write_text("\n".join(GOOD))
     assert read_measurements(path, sample_rate_Hz=4.001).sample_rate_Hz == 4.001
-    with pytest.raises(InputError, match=r"sample_rate_Hz = 5.0: expected 4 Hz, as the time stamps say"):
+    with pytest.raises(InputError, match=r"sample_rate_Hz = 0: expected 4 Hz, the rate of the time stamps"):
+        read_measurements(path, sample_rate_Hz=0)
+    with pytest.raises(InputError, match=r"sample_rate_Hz = 5.0: expected 4 Hz, the rate of the time stamps"):
         read_measurements(path, sample_rate_Hz=5.0)

@@ -90,6 +90,13 @@ def test_frequency_responses_with_coherence(path, rng, order, double, even):
     np.testing.assert_allclose(response.entry_variance[:, :, 0], expected.T, rtol=2e-3)
 
 
+def test_a_stated_rate_must_agree_with_the_increment(path, rng):
+    path.write_bytes(data_set(rng.normal(size=20), **A) + data_set(rng.normal(size=20), **S))
+    assert read_measurements(path, excitation="noise", sample_rate_Hz=100.05).sample_rate_Hz == 100.05
+    with pytest.raises(InputError, match=r"sample_rate_Hz = 50: expected 100 Hz, the rate of the time stamps"):
+        read_measurements(path, excitation="noise", sample_rate_Hz=50)
+
+
 def test_units_by_data_type_and_data_set_164(path):
     """The factor of length is file units per metre: 1000 for millimetres."""
     y = np.arange(1.0, 9.0)

@@ -28,7 +28,7 @@ from scipy import signal
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.gates import GATES, Expectation, examine
 from avis_ctrl.measurement.gates.channel_map import ChannelMap
-from avis_ctrl.measurement.gates.examine import after_missing_samples
+from avis_ctrl.measurement.gates.examine import CONSEQUENCES, OF_ALL, after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples, delays, explained
@@ -164,6 +164,15 @@ def test_rows_lost_from_u_and_y(clean):
     broken = changed(clean, 0, u=np.delete(old.u, lost, axis=0), y=np.delete(old.y, lost, axis=0))
     found = [f for f in alarms(broken) if f.gate == "missing samples"]
     assert "3 samples off" in found[0].sentence and "period 3" in found[0].sentence
+    assert abs(found[0].value) == 3
+
+
+def test_rows_lost_twice(clean):
+    """The sentence and the value state the shift of the period that it names, not of the last one."""
+    old, lost = clean.records[0], np.r_[9000:9003, 19000:19002]
+    broken = changed(clean, 0, u=np.delete(old.u, lost, axis=0), y=np.delete(old.y, lost, axis=0))
+    (found,) = [f for f in alarms(broken) if f.gate == "missing samples" and "off its period" in f.sentence]
+    assert "3 samples off" in found.sentence and abs(found.value) == 3
 
 
 def test_a_buffer_written_twice(clean):
@@ -180,6 +189,10 @@ def test_channels_are_not_called_exchanged_where_every_record_lacks_samples():
     assert [f.severity for f in judged] == ["stop", "note", "stop"] and "consequence" in judged[1].sentence
     judged = after_missing_samples([lost, mixed, copied], {"00", "01", "02"})
     assert [f.severity for f in judged] == ["stop"] * 3
+
+
+def test_gates_affected_by_missing_samples_exist(clean):
+    assert {*CONSEQUENCES, *OF_ALL} < {f.gate for f in examine(clean, known())}
 
 
 def test_records_that_overlap_in_time(clean):

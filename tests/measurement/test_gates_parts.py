@@ -12,7 +12,7 @@ from scipy import signal
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
-from avis_ctrl.measurement.gates import Expectation, examine
+from avis_ctrl.measurement.gates import Expectation, examine, periodicity
 from avis_ctrl.measurement.gates.channel_faults import MapSettings, compare, explain
 from avis_ctrl.measurement.gates.clipping import over_range, repeated_extreme
 from avis_ctrl.measurement.gates.dead_channel import equal_runs
@@ -20,7 +20,7 @@ from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.h1 import Spectra, h1, spectra
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import delay_step, repeated_block, runs_away
-from avis_ctrl.measurement.gates.periodicity import compared
+from avis_ctrl.measurement.gates.periodicity import Periodicity, compared
 from avis_ctrl.measurement.gates.sine_fit import fit_sine, second_order
 from avis_ctrl.measurement.gates.spikes import departure, jump_corner
 
@@ -258,6 +258,17 @@ def test_false_alarms_of_periodicity(rng):
         assert T.mean() == pytest.approx(1.0, abs=0.25)
         hits += T.max() > stats.f.isf(0.01 / T.size, lines, lines * (R - 1))
     assert hits <= 7
+
+
+def test_a_channel_that_differs_only_before_the_reference_has_settled():
+    """Of 6 periods, "a" fails in the last one and "b" in the last one before the reference, which is no drift."""
+    T = np.ones((6, 2))
+    T[5, 0], T[2, 1] = 9.0, 9.0
+    header = RecordHeader("00", 100.0, 600, ("u",), ("a", "b"), "multisine", 1.0, 0.0, 1.0)
+    campaign = Campaign("x", (Record(header, np.zeros((600, 1)), np.zeros((600, 2))),))
+    periods = periodicity._Kept("00", 1.0, T, 0.1 * T, 50, 2)
+    (finding,) = Periodicity().conclude([periods], campaign, Expectation())
+    assert finding.severity == "warning" and finding.channels == ("a",)
 
 
 def test_long_records_are_looked_at_in_pieces_and_that_is_said(rng):

@@ -25,7 +25,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
 from avis_ctrl.measurement.formats.common import existing_file, is_number, reading, require_small, within
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
-from avis_ctrl.measurement.formats.time_axis import sample_rate_from
+from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
 CHUNK = 1 << 16  # lines that are converted to numbers at once
 LONGEST_LINE = 1 << 20  # characters
@@ -212,12 +212,7 @@ def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[flo
             raise InputError(f"expected one of {', '.join(TIME_UNITS)}", field="unit of t", value=unit)
         factor = TIME_UNITS[unit or "s"]
         rate, start, note = sample_rate_from(time * factor, lambda sample: f"data row {sample + 1}")
-        if hints.sample_rate_Hz is None:
-            return rate, start, note
-        if abs(rate / hints.sample_rate_Hz - 1) > 1e-3:
-            raise InputError(f"expected {rate:.9g} Hz, as the time stamps say", field="sample_rate_Hz",
-                             value=hints.sample_rate_Hz)
-        return hints.sample_rate_Hz, start, note
+        return rate if hints.sample_rate_Hz is None else agreed_rate(hints.sample_rate_Hz, rate), start, note
     if hints.sample_rate_Hz is None:
         raise InputError("expected a column t (time in s) or a comment line such as '# sample_rate_Hz = 1000'",
                          field="t")

@@ -27,7 +27,7 @@ from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.stored import Columns
-from avis_ctrl.measurement.formats.time_axis import sample_rate_from
+from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
 
 @dataclass(frozen=True)
@@ -306,9 +306,8 @@ def _clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],
             if period <= 0:
                 raise InputError("expected a positive sampling period in s", field=name, value=period)
             stated = 1 / period
-    if stated is not None and rate is not None and abs(stated / rate - 1) > 1e-3:
-        raise InputError(f"expected {rate:.9g} Hz, as the time vector says", field=source, value=stated)
-    result = stated if stated is not None else rate
-    if result is None:
+    if stated is not None:
+        rate = stated if rate is None else agreed_rate(stated, rate, source)
+    if rate is None:
         raise InputError(f"expected t, fs or sample_rate_Hz; the file has {overview(tree)}", field="sample rate")
-    return result, start, note, known
+    return rate, start, note, known

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Record, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Portion, Record, RecordHeader, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import as_number, as_text, stated_period, unit_of, units_of, within
 from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
@@ -207,7 +207,9 @@ def _root_mean_square(u: np.ndarray | Columns, names: Sequence[str], path: str) 
 
 
 def with_header(record: RecordSource, **changes: Any) -> RecordSource:
-    """The record with changed header fields; records in memory and in files are dataclasses with a header."""
+    """The record with changed names, units or rate; records in memory and in files are dataclasses with a header."""
+    if isinstance(record, Portion):
+        return Portion(with_header(record.whole, **changes), record.start, record.stop)
     return replace(record, header=replace(record.header, **changes))  # type: ignore[type-var]
 
 

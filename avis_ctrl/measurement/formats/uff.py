@@ -20,7 +20,7 @@ from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
 from avis_ctrl.measurement.formats.common import ALLOWED, Unit, existing_file, reading, require_small, unit_of
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.response import response_from
-from avis_ctrl.measurement.formats.time_axis import rounded, sample_rate_from
+from avis_ctrl.measurement.formats.time_axis import agreed_rate, rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
@@ -198,9 +198,11 @@ def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str,
             if some else np.zeros((len(every[0].value), 0))
         parts[role] = Part(roles[role], [unit.si for unit in units], array)
     # The units have already been applied.
-    record, notes = record_from(name, parts, hints.sample_rate_Hz or rate, start,
-                                replace(hints, u_unit=None, y_unit=None))
-    notes += [f"record {name}: {note}"] if note and hints.sample_rate_Hz is None else []
+    hints = replace(hints, u_unit=None, y_unit=None)
+    if hints.sample_rate_Hz is not None:
+        rate, note = agreed_rate(hints.sample_rate_Hz, rate, f"record {name}: sample_rate_Hz"), ""
+    record, notes = record_from(name, parts, rate, start, hints)
+    notes += [f"record {name}: {note}"] if note else []
     notes += [f"record {name}: channel {function.response.name} is measured along "
               f"{function.response._replace(name='').channel().split()[-1]}; its sign is kept"
               for function in every if function.response.direction < 0 and function.response.name]

@@ -100,11 +100,12 @@ class MissingSamples(Gate):
                           float(SETTINGS.block_rows), picture)
         if k.clock is not None and np.any(k.clock != 0):
             p = int(np.flatnonzero(k.clock)[0])
+            shift = float(k.clock[p])
             yield Finding(self.name, "stop",
-                          f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off "
+                          f"The commanded voltage of record {name} is {abs(shift):g} samples off "
                           f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, "
                           "or the stated period is wrong. Check period_s, or repeat the record.", (), (name,),
-                          float(k.clock[p]), 0.0, picture)
+                          shift, 0.0, picture)
         steps = [step for one in k.stepped if (step := delay_step(one, level)) is not None]
         at, size = max(steps, key=lambda step: abs(step[1]), default=(0, 0.0))
         if abs(size) > SETTINGS.jump_samples:

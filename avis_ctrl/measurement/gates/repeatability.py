@@ -48,6 +48,7 @@ class ComparisonSettings:
 
 
 SETTINGS = ComparisonSettings()
+LEVEL_DEPENDENCE = "level dependence"  # gate name of the findings on different levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ class Comparison(Gate):
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
         return [*_judged(self.name, repeats, campaign, _drifted, agreed,
                          "Repeatability was not tested: no two driven records of one level and enough length."),
-                *_judged("level dependence", levels, campaign, _nonlinear, "The responses at all levels agree",
+                *_judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, "The responses at all levels agree",
                          "Dependence on the level was not tested: no driven records of one kind and enough length at "
                          f"two levels, at least a factor {SETTINGS.apart:g} apart.")]
 
