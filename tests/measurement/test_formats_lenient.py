@@ -97,7 +97,7 @@ def test_everything_that_is_missing_is_said_at_once(path, rng, version):
     with pytest.raises(InputError) as caught:
         read_measurements(path)
     assert str(caught.value).startswith(f"{path}: records: missing: ") and "\n" not in str(caught.value)
-    for said in ("fs or a time vector t (record 00)", "y, what the sensors gave (record 01)",
+    for said in ("fs or a time vector t (record 00)", "y, the sensor signals (record 01)",
                  "period_s, the period in s of a multisine (not 0 or NaN) (record 00)"):
         assert said in str(caught.value)
 
@@ -141,7 +141,7 @@ def test_a_variable_of_the_names_goes_before_the_names_themselves(path, rng):
     one = record(rng, labels=cells(["p", "q", "r"]))
     scipy.io.savemat(path, one)
     assert read_measurements(path, {"y_names": "labels"}).y_names == ("p", "q", "r")
-    with pytest.raises(InputError, match="y_names = 'lables': no variable of that name, and too few for names"):
+    with pytest.raises(InputError, match="y_names = 'lables': neither a variable nor a list of channel names"):
         read_measurements(path, {"y_names": "lables"})
 
 

@@ -32,7 +32,7 @@ from avis_ctrl.measurement.gates.examine import CONSEQUENCES, OF_ALL, after_miss
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples, delays, explained
-from avis_ctrl.measurement.gates.repeatability import beyond_chance
+from avis_ctrl.measurement.gates.repeatability import significance
 
 SEVERE = ("warning", "stop")
 
@@ -167,14 +167,6 @@ def test_rows_lost_from_u_and_y(clean):
     assert abs(found[0].value) == 3
 
 
-def test_rows_lost_twice(clean):
-    """The sentence and the value state the shift of the period that it names, not of the last one."""
-    old, lost = clean.records[0], np.r_[9000:9003, 19000:19002]
-    broken = changed(clean, 0, u=np.delete(old.u, lost, axis=0), y=np.delete(old.y, lost, axis=0))
-    (found,) = [f for f in alarms(broken) if f.gate == "missing samples" and "off its period" in f.sentence]
-    assert "3 samples off" in found.sentence and abs(found.value) == 3
-
-
 def test_a_buffer_written_twice(clean):
     y = clean.records[0].y.copy()
     y[9000:9256] = y[8744:9000]
@@ -233,7 +225,7 @@ def test_lines_beside_the_band_are_not_compared():
 @pytest.mark.parametrize(("T", "said"), [(46358975614.2, "far more than noise explains"),
                                          (3.04, "3.0 times the 1 % limit of noise alone")])
 def test_statistics_are_said_in_words_that_one_can_read(T, said):
-    assert beyond_chance(T).startswith(said)
+    assert significance(T).startswith(said)
 
 
 def test_records_of_different_voltages_say_how_little_their_comparison_tells():

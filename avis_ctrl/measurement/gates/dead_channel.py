@@ -149,9 +149,9 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
         return None
     n_u = estimate.rank
     level = FALSE_ALARM / estimate.coherence.size
-    chance = stats.beta.isf(level, n_u, estimate.dof)
+    limit = stats.beta.isf(level, n_u, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)
-    return np.max(ratio, axis=0) / (chance / max(1 - chance, 1e-12))
+    return np.max(ratio, axis=0) / (limit / max(1 - limit, 1e-12))
 
 
 def _sine_excess(seen: Excerpt) -> np.ndarray:
@@ -159,5 +159,5 @@ def _sine_excess(seen: Excerpt) -> np.ndarray:
     piece = seen.first
     n_u = piece.u.shape[1]
     fit = fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), n_u, seen.header.sample_rate_Hz)
-    ratio = np.abs(fit.X[n_u:]) ** 2 / 4 * fit.samples / np.maximum(fit.rest[n_u:] ** 2, 1e-300)
+    ratio = np.abs(fit.X[n_u:]) ** 2 / 4 * fit.samples / np.maximum(fit.residual_rms[n_u:] ** 2, 1e-300)
     return ratio / float(stats.f.isf(FALSE_ALARM / len(ratio), 2, fit.samples - 3))
