@@ -203,7 +203,7 @@ WRONG = {
                 "records: missing: sample_rate_Hz, fs or a time vector t; the records have excitation, floor"),
     "no y": ({"y": MISSING}, "records: missing: y, the sensor signals; the records have"),
     "all at once": ({"y": MISSING, "sample_rate_Hz": MISSING, "period_s": 0.0},
-                    "missing: y, the sensor signals; sample_rate_Hz, fs or a time vector t; period_s, the period in s of a mult"),
+                    "missing: y, the sensor signals; sample_rate_Hz, fs or a time vector t; period_s, the period"),
     "names": ({"y_names": cells(["S1", "S2"])}, "expected 2 channels, as many as names; it is 60x3"),
     "same names": ({"y_names": cells(["S1", "S1", "S2"])}, "expected different names"),
     "lengths": ({"y": np.zeros((59, 3))}, "expected equally many samples; u is 60x2, y is 59x3, floor is 60x3"),
