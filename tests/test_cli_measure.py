@@ -157,7 +157,7 @@ def test_a_flat_file_without_names_is_held_against_the_rig(flat, tmp_path):
     (("identify", "C", "--rig", "halcyonics", "--out", "o"), "the file is a campaign of avis"),
     (("convert", "F", "o.h5", "--excitation", "chirp"), "excitation = 'chirp': expected one of multisine"),
     (("convert", "F", "o.h5", "--unit-y", "Pa"), "y unit = 'Pa'"),
-    (("convert", "F", "o.h5", "--sample-rate", "500"), "expected 1000 Hz, as the time vector says"),
+    (("convert", "F", "o.h5", "--sample-rate", "500"), "expected 1000 Hz, the rate of the time stamps"),
     (("convert", "C", "o.h5", "--period", "5"), "an HDF5 campaign states this itself"),
     (("convert", __file__, "o.h5"), "not a measurement file (.py)"),
 ], ids=lambda value: " ".join(map(str, value))[-40:] if isinstance(value, tuple) else "")

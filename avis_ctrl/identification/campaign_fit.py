@@ -108,15 +108,15 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
                  "the last third of every record held out, because too few records excite every input")
 
 
-def of_one_level(items: Sequence[Item], told: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
+def of_one_level(items: Sequence[Item], kind_and_level: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
     """Group items of one kind and level, within SAME_LEVEL of the lowest in a group; sorted by kind, then level.
 
-    told : function that returns kind and level of an item.
+    kind_and_level : function that returns kind and level of an item.
     """
     groups: list[list[Item]] = []
-    for item in sorted(items, key=told):
-        kind, level = told(item)
-        first = told(groups[-1][0]) if groups else None
+    for item in sorted(items, key=kind_and_level):
+        kind, level = kind_and_level(item)
+        first = kind_and_level(groups[-1][0]) if groups else None
         if first and kind == first[0] and level <= SAME_LEVEL * first[1]:
             groups[-1].append(item)
         else:
@@ -280,8 +280,8 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
     at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
     noise = noise_covariance(campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3,
                              longest_piece=SETTINGS.longest_piece)
-    nearest = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
-    return block.with_noise(noise.covariance[nearest], float(np.median(noise.dof)))
+    above = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
+    return block.with_noise(noise.covariance[above], float(np.median(noise.dof)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,7 +391,7 @@ def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
     return f"they contribute up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
 
 
-def _bounds(found: LikelihoodFit) -> tuple[str, ...]:
+def _bounds(found: LikelihoodFit[ResponseModel]) -> tuple[str, ...]:
     """Sentences about parameters that ended at a physical limit."""
     moments = [name for name in found.held if any(name in names for names in MOMENTS)]
     low = [name for name in found.held if name not in moments]

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.response import central_differences
 from avis_ctrl.rigs.rig import Rig
 
 # Directions that together change the response by less than this fraction, at every frequency, are not kept.
@@ -72,7 +73,7 @@ def directions_that_matter(rig: Rig, names: Sequence[str], factor: np.ndarray, k
     if factor.ndim != 2 or len(factor) != len(names) or not np.all(np.isfinite(factor)):
         raise InputError(f"expected finite numbers of shape ({len(names)}, r)", field="factor", value=factor.shape)
     if not 0 < confidence < 1:
-        raise InputError("expected a share between 0 and 1", field="confidence", value=confidence)
+        raise InputError("expected a probability between 0 and 1", field="confidence", value=confidence)
     if unknown := [name for name in names if name not in rig.parameters()]:
         raise InputError(f"the rig {rig.name} has no such parameters", field="names", value=unknown)
     r = factor.shape[1]
@@ -114,16 +115,9 @@ def relative_sensitivity(rig: Rig, names: Sequence[str], keep: Sequence[str], om
 
 def matrix_slopes(rig: Rig, names: Sequence[str], keep: Sequence[str]) -> list[KeptMatrices]:
     """Derivatives of M, C, K, T of the kept coordinates by each parameter, per its unit."""
-    known, slopes = rig.parameters(), []
-    for name in names:
-        value = known[name].value
-        # Polynomials of second degree: a central difference is exact at any step.
-        step = 0.1 * abs(value) or 1e-3
-        up, down = (kept_matrices(rig.with_parameters({name: value + sign * step}), keep, rig.edge_m)
-                    for sign in (1, -1))
-        M, C, K, T = ((a - b) / (2 * step) for a, b in zip(up, down, strict=True))
-        slopes.append((M, C, K, T))
-    return slopes
+    def matrices_of(one: Rig) -> KeptMatrices:
+        return kept_matrices(one, keep, rig.edge_m)
+    return [(M, C, K, T) for M, C, K, T in (central_differences(matrices_of, rig, name) for name in names)]
 
 
 def relative_changes(base: KeptMatrices, changes: Sequence[KeptMatrices], omega: np.ndarray,

@@ -153,6 +153,7 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
     for source in campaign.records[:settings.warm_up]:
         _through(kalman, source, inverse, rig0.loop_delay_s, keep)
     kalman.forget()
+    kalman.state.guarded[:] = 0
     pieces, statistics, ends = [], [], [0.0]
     for source in campaign.records:
         trace = _through(kalman, source, inverse, rig0.loop_delay_s, keep)

@@ -65,7 +65,8 @@ class Trace(NamedTuple):
 
 
 @njit(cache=True, fastmath=FAST)
-def flow(plant, s, x, u, h):
+def flow(plant: Plant, s: np.ndarray, x: np.ndarray, u: np.ndarray, h: float
+         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x after a sample of h seconds at held volts u (n_u,), Phi (n_x, n_x) and Psi (n_x, n_p).
 
     The terms (A h)^k / k! of the state, of its derivatives and of the transition are computed together. x is NaN if a
@@ -102,7 +103,7 @@ def flow(plant, s, x, u, h):
 
 
 @njit(cache=True, fastmath=FAST)
-def _forces(plant, slope, term):
+def _forces(plant: Plant, slope: np.ndarray, term: np.ndarray) -> np.ndarray:
     """(n_q, n_p) dM q'' + dC q' + dK q by each s, for a term (q, q') and its time derivative."""
     n_q, n_p = plant.T.shape[0], plant.reference.shape[0]
     out = np.zeros((n_q, n_p))
@@ -117,7 +118,7 @@ def _forces(plant, slope, term):
 
 
 @njit(cache=True)
-def propagate(W, Phi, Psi, W_Q):
+def propagate(W: np.ndarray, Phi: np.ndarray, Psi: np.ndarray, W_Q: np.ndarray) -> None:
     """Propagate W over a sample, in place; W_Q (n_x, n_x) with W_Q^T W_Q the process noise of the sample."""
     n_p = Psi.shape[1]
     F_t = np.ascontiguousarray(np.concatenate((Psi, Phi), axis=1).T)
@@ -127,7 +128,7 @@ def propagate(W, Phi, Psi, W_Q):
 
 
 @njit(cache=True, fastmath=FAST)
-def update(W, h, r, gain):
+def update(W: np.ndarray, h: np.ndarray, r: float, gain: np.ndarray) -> float:
     """Carlson's update of W by a measurement h x of variance r; `gain` becomes P h / variance, which is returned."""
     n, n_x = W.shape[0], h.shape[0]
     n_p = n - n_x
@@ -151,7 +152,8 @@ def update(W, h, r, gain):
 
 
 @njit(cache=True)
-def _measure(plant, state, y, R, gain, innovation):
+def _measure(plant: Plant, state: Filter, y: np.ndarray, R: np.ndarray, gain: np.ndarray, innovation: np.ndarray
+             ) -> bool:
     """Process all measurements of one sample, one by one; False if an innovation is not finite."""
     n_p = state.s.shape[0]
     for i in range(y.shape[0]):
@@ -169,7 +171,8 @@ def _measure(plant, state, y, R, gain, innovation):
 
 
 @njit(cache=True)
-def run(plant, state, W_Q, R, u, y, h, keep, trace):
+def run(plant: Plant, state: Filter, W_Q: np.ndarray, R: np.ndarray, u: np.ndarray, y: np.ndarray, h: float, keep: int,
+        trace: Trace) -> int:
     """Filter a record: measurement update, then propagation to the next sample. Returns the number of samples
     processed; fewer than all means failure.
 

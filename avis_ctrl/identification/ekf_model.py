@@ -37,6 +37,7 @@ class LinearModel(NamedTuple):
 
     @property
     def n_q(self) -> int:
+        """Number of coordinates."""
         return len(self.T)
 
     def matrices(self, theta: np.ndarray) -> np.ndarray:
@@ -91,7 +92,7 @@ def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | N
     for name, value, *of in zip(names, theta, *slopes, strict=True):
         M, C, K, _, _, T, R = (np.any(one) for one in of)
         if not value > 0:
-            raise InputError("expected a positive starting value: the filter's prior is a share of it", field=name,
+            raise InputError("expected a positive starting value: the filter's prior is a fraction of it", field=name,
                              value=value)
         if T or R:
             raise InputError("this parameter also moves actuators or sensors; the filter takes those as known and "
@@ -102,7 +103,7 @@ def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | N
     constant, moved = np.array(known[:3]) - of_body @ theta, np.array(model.at(1.2 * theta).matrices[:3])
     size = LINEARITY * np.max(np.abs(moved), axis=(1, 2), keepdims=True)
     if np.any(np.abs(moved - constant - of_body @ (1.2 * theta)) > size):
-        raise InputError("M, C and K must be linear in the parameters of this filter; in these they are not",
+        raise InputError("M, C and K must be linear in the parameters of this filter; they are not linear in these",
                          field="names", value=list(names))
     rows = np.hstack([np.zeros_like(known.R), known.R])
     return LinearModel(names, theta, constant, of_body, known.T, rows if motion == "velocity" else np.roll(rows, 6, 1))

@@ -32,6 +32,7 @@ class Innovations:
 
     @property
     def nis_per_output(self) -> float:
+        """Mean normalised innovation squared per output, 1 expected."""
         return self.nis / self.autocorrelation.shape[1]
 
     @property
@@ -102,6 +103,7 @@ class EkfResult:
 
     @property
     def sigma(self) -> np.ndarray:
+        """(n_p,) standard deviations in the parameters' units."""
         return np.sqrt(np.diag(self.covariance))
 
     @property

@@ -57,19 +57,23 @@ class EkfSettings:
 
 
 SOURCE_SETTINGS = EkfSettings()
-"""Section 3.3 as printed, but for the sensors' chain, which is undone here and was not there. What this tuning hides:
-R = 1e-8 is an r.m.s. velocity of 1e-4 m/s, the size of the payload's own motion, five orders of variance above sensor
-noise and converter (1e-13); Q = 1e-8 is near the density of what the drives of section 3.4 do along x and y (1.6e-8), a
-sixth of it along z and a hundredth about x. The source raised R because the filter was unstable without. The bands are
-therefore those of a filter that distrusts its data: they are wide, and cover errors that the data would have shown. And
-of the 26 parameters only 20 combinations act on the payload: the bands of the others tell the prior, not the data."""
+"""Settings of section 3.3 as printed. Unlike in the source, the response of the sensors' chain is compensated.
+
+R = 1e-8 corresponds to an r.m.s. velocity of 1e-4 m/s, which is the size of the payload's own motion and five orders of
+variance above sensor noise and converter (1e-13). Q = 1e-8 is close to the spectral density of the acceleration by the
+drives of section 3.4 along x and y (1.6e-8); along z it is a sixth of that density, about x a hundredth. The source
+raised R because the filter was unstable otherwise. The filter therefore gives little weight to its data: its bands are
+wide, and cover errors that the data would have revealed. Only 20 combinations of the 26 parameters affect the payload:
+the bands of the others show the prior, not the data."""
 
 HONEST_SETTINGS = EkfSettings(q_sigma=2.5e-6, v_sigma=1e-4, Q=None, R=None, reset=False, warm_up=1)
-"""R from the rig's sensor noise and quantiser, process noise from its ambient floor motion (white velocity through the
-isolators, which colours it: three more states), covariance kept from record to record, begun where the first record
-ends: the bands are what the data say. Without the first round, parameters 25 % off shape the floor's motion and the
-first corrections wrongly, and the filter never learns that its bands are then too narrow. The small R that the source
-could not use does no harm here once the sensors' chain is undone."""
+"""Settings from the actual noise, so that the bands show what the data determine.
+
+R follows from the rig's sensor noise and quantiser. The process noise follows from its ambient floor motion: white
+velocity through the isolators, which colour it (three more states). The covariance is kept from record to record. The
+first record is filtered once beforehand, to start from its estimate: with parameters that are 25 % off, the modelled
+transmission of the floor motion and the first corrections are wrong, and the bands would remain too narrow. The small
+R, with which the source's filter was unstable, causes no problem once the sensors' chain is compensated."""
 
 
 def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str], unit: str) -> np.ndarray:
@@ -86,8 +90,8 @@ def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str]
         return np.full(len(y_names), settings.R)
     g, a = rig.geophones, rig.acquisition
     if unit != "V" or g is None or a is None or rig.ambient is None:
-        raise InputError("the sensor noise is known for geophones in V of a rig with acquisition and ambient noise "
-                         "only; give R", field="R", value=None)
+        raise InputError("the sensor noise is known only for geophones in V of a rig file with acquisition and ambient "
+                         "noise; state R", field="R", value=None)
     rounding = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz).noise_rms_V
     gain = np.array([g.sensitivity_Vs_per_m[g.names.index(name)] for name in y_names]) * g.preamplifier_gain
     return (rig.ambient.sensor_noise_rms_V ** 2 + rounding ** 2) / gain ** 2
@@ -122,6 +126,6 @@ def floor_noise(settings: EkfSettings, rig: Rig) -> FloorNoise | None:
     if settings.Q is not None:
         return None
     if rig.ambient is None or not rig.ambient.floor_velocity_rms_m_per_s > 0:
-        raise InputError("the rig file has no ambient floor motion; give Q", field="Q", value=None)
+        raise InputError("the rig file has no ambient floor motion; state Q", field="Q", value=None)
     density = rig.ambient.floor_velocity_rms_m_per_s ** 2 / (2 * (FLOOR_BAND_Hz[1] - FLOOR_BAND_Hz[0]))
     return FloorNoise(density, np.pi * settings.highpass_Hz)

@@ -20,7 +20,7 @@ from avis_ctrl.identification.identifiability import IdentifiabilityReport, iden
 from avis_ctrl.identification.identifiability_text import combination_text, listed, number
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
-from avis_ctrl.identification.structure import size_of, structural_null_space, structure_of
+from avis_ctrl.identification.structure import structural_null_space, structure_of
 
 _FLOOR_SHAKEN = 1e-4
 _BENCH = 0.02
@@ -44,11 +44,11 @@ class Experiment:
     def information(self, model: ResponseModel, noise: Noise) -> Information:
         """Information that it would add on the model's free parameters."""
         n = len(model.names)
-        found = Information(model.names, model.values, model.units, np.zeros((n, n)), size_of(model.values))
+        found = Information(model.names, model.values, model.units, np.zeros((n, n)), model.scales())
         if self.drive is not None:
             matrix = predicted_information(changed(model, **self.change), self.drive, noise).matrix
             found = replace(found, matrix=matrix)
-        sizes = dict(zip(model.names, size_of(model.values).tolist(), strict=True))
+        sizes = dict(zip(model.names, model.scales().tolist(), strict=True))
         return found.with_priors({name: share * sizes[name] for name, share in self.bench.items()})
 
 
@@ -70,6 +70,7 @@ class Outcome:
 
     @property
     def words(self) -> str:
+        """What the experiment adds, as a sentence."""
         if not self.gained:
             sharper = f"the known standard deviations decrease by a factor of {number(self.tighter)}" \
                 if self.tighter > 1.005 else "no standard deviation decreases"

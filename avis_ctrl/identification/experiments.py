@@ -24,7 +24,6 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, Matrices, ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.structure import size_of
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -172,4 +171,4 @@ def predicted_information(model: ResponseModel, drive: Drive, noise: Noise) -> I
         white = (L @ dY) * np.sqrt(2 * lines)[:, None, None]
         flat = white.reshape(len(white), -1)
         H = np.real(np.conj(flat) @ flat.T)
-    return Information(model.names, model.values, model.units, H, size_of(model.values))
+    return Information(model.names, model.values, model.units, H, model.scales())

@@ -18,8 +18,8 @@ from avis_ctrl.identification.identifiability_text import (
     weak_sentence,
 )
 from avis_ctrl.identification.information import UNDETERMINED, Combination, Information
-from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.structure import Structure, size_of, structural_null_space, structure_of
+from avis_ctrl.identification.response import ResponseModel, size_of
+from avis_ctrl.identification.structure import Structure, structural_null_space, structure_of
 
 # Relative standard deviation above which a combination is called weak.
 WEAK = 0.05
@@ -68,7 +68,7 @@ def identifiability_report(information: Information, model: ResponseModel | None
         null, own = information.null_space, information.null_space
         structure = structure_of(null, values, units, names, 1e-3)
     else:
-        own = _orthonormal(structural_null_space(model, floor) * (size_of(model.values) / information.scale)[:, None])
+        own = _orthonormal(structural_null_space(model, floor) * (model.scales() / information.scale)[:, None])
         null = _left_dark(information, own)
         # The structure uses relative units of the values.
         structure = structure_of(_orthonormal(null * (information.scale / size_of(values))[:, None]), values, units,

@@ -17,10 +17,12 @@ _KINDS = {"kg": ("mass", "masses"), "kg m^2": ("inertia", "inertias"), "N/m": ("
 
 
 def number(value: float) -> str:
+    """Number with three digits."""
     return f"{value:.3g}"
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
+    """"a, b and c"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
@@ -39,6 +41,7 @@ def combination_text(terms: Iterable[tuple[str, float]], powers: Sequence[tuple[
 
 
 def unit_text(unit: str, powers: Sequence[tuple[str, float]]) -> str:
+    """Unit of a quantity times powers of quantities in other units."""
     if unit == "mixed units":
         return unit
     for other, power in powers:
@@ -58,6 +61,7 @@ def known_text(one: Combination) -> str:
 
 
 def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
+    """How a group of correlated parameters is determined: the combinations that these data determine."""
     if not seen:
         one = len(members) == 1
         return (f"{listed(members)} {'has' if one else 'have'} no influence on the responses to these inputs and "
@@ -100,6 +104,7 @@ def kinds(exponents: np.ndarray, information: Information, of: float) -> list[st
 
 
 def scaling_sentence(scaling: Scaling, information: Information) -> str:
+    """A common factor that changes no response, and the parameter that fixes it."""
     sizes = sorted(set(scaling.exponents[scaling.exponents != 0].tolist()), reverse=True)
     if sizes == [1.0]:
         return (f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} are determined only as ratios: a common "
@@ -117,6 +122,7 @@ def scaling_sentence(scaling: Scaling, information: Information) -> str:
 
 
 def weak_sentence(one: Combination) -> str:
+    """Precision of a combination that is determined poorly."""
     return (f"{one.words} is determined only to {number(100 * one.relative)} %: "
             f"{uncertain_value.text(one.value, one.standard_deviation, one.unit)}.")
 
@@ -129,5 +135,6 @@ def main_members(names: Sequence[str], direction: np.ndarray) -> list[tuple[str,
 
 
 def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: float) -> str:
+    """Changes of the parameters that amount to one standard deviation along the least precise direction."""
     moved = [f"{name} by {100 * sigma * weight:+.2g} %" for name, weight in main_members(names, direction)[:6]]
     return f"The least precise combination: changing {listed(moved)} together is one standard deviation."

@@ -33,10 +33,12 @@ class Combination:
 
     @property
     def relative(self) -> float:
+        """Standard deviation relative to the value."""
         return self.standard_deviation / abs(self.value) if self.value else np.inf
 
     @property
     def determined(self) -> bool:
+        """Whether the data determine the combination."""
         return bool(np.isfinite(self.standard_deviation))
 
 
@@ -105,6 +107,7 @@ class Information:
 
     @property
     def rank(self) -> int:
+        """Number of determined combinations."""
         return int(np.count_nonzero(self.determined))
 
     @property

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from avis_ctrl.rigs.nonlinear import payload_acceleration, rig_arrays
+from avis_ctrl.rigs.nonlinear import RigArrays, payload_acceleration, rig_arrays
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -59,7 +59,7 @@ def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sens
 
 
 @njit(cache=True)
-def _along(q, q_dot, u, arrays):
+def _along(q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, arrays: RigArrays) -> tuple[np.ndarray, np.ndarray]:
     """Accelerations (n, 6), and forces (n, 6) added by turned motors."""
     acceleration, turned = np.empty_like(q), np.empty_like(q)
     still = np.zeros(6)
@@ -70,7 +70,8 @@ def _along(q, q_dot, u, arrays):
 
 
 @njit(cache=True)
-def _turned_readings(q, q_dot, q_ddot, place, direction):
+def _turned_readings(q: np.ndarray, q_dot: np.ndarray, q_ddot: np.ndarray, place: np.ndarray, direction: np.ndarray
+                     ) -> np.ndarray:
     out = np.empty((len(q), len(place)))
     for k in range(len(q)):
         turned_reading(out[k], q[k], q_dot[k], q_ddot[k], place, direction)
@@ -78,7 +79,7 @@ def _turned_readings(q, q_dot, q_ddot, place, direction):
 
 
 @njit(cache=True)
-def turned_force(out, q, u, arrays):
+def turned_force(out: np.ndarray, q: np.ndarray, u: np.ndarray, arrays: RigArrays) -> None:
     """out (6,): force added by the motors when their axes turn by the payload's small rotation."""
     for i in range(6):
         out[i] = 0.0
@@ -96,7 +97,8 @@ def turned_force(out, q, u, arrays):
 
 
 @njit(cache=True)
-def turned_reading(out, q, q_dot, q_ddot, place, direction):
+def turned_reading(out: np.ndarray, q: np.ndarray, q_dot: np.ndarray, q_ddot: np.ndarray, place: np.ndarray,
+                   direction: np.ndarray) -> None:
     """out (n_y,): acceleration that sensors on the payload measure in addition to the linear one: their axes turn by
     its rotation, and their positions move with its square (3-2-1 angles, as in `rigs.nonlinear`)."""
     a, v, w = q[3:], q_dot[3:], q_ddot[3:]
@@ -116,7 +118,7 @@ def turned_reading(out, q, q_dot, q_ddot, place, direction):
                   + d[1] * (s23 * p[2] - (s11 + s33) / 2 * p[1]) - d[2] * (s11 + s22) / 2 * p[2])
 
 
-class March(NamedTuple):
+class SteppedTable(NamedTuple):
     """A sampled table with its second-order terms, from sample to sample.
 
     Phi (N, N); held, ramp (N, 6 + n_y): contributions over a period of constant and rising accelerations of the
@@ -141,7 +143,8 @@ class March(NamedTuple):
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
-def march(drive, volts, floor, x, before, started, table, arrays, states, beside):
+def step_through(drive: np.ndarray, volts: np.ndarray, floor: np.ndarray, x: np.ndarray, before: np.ndarray,
+                 started: bool, table: SteppedTable, arrays: RigArrays, states: np.ndarray, beside: np.ndarray) -> None:
     """Step through a piece of a record.
 
     drive : (n, N) contribution of the inputs to the state over a period. volts (n, n_u), floor (n, 3): acting at its
@@ -199,8 +202,8 @@ def march(drive, volts, floor, x, before, started, table, arrays, states, beside
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
-def march_linear(drive, x, Phi, states):
-    """`march` for the linear table."""
+def step_through_linear(drive: np.ndarray, x: np.ndarray, Phi: np.ndarray, states: np.ndarray) -> None:
+    """`step_through` for the linear table."""
     N = x.shape[0]
     after = np.empty(N)
     for k in range(drive.shape[0]):

@@ -102,10 +102,12 @@ class LikelihoodFit(Generic[Fitted]):
 
     @property
     def values(self) -> np.ndarray:
+        """(n_p,) estimate."""
         return self.model.values
 
     @property
     def chi2_per_dof(self) -> float:
+        """Reduced chi-square, 1 expected."""
         return self.chi2 / self.dof
 
 
@@ -172,7 +174,8 @@ def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Pri
                          + best.largest_moments())
 
 
-def _thinned_descent(begin: Fitted, blocks, priors, first: Fitted, max_iterations: int) -> Fitted:
+def _thinned_descent(begin: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior], first: Fitted,
+                     max_iterations: int) -> Fitted:
     """A first descent on a subset of the lines: from a distant start it leads to the same minimum in less time."""
     few = [thinned(block, max(SETTINGS.thin_lines, len(block.omega) // SETTINGS.thin_by)) for block in blocks]
     descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
@@ -183,7 +186,8 @@ def _thinned_descent(begin: Fitted, blocks, priors, first: Fitted, max_iteration
 class _Descent(Generic[Fitted]):
     """One Levenberg-Marquardt run."""
 
-    def __init__(self, model: Fitted, blocks, whiteners, priors, first: Fitted):
+    def __init__(self, model: Fitted, blocks: Sequence[SpectralBlock], whiteners: Sequence[np.ndarray],
+                 priors: Mapping[str, Prior], first: Fitted):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
         self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
         self.rows = _held_rows(first)
@@ -297,13 +301,11 @@ class _Descent(Generic[Fitted]):
 
     def at_bound(self) -> np.ndarray:
         """(n_p,) which parameters are at their smallest physical value."""
-        slack = 1e-9 * np.abs(self.lowest, where=np.isfinite(self.lowest), out=np.zeros(len(self.lowest)))
-        return self.model.values <= self.lowest + slack
+        return self.model.values <= self.lowest + _slack(self.lowest)
 
     def at_top(self) -> np.ndarray:
         """(n_p,) which parameters are at their largest value."""
-        slack = 1e-9 * np.abs(self.highest, where=np.isfinite(self.highest), out=np.zeros(len(self.highest)))
-        return self.model.values >= self.highest - slack
+        return self.model.values >= self.highest - _slack(self.highest)
 
     def _try(self, step: np.ndarray) -> tuple[Fitted, float] | None:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
@@ -323,6 +325,11 @@ class _Descent(Generic[Fitted]):
             return None
         chi2 = self.evaluate(model, derivative=False).chi2
         return (model, chi2) if np.isfinite(chi2) else None
+
+
+def _slack(bound: np.ndarray) -> np.ndarray:
+    """(n_p,) distance at which a parameter counts as being at its bound."""
+    return 1e-9 * np.abs(bound, where=np.isfinite(bound), out=np.zeros(len(bound)))
 
 
 def _physical(model: FrequencyModel) -> bool:
@@ -401,7 +408,7 @@ def whitener(block: SpectralBlock) -> np.ndarray:
         factor = np.linalg.cholesky(block.noise)
     except np.linalg.LinAlgError:
         raise InputError("expected a positive definite noise covariance on every line; a channel without noise, or two "
-                         "channels that repeat each other, leave it singular", field=f"block {block.name}") from None
+                         "equal channels, make it singular", field=f"block {block.name}") from None
     correction = 1.0 if np.isinf(block.dof) else (block.dof - n_y) / block.dof
     return np.sqrt(2 * correction) * np.linalg.inv(factor)
 
@@ -464,7 +471,7 @@ def _held_rows(first: FrequencyModel) -> np.ndarray:
     return rows[rows @ first.values >= -SETTINGS.edge * np.abs(rows) @ np.abs(first.values)]
 
 
-def _check(model: FrequencyModel, blocks, priors, starts: int) -> None:
+def _check(model: FrequencyModel, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior], starts: int) -> None:
     if not model.names:
         raise InputError("expected at least one free parameter", field="parameters")
     if not blocks:

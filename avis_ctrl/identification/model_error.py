@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from avis_ctrl.checks import places
-from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.predictor import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
@@ -36,9 +36,7 @@ class Unexplained(RecordSource):
         self.record, self.model, self.header = record, model, record.header
         h = record.header
         self.columns = places(model.sensors.names, h.y_names, "the record has", f"record {h.name}: y names")
-        if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
-            raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
-                             field=f"record {h.name}: sample_rate_Hz")
+        model.require_rate(h)
         self.predictor, self.at = Predictor(model, large_motion=True), 0
         self.last: tuple[int, int, Record] | None = None
 

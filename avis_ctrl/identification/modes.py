@@ -54,10 +54,12 @@ class ModelModes:
 
     @property
     def frequency_std_Hz(self) -> np.ndarray:
+        """(n,) standard deviations of the frequencies."""
         return np.sqrt(np.diag(self.covariance)[:len(self.damping)])
 
     @property
     def damping_std(self) -> np.ndarray:
+        """(n,) standard deviations of the damping ratios."""
         return np.sqrt(np.diag(self.covariance)[len(self.damping):])
 
 

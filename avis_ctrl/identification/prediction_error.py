@@ -49,20 +49,20 @@ class PredictionError:
     @property
     def output_chi2(self) -> np.ndarray:
         """(n_y,) the same for each output separately, relative to its own variance."""
-        return np.sum(2 * np.abs(self.error) ** 2 / self._variance, axis=(0, 2))
+        # 1/variance of an estimate is too large by dof/(dof - 1).
+        dof = self.block.dof
+        variance = self._variance if np.isinf(dof) else self._variance * dof / (dof - 1)
+        return np.sum(2 * np.abs(self.error) ** 2 / variance, axis=(0, 2))
 
     @property
     def _variance(self) -> np.ndarray:
-        """(n, n_y, 1 or m) noise variance of each output; 1/variance of an estimate is too large by dof/(dof - 1)."""
+        """(n, n_y, 1 or m) noise variance of each output."""
         assert self.block.noise is not None
-        variance = np.real(np.einsum("kmii->kim", self.block.noise))
-        return variance if np.isinf(self.block.dof) else variance * self.block.dof / (self.block.dof - 1)
+        return np.real(np.einsum("kmii->kim", self.block.noise))
 
     def noise_share(self) -> np.ndarray:
         """(n_y,) expected sum of |noise|^2 in each output's error if it is noise only."""
-        assert self.block.noise is not None
-        variance = np.real(np.einsum("kmii->kim", self.block.noise))
-        whole = np.sum(np.broadcast_to(variance, self.error.shape), axis=(0, 2))
+        whole = np.sum(np.broadcast_to(self._variance, self.error.shape), axis=(0, 2))
         return whole * self.output_dof / (2 * self.error.shape[0] * self.error.shape[2])
 
     def expected(self, covariance: np.ndarray) -> float:

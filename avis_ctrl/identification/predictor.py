@@ -17,7 +17,7 @@ import scipy.linalg as la
 
 from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.large_motion import March, march, march_linear, sensors_of
+from avis_ctrl.identification.large_motion import SteppedTable, sensors_of, step_through, step_through_linear
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.rigs.nonlinear import rig_arrays
@@ -129,13 +129,13 @@ class Predictor:
         self.part = part
         self.x = np.zeros(len(self.Phi))
         self.pending = np.zeros((self.whole + 1, n_u))
-        self.table: March | None = None
+        self.table: SteppedTable | None = None
         if large_motion:
             held, rising = (np.ascontiguousarray(step[:, n_u + 3:]) for step in whole_step[1:])
-            self.table, self.arrays = self._march(held, rising), rig_arrays(model.rig.mounted_body())
+            self.table, self.arrays = self._stepped(held, rising), rig_arrays(model.rig.mounted_body())
             self.before, self.started = np.zeros(6 + len(model.sensors.names)), False
 
-    def _march(self, held: np.ndarray, rising: np.ndarray) -> March:
+    def _stepped(self, held: np.ndarray, rising: np.ndarray) -> SteppedTable:
         model, m = self.model, self.model.matrices
         n_u, corner = len(model.actuators), model.amplifier_corner_Hz
         known = [one.name for one in model.rig.mounted_body().actuators]
@@ -143,11 +143,11 @@ class Predictor:
         of_x, of_volts, of_floor = (np.ascontiguousarray(one) for one in
                                     np.split(_body(model), [TABLE, TABLE + n_u], axis=1))
         place, direction = sensors_of(model.rig, model.sensors.names)
-        return March(np.ascontiguousarray(self.Phi), held, rising, of_x, of_volts, of_floor,
-                     TABLE + chains if corner else -1,
-                     np.array([known.index(name) for name in model.actuators], np.int64),
-                     np.ascontiguousarray(la.inv(m.M)), place, direction, float(model.turning.motors),
-                     float(model.turning.sensors))
+        return SteppedTable(np.ascontiguousarray(self.Phi), held, rising, of_x, of_volts, of_floor,
+                            TABLE + chains if corner else -1,
+                            np.array([known.index(name) for name in model.actuators], np.int64),
+                            np.ascontiguousarray(la.inv(m.M)), place, direction, float(model.turning.motors),
+                            float(model.turning.sensors))
 
     def _step(self, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Step over a fraction of a period: e^(A h), and the contributions of a constant and a rising unit input."""
@@ -177,11 +177,11 @@ class Predictor:
         acting = new if not np.any(self.old) else old
         inputs = [acting, w[:-1]]
         if self.table is None:
-            march_linear(drive, self.x, self.Phi, x)
+            step_through_linear(drive, self.x, self.Phi, x)
         else:
             beside = np.empty((n, len(self.before)))
-            march(drive, np.ascontiguousarray(self.part * old + (1 - self.part) * new), w[:-1], self.x, self.before,
-                  self.started, self.table, self.arrays, x, beside)
+            step_through(drive, np.ascontiguousarray(self.part * old + (1 - self.part) * new), w[:-1], self.x,
+                         self.before, self.started, self.table, self.arrays, x, beside)
             self.started = self.started or n > 0
             inputs.append(beside)
         y = x @ self.system.C.T
@@ -199,10 +199,7 @@ def predict(model: ResponseModel, record: Record, large_motion: bool = True) -> 
     ------
     InputError : channels or a sample rate that are not the model's.
     """
-    h = record.header
-    if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
-        raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
-                         field=f"record {h.name}: sample_rate_Hz")
+    model.require_rate(record.header)
     return Predictor(model, large_motion).read(*model_inputs(model, record))
 
 

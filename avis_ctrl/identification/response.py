@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, wraps
 from itertools import zip_longest
 from typing import NamedTuple, Protocol, Self, TypeVar
+from weakref import ref
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from avis_ctrl.identification.sample_and_hold import Motion, aliases, hold
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.rigs.rig import Parameter, Rig
 
 FLOOR = ("vx", "vy", "vz")
@@ -59,17 +61,21 @@ def _aliases(lines: bytes, period_s: float, delay_s: float, motion: Motion, corn
 
 def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
                ) -> Callable[[Model, np.ndarray], Value]:
-    """Cache the last `most` results of a method of lines omega; they are read-only. A fit needs them repeatedly, and
-    records of one kind share their lines."""
-    known: list[tuple[Model, np.ndarray, Value]] = []
+    """Cache the last `most` results of a method of lines omega, while their models live; they are read-only. A fit
+    needs them repeatedly, and records of one kind share their lines."""
+    known: list[tuple[ref[Model], np.ndarray, Value]] = []
 
+    def forget(gone: ref[Model]) -> None:
+        known[:] = [one for one in known if one[0] is not gone]
+
+    # Threads share the list. It is only replaced as a whole: at worst, a result is computed twice.
     @wraps(compute)
     def found(model: Model, omega: np.ndarray) -> Value:
-        for one, lines, value in known:
-            if one is model and lines is omega:
+        for one, lines, value in tuple(known):
+            if one() is model and lines is omega:
                 return value
-        known.append((model, omega, value := compute(model, omega)))
-        del known[:-most]
+        value = compute(model, omega)
+        known[:] = [*known, (ref(model, forget), omega, value)][-most:]
         return value
     return found
 
@@ -132,7 +138,7 @@ class SensorModel:
 
     def picked(self, index: Sequence[int]) -> SensorModel:
         """The sensors at `index`, in that order; an index may be repeated."""
-        def of(values: tuple) -> tuple:
+        def of(values: tuple[Value, ...]) -> tuple[Value, ...]:
             return tuple(values[k] for k in index)
         return SensorModel(of(self.names), of(self.motions), of(self.chains), self.sensitivity[list(index)], self.unit,
                            of(self.sensitivity_units), of(self.poles), self.relative[list(index)],
@@ -309,28 +315,56 @@ class FrequencyModel(Protocol):
     (`gap.table_model`)."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Free parameters."""
     @property
-    def units(self) -> tuple[str, ...]: ...
+    def units(self) -> tuple[str, ...]:
+        """(n_p,) their units."""
     @property
-    def values(self) -> np.ndarray: ...
+    def values(self) -> np.ndarray:
+        """(n_p,) their present values; read-only."""
     @property
-    def actuators(self) -> tuple[str, ...]: ...
+    def actuators(self) -> tuple[str, ...]:
+        """Driven inputs."""
     @property
-    def inputs(self) -> tuple[str, ...]: ...
+    def inputs(self) -> tuple[str, ...]:
+        """Actuators, then the floor's velocities."""
     @property
-    def matrices(self) -> Matrices: ...
+    def matrices(self) -> Matrices:
+        """Equations of motion and sensor rows."""
     @property
-    def derivative_matrices(self) -> Matrices: ...
-    def scales(self) -> np.ndarray: ...
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]: ...
-    def reach(self) -> tuple[np.ndarray, np.ndarray]: ...
-    def at(self, theta: Sequence[float] | np.ndarray) -> Self: ...
-    def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven: ...
+    def derivative_matrices(self) -> Matrices:
+        """Derivatives by the free parameters."""
+    def scales(self) -> np.ndarray:
+        """(n_p,) size of one relative unit of each parameter."""
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) lower and upper bounds in a fit that starts here."""
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) largest relative decrease and increase in one step of a fit."""
+    def at(self, theta: Sequence[float] | np.ndarray) -> Self:
+        """The model with its free parameters at theta."""
+    def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
+        """y for spectra of the inputs."""
     def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
-               inner: np.ndarray | None = None) -> Driven: ...
-    def sensor_transients(self, omega: np.ndarray) -> np.ndarray: ...
-    def inner_transients(self, omega: np.ndarray) -> np.ndarray: ...
+               inner: np.ndarray | None = None) -> Driven:
+        """y of a block of data."""
+    def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
+        """Transients of the sensors."""
+    def inner_transients(self, omega: np.ndarray) -> np.ndarray:
+        """y by initial states other than those of body and sensors."""
+
+
+def size_of(values: np.ndarray) -> np.ndarray:
+    """(n_p,) size of one relative unit of each parameter: its magnitude, or 0.1 (m, kg m^2, ..) if it is zero."""
+    return np.where(values == 0, 0.1, np.abs(values))
+
+
+def central_differences(matrices_of: Callable[[Rig], Sequence[np.ndarray]], rig: Rig, name: str) -> list[np.ndarray]:
+    """Derivatives of a rig's matrices by a parameter, exact at any step for polynomials of second degree."""
+    value = rig.parameters()[name].value
+    step = 0.1 * abs(value) or 1e-3  # large enough to avoid cancellation
+    up, down = (matrices_of(rig.with_parameters({name: value + sign * step})) for sign in (1, -1))
+    return [(high - low) / (2 * step) for high, low in zip(up, down, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,13 +437,13 @@ class ResponseModel:
 
     @property
     def units(self) -> tuple[str, ...]:
+        """(n_p,) units of the free parameters."""
         known = self.all_parameters()
         return tuple(known[name].unit for name in self.names)
 
     def scales(self) -> np.ndarray:
-        """(n_p,) size of one relative unit of each parameter: its magnitude, or 0.1 (m, kg m^2, ..) if it is zero."""
-        values = self.values
-        return np.where(values == 0, 0.1, np.abs(values))
+        """(n_p,) size of one relative unit of each parameter."""
+        return size_of(self.values)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_p,) lower and upper bounds in a fit that starts here: LOWEST times its size for a positive parameter."""
@@ -425,6 +459,12 @@ class ResponseModel:
     def inputs(self) -> tuple[str, ...]:
         """Actuators, then the floor's velocities."""
         return (*self.actuators, *FLOOR)
+
+    def require_rate(self, header: RecordHeader) -> None:
+        """Raise InputError for a record that was sampled at another rate."""
+        if self.period_s and abs(header.sample_rate_Hz * self.period_s - 1) > 1e-6:
+            raise InputError(f"expected the rig's own {1 / self.period_s:g} Hz", value=header.sample_rate_Hz,
+                             field=f"record {header.name}: sample_rate_Hz")
 
     def at(self, theta: Sequence[float] | np.ndarray) -> Self:
         """The model with its free parameters at theta (n_p,). Raises InputError if no rig has these values."""
@@ -463,7 +503,7 @@ class ResponseModel:
         for j, name in enumerate(self.names):
             if name not in known:
                 continue
-            for which, channel, slope in self.rig.slopes(name) or self._differences(name, known[name].value):
+            for which, channel, slope in self.rig.slopes(name) or self._differences(name):
                 if not channel:
                     getattr(found, which)[j] = slope
                 elif which == "T" and channel in self.actuators:
@@ -472,12 +512,10 @@ class ResponseModel:
                     found.R[j, self.sensors.names.index(channel)] = slope
         return found
 
-    def _differences(self, name: str, value: float) -> list[tuple[str, str, np.ndarray]]:
-        """As `Rig.slopes`, whole matrices: central differences, exact at any step for polynomials of second degree."""
-        step = 0.1 * abs(value) or 1e-3  # large enough to avoid cancellation
-        up, down = (self.matrices_of(self.rig.with_parameters({name: value + sign * step})) for sign in (1, -1))
-        slopes = (high - low for high, low in zip(up, down, strict=True))
-        return [(which, "", slope / (2 * step)) for which, slope in zip(Matrices._fields, slopes, strict=True)]
+    def _differences(self, name: str) -> list[tuple[str, str, np.ndarray]]:
+        """As `Rig.slopes`, whole matrices."""
+        slopes = central_differences(self.matrices_of, self.rig, name)
+        return [(which, "", slope) for which, slope in zip(Matrices._fields, slopes, strict=True)]
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """G, (n, n_y, n_u + 3): from commanded volts and floor velocity [m/s] to y; omega > 0 [rad/s]."""
@@ -570,7 +608,8 @@ class ResponseModel:
             dY[self.names.index("loop_delay_s")] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
         return Driven(Y, dY)
 
-    def _delay_derivative(self, omega, volts, mat, inverse, out, Minv) -> np.ndarray:
+    def _delay_derivative(self, omega: np.ndarray, volts: np.ndarray, mat: Matrices, inverse: np.ndarray,
+                          out: np.ndarray, Minv: np.ndarray) -> np.ndarray:
         """Exact for the continuous term; a difference for the aliases, which are small and have a kink at whole
         samples."""
         s, step = 1j * omega[:, None, None], 1e-4 * (self.period_s or 1e-3)

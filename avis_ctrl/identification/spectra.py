@@ -30,9 +30,7 @@ def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, flo
     InputError : a channel that the model does not have, a band without lines, a rate that is not the model's.
     """
     h = record.header
-    if model.period_s and abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
-        raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
-                         field=f"record {h.name}: sample_rate_Hz")
+    model.require_rate(h)
     frequency = scipy.fft.rfftfreq(h.samples, 1 / h.sample_rate_Hz)
     keep = (frequency >= band_Hz[0]) & (frequency <= band_Hz[1]) & (frequency > 0)
     if not np.any(keep):

@@ -51,7 +51,7 @@ class SpectralBlock:
             raise InputError(f"expected U (n, n_in, m) and Y (n, n_y, m) on {n} lines",
                              field=f"block {self.name}", value=(self.U.shape, self.Y.shape))
         if self.transient and m != 1:
-            raise InputError("expected one experiment where a transient is to be found", field=f"block {self.name}")
+            raise InputError("expected one experiment in a block with a transient", field=f"block {self.name}")
 
     @property
     def numbers(self) -> int:

@@ -120,7 +120,7 @@ def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence
         cannot drive or distinguish, or that the records do not excite.
     """
     if not confidences or not all(0 < one < 1 for one in confidences):
-        raise InputError("expected shares between 0 and 1", field="confidences", value=list(confidences))
+        raise InputError("expected probabilities between 0 and 1", field="confidences", value=list(confidences))
     rows, drives = _channels(measured, model)
     A, D = kept_axes(model.rig, keep, model.actuators, model.sensors.names)
     D = D / model.sensors.sensitivity

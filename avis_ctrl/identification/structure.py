@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import ResponseModel, size_of
 from avis_ctrl.identification.sparse_space import components, reduced_rows, sparse_rows, whole_numbers
 
 # The derivative is exact to about 1e-12; a singular value below this, relative to the largest, counts as zero.
@@ -56,11 +56,6 @@ class Structure:
     singles: tuple[int, ...]
 
 
-def size_of(values: np.ndarray) -> np.ndarray:
-    """One relative unit of each parameter: its size, or 0.1 if it is zero (as in the fit)."""
-    return np.where(values == 0, 0.1, np.abs(values))
-
-
 def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarray:
     """(n_p, d) orthonormal, relative: directions that change no response of the model at any frequency.
 
@@ -74,7 +69,7 @@ def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarr
     found = model.driven(lines, U)
     level = np.sqrt(np.mean(np.abs(found.Y) ** 2, axis=1, keepdims=True))
     J = (found.dY / np.where(level > 0, level, 1.0)).reshape(len(model.names), -1)
-    J = np.concatenate([J.real, J.imag], axis=1) * size_of(model.values)[:, None]
+    J = np.concatenate([J.real, J.imag], axis=1) * model.scales()[:, None]
     norm = np.linalg.norm(J, axis=1)
     acting = norm > _ZERO * norm.max(initial=0.0)
     unit = J / np.where(acting, norm, 1.0)[:, None]

@@ -207,7 +207,8 @@ def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: Sp
     expected = error.expected(covariance) / error.dof
     power = np.sum(np.abs(block.Y) ** 2, axis=(0, 2))
     if not np.all(power > 0):
-        raise InputError("expected outputs that move", field=f"held-out record {block.name}", value=power.tolist())
+        raise InputError("expected outputs that are not zero", field=f"held-out record {block.name}",
+                         value=power.tolist())
     of_output = [interval(expected, dof, noise_dof / len(power), LEVEL) for dof in error.output_dof]
     floor = error.noise_share()
     white = whiteness(error, model.sensors.names, model.inputs, covariance, noise_dof / (2 * len(power)), families)

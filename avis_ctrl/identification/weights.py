@@ -78,6 +78,7 @@ class Weights:
 
     @property
     def log_determinant(self) -> float:
+        """Sum over all levels and bands."""
         return float(sum(self.log_determinants.values()))
 
     def flatten(self, x: np.ndarray) -> np.ndarray:

@@ -52,6 +52,7 @@ class Correlation:
 
     @property
     def sentence(self) -> str:
+        """Result in words."""
         ratio = self.value / self.limit
         row, lag = np.unravel_index(np.argmax(ratio), ratio.shape)
         at = f"{self.lags[lag]:.3g} {self.lag_unit}"
@@ -70,10 +71,12 @@ class Whiteness:
 
     @property
     def white(self) -> bool:
+        """Whether no correlation exceeds its limit."""
         return not any(one.beyond for one in self.correlations)
 
     @property
     def sentences(self) -> tuple[str, ...]:
+        """Results in words."""
         return tuple(one.sentence for one in self.correlations)
 
 

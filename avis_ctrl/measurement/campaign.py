@@ -87,6 +87,7 @@ class RecordHeader:
 
     @property
     def duration_s(self) -> float:
+        """Number of samples over the sample rate."""
         return self.samples / self.sample_rate_Hz
 
     @property
@@ -232,18 +233,22 @@ class Campaign:
 
     @property
     def sample_rate_Hz(self) -> float:
+        """Sample rate of all records."""
         return self.records[0].header.sample_rate_Hz
 
     @property
     def u_names(self) -> tuple[str, ...]:
+        """Names of the inputs of all records."""
         return self.records[0].header.u_names
 
     @property
     def y_names(self) -> tuple[str, ...]:
+        """Names of the outputs of all records."""
         return self.records[0].header.y_names
 
     @property
     def y_unit(self) -> str:
+        """Unit of the outputs of all records."""
         return self.records[0].header.y_unit
 
     def named(self, name: str) -> RecordSource:

@@ -5,15 +5,15 @@ Measurement files, recognised by their content:
 
 HDF5 campaign: /records/NN with u, y, floor; or /frf with frequency_Hz, value and variance or coherence.
 
-MATLAB .mat (v5 to v7.3), flat: u, y (samples by channels, either way round) and t or fs (sample_rate_Hz, Fs, Ts, dt).
+MATLAB .mat (v5 to v7.3), flat: u, y (samples by channels, or transposed) and t or fs (sample_rate_Hz, Fs, Ts, dt).
 Optional: u_names, y_names (cell arrays), u_unit, y_unit, floor (three velocities), excitation, period_s, level_V,
 start_s, rig.
 
 MATLAB .mat, records: a struct array `records` with the fields of the flat layout, one element per record; u, y and t or
-sample_rate_Hz (or fs) are required, all else is optional: excitation (multisine, noise, rest, floor or sine; by default
-multisine with period_s, rest where u is zero, otherwise noise), period_s (empty, 0 or NaN where not periodic), start_s
-(by default one record after the other), level_V (from u), name. Names, units and rate that all records share may stand
-beside `records`, as does rig.
+sample_rate_Hz (or fs) are required. Optional: excitation (multisine, noise, rest, floor or sine; by default multisine
+with period_s, rest if u is zero, otherwise noise), period_s (empty, 0 or NaN if not periodic), start_s (by default one
+record after the other), level_V (by default from u), name. Names, units and rate that apply to all records may be
+variables next to `records`, where rig is, too.
 
 MATLAB .mat, frequency responses: frequency_Hz, H (lines, outputs, inputs) and variance, or coherence with averages;
 optional: inputs, outputs, input_unit, output_unit.
@@ -23,7 +23,7 @@ UFF 58 and 58b: time responses, or frequency responses with their coherence; ASC
 CSV: header line with channel names such as "Sz1 [V]", column t or "# sample_rate_Hz = 1000"; a directory of CSV files
 is a campaign, one record each.
 
---columns says which variable, channel or column is what: u=vir,y=qm,t=t (roles t, u, y, floor, sample_rate_Hz; several
-of one role: u=A1+A2), and what the channels are called: y_names=Sy1+Sz1 (a variable of that name, or the names
+--columns assigns variables, channels or columns to roles: u=vir,y=qm,t=t (roles t, u, y, floor, sample_rate_Hz; several
+for one role: u=A1+A2). It also names the channels: y_names=Sy1+Sz1 (the variable with the names, or the names
 themselves in the order of the file's channels).
 """

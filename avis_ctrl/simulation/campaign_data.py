@@ -87,10 +87,12 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     ambient = _ambient(rig, plan)
     planned = list(_signals(loop, plan, seed))
     records, notes, start_s = [], _assumptions(loop, plan, seed, ambient), 0.0
-    ends_s = sum(plan.settle_s + len(one.u) / rig.sample_rate_Hz for one in planned)
+    settle = round(plan.settle_s * rig.sample_rate_Hz)
+    settle_s = settle / rig.sample_rate_Hz
+    ends_s = sum(settle_s + len(one.u) / rig.sample_rate_Hz for one in planned)
     for k, one in enumerate(planned):
-        start_s += plan.settle_s
-        record, note = _record(loop, plan, one, ambient, (seed, k), start_s, change, (plan.settle_s, ends_s))
+        start_s += settle_s
+        record, note = _record(loop, plan, one, ambient, (seed, k), settle, start_s, change, (settle_s, ends_s))
         records.append(record)
         notes.append(note)
         start_s += record.header.duration_s
@@ -214,11 +216,10 @@ def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None
 
 
 def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None,
-            seed: tuple[int, int], start_s: float, change: SensorChange | None,
+            seed: tuple[int, int], settle: int, start_s: float, change: SensorChange | None,
             campaign_s: tuple[float, float]) -> tuple[Record, str]:
     """One record, and a sentence on its levels."""
     fs, samples, name = loop.sample_rate_Hz, len(one.u), f"{seed[1]:02d}"
-    settle = round(plan.settle_s * fs)
     floor = _floor(loop, plan, one, ambient, settle, _rng(*seed, _FLOOR))
     run = _run(loop, one.u, settle, floor, (*seed, _NOISE), plan.truth.nonlinear)
     if run.diverged:

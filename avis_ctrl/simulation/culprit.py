@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.lti.statespace import gain
+from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import period_map, spectral_radius
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
@@ -71,7 +72,7 @@ def find_culprit(loop: SampledLoop) -> Culprit:
 def _who(loop: SampledLoop) -> tuple[str, tuple[str, ...]]:
     idle = gain(np.zeros(loop.K.D.shape))
 
-    def stable(K, keep) -> bool:
+    def stable(K: StateSpace, keep: Collection[str]) -> bool:
         return spectral_radius(replace(loop, K=K, loops={a: s for a, s in loop.loops.items() if a in keep})) < 1
     if not stable(idle, ()):
         return "table", ()

@@ -44,6 +44,7 @@ class PlantCheck:
 
     @property
     def stable(self) -> bool:
+        """Whether the linear loop is stable and the simulation did not diverge."""
         return not self.diverged and self.spectral_radius < 1.0
 
     @property
@@ -53,13 +54,16 @@ class PlantCheck:
 
     @property
     def agrees(self) -> bool:
+        """Whether the spectrum agrees with its prediction."""
         return self.spectrum is not None and self.spectrum.agrees
 
     @property
     def passed(self) -> bool:
+        """Whether the plant passes all checks."""
         return self.stable and self.agrees and self.within_limits
 
     def as_dict(self) -> dict[str, Any]:
+        """Values for a file."""
         return {"name": self.name, "passed": self.passed, "stable": self.stable, "diverged": self.diverged,
                 "spectral_radius": self.spectral_radius, "spectrum_agrees": self.agrees,
                 "spectrum": self.spectrum.as_dict() if self.spectrum else None, "within_limits": self.within_limits,
@@ -79,6 +83,7 @@ class SimulationCheck:
 
     @property
     def passed(self) -> bool:
+        """Whether the plant passes all checks."""
         return all(plant.passed for plant in self.plants)
 
     def as_dict(self) -> dict[str, Any]:

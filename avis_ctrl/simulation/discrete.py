@@ -212,12 +212,11 @@ def rest_state(loop: SampledLoop) -> RestState:
 
 
 def gain_at_rest(K: StateSpace) -> np.ndarray:
-    """(n_u, n_y) DC gain of a system; inf if it has a pole at zero frequency."""
+    """(n_u, n_y) DC gain of a system; all entries are inf if it has a pole at zero frequency to within round-off."""
     edge = np.eye(K.nstates) - K.A if K.dt else -K.A
-    try:
-        return K.D + K.C @ np.linalg.solve(edge, K.B)
-    except np.linalg.LinAlgError:
+    if np.linalg.matrix_rank(la.matrix_balance(edge)[0]) < K.nstates:
         return np.full(K.D.shape, np.inf)
+    return K.D + K.C @ np.linalg.solve(edge, K.B)
 
 
 def spectral_radius(loop: SampledLoop) -> float:

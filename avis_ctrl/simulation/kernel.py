@@ -7,6 +7,7 @@ run. numba's cache of compiled code checks the date of this file only: after a c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numba import njit
 from avis_ctrl.rigs.converter import quantise
 from avis_ctrl.rigs.nonlinear import payload_acceleration
 from avis_ctrl.simulation.discrete import StepArrays
+from avis_ctrl.simulation.sampled_loop import AntiWindup
 
 _quantise = njit(cache=True)(quantise)
 
@@ -69,7 +71,7 @@ def workspace(arrays: StepArrays, state: np.ndarray, delay: int) -> Work:
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
-def _multiply(out, A, x):
+def _multiply(out: np.ndarray, A: np.ndarray, x: np.ndarray) -> None:
     for i in range(A.shape[0]):
         total = 0.0
         for j in range(A.shape[1]):
@@ -78,14 +80,14 @@ def _multiply(out, A, x):
 
 
 @njit(cache=True)
-def _put(out, start, values):
+def _put(out: np.ndarray, start: int, values: np.ndarray) -> None:
     """out[start:start + len(values)] = values"""
     for i in range(values.shape[0]):
         out[start + i] = values[i]
 
 
 @njit(cache=True)
-def _arrive(work, floor, k, j, substeps, step):
+def _arrive(work: Work, floor: np.ndarray, k: int, j: int, substeps: int, step: int) -> None:
     """Floor velocity over substep j of period k, and the voltages that start to act at its beginning."""
     delay = work.line.shape[0] - 1
     for i in range(6):
@@ -96,7 +98,7 @@ def _arrive(work, floor, k, j, substeps, step):
 
 
 @njit(cache=True)
-def _excess(arrays, work):
+def _excess(arrays: StepArrays, work: Work) -> None:
     """N: acceleration of the nonlinear table minus that of the linear table."""
     x, n, n_u = work.x, work.x.shape[0], work.u.shape[0]
     _put(work.observe_in, 0, x)
@@ -109,7 +111,7 @@ def _excess(arrays, work):
 
 
 @njit(cache=True)
-def _sense(arrays, work, noise, adc, sensed_row):
+def _sense(arrays: StepArrays, work: Work, noise: np.ndarray, adc: np.ndarray, sensed_row: np.ndarray) -> None:
     """Converter readings for the present motion and sample noise (n_s,), as the controller's input."""
     n, n_s = work.x.shape[0], work.sensed.shape[0]
     n_c = work.control_in.shape[0] - n_s
@@ -124,7 +126,7 @@ def _sense(arrays, work, noise, adc, sensed_row):
 
 
 @njit(cache=True)
-def _control(arrays, work):
+def _control(arrays: StepArrays, work: Work) -> None:
     """Next state and output voltages of the linear controller."""
     n_c = work.control_in.shape[0] - work.sensed.shape[0]
     _multiply(work.controlled, arrays.control, work.control_in)
@@ -133,7 +135,8 @@ def _control(arrays, work):
 
 
 @njit(cache=True)
-def _demand(work, step, drive, limit_V, windup, demanded_row):
+def _demand(work: Work, step: int, drive: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, demanded_row: np.ndarray
+            ) -> None:
     """Limit the sum of the controller's voltages and `drive` (n_u,) and delay it; without delay it acts at once.
 
     The anti-windup (keep, feed) compares the controller's own voltages with the limits and subtracts what the limits
@@ -152,7 +155,7 @@ def _demand(work, step, drive, limit_V, windup, demanded_row):
 
 
 @njit(cache=True)
-def _advance(arrays, work):
+def _advance(arrays: StepArrays, work: Work) -> None:
     n, n_u = work.x.shape[0], work.u.shape[0]
     _put(work.advance_in, 0, work.x)
     _put(work.advance_in, n, work.u)
@@ -166,7 +169,7 @@ def _advance(arrays, work):
 
 
 @njit(cache=True)
-def _gone(x, far):
+def _gone(x: np.ndarray, far: np.ndarray) -> bool:
     """Whether the table has moved beyond `far` relative to the floor; non-finite values count as beyond."""
     inside = True
     for i in range(3):
@@ -175,60 +178,63 @@ def _gone(x, far):
 
 
 @njit(cache=True)
-def run(arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, windup, far, records):
+def _sample(arrays: StepArrays, work: Work, floor: np.ndarray, noise: np.ndarray, k: int, substeps: int, first: bool,
+            adc: np.ndarray, records: Records) -> None:
+    """Start of period k: converter readings; first : whether the sensors measure N, which is then computed before."""
+    _arrive(work, floor, k, 0, substeps, k * substeps)
+    if first:
+        _excess(arrays, work)
+    _sense(arrays, work, noise[k], adc, records.sensed[k])
+
+
+@njit(cache=True)
+def _period(arrays: StepArrays, work: Work, floor: np.ndarray, drive: np.ndarray, k: int, substeps: int,
+            nonlinear: bool, acceleration: bool, limit_V: np.ndarray, windup: AntiWindup, records: Records) -> None:
+    """The remainder of period k, with the controller's voltages for its sample."""
+    _demand(work, k * substeps, drive[k], limit_V, windup, records.demanded[k])
+    _put(records.volts[k], 0, work.u)
+    _put(records.q[k], 0, work.x[:6])
+    _put(records.q_dot[k], 0, work.x[6:12])
+    for j in range(substeps):
+        if j > 0:
+            _arrive(work, floor, k, j, substeps, k * substeps + j)
+        if nonlinear and (j > 0 or not acceleration):
+            _excess(arrays, work)
+        if k == 0 and j == 0:
+            _put(work.N_before, 0, work.N)
+        _advance(arrays, work)
+
+
+@njit(cache=True)
+def run(arrays: StepArrays, work: Work, floor: np.ndarray, noise: np.ndarray, drive: np.ndarray, substeps: int,
+        nonlinear: bool, acceleration: bool, adc: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, far: np.ndarray,
+        records: Records) -> int:
     """Step through the control periods; return how many were completed before the table left its range, or all.
 
     floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V added to the controller's.
-    substeps : steps per period. nonlinear : whether N is computed. acceleration : whether sensors measure it; N is then
-        computed before the sample.
+    substeps : steps per period. nonlinear : whether N is computed. acceleration : whether sensors measure it.
     adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. windup : (keep, feed) of the
         anti-windup.
     far : (m, rad) distance from the floor beyond which the table has diverged.
     """
-    step = 0
     for k in range(floor.shape[0] - 1):
-        for j in range(substeps):
-            _arrive(work, floor, k, j, substeps, step)
-            if nonlinear and acceleration:
-                _excess(arrays, work)
-            if j == 0:
-                _sense(arrays, work, noise[k], adc, records.sensed[k])
-                _control(arrays, work)
-                _demand(work, step, drive[k], limit_V, windup, records.demanded[k])
-                _put(records.volts[k], 0, work.u)
-                _put(records.q[k], 0, work.x[:6])
-                _put(records.q_dot[k], 0, work.x[6:12])
-            if nonlinear and not acceleration:
-                _excess(arrays, work)
-            if step == 0:
-                _put(work.N_before, 0, work.N)
-            _advance(arrays, work)
-            step += 1
+        _sample(arrays, work, floor, noise, k, substeps, nonlinear and acceleration, adc, records)
+        _control(arrays, work)
+        _period(arrays, work, floor, drive, k, substeps, nonlinear, acceleration, limit_V, windup, records)
         if _gone(work.x, far):
             return k + 1
     return floor.shape[0] - 1
 
 
-def run_stepwise(code, arrays, work, floor, noise, drive, substeps, nonlinear, acceleration, adc, limit_V, windup, far,
-                 records):
+def run_stepwise(code: Callable[[np.ndarray], np.ndarray], arrays: StepArrays, work: Work, floor: np.ndarray,
+                 noise: np.ndarray, drive: np.ndarray, substeps: int, nonlinear: bool, acceleration: bool,
+                 adc: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, far: np.ndarray, records: Records) -> int:
     """`run` with a controller called once per sample, which does its own anti-windup: code (n_s,) -> (n_u,) volts."""
-    n_s, n_u, step = work.sensed.shape[0], work.u.shape[0], 0
+    n_s, n_u = work.sensed.shape[0], work.u.shape[0]
     for k in range(floor.shape[0] - 1):
-        for j in range(substeps):
-            _arrive(work, floor, k, j, substeps, step)
-            if nonlinear and acceleration:
-                _excess(arrays, work)
-            if j == 0:
-                _sense(arrays, work, noise[k], adc, records.sensed[k])
-                work.controlled[work.controlled.shape[0] - n_u:] = code(work.control_in[-n_s:])
-                _demand(work, step, drive[k], limit_V, windup, records.demanded[k])
-                records.volts[k], records.q[k], records.q_dot[k] = work.u, work.x[:6], work.x[6:12]
-            if nonlinear and not acceleration:
-                _excess(arrays, work)
-            if step == 0:
-                work.N_before[:] = work.N
-            _advance(arrays, work)
-            step += 1
+        _sample(arrays, work, floor, noise, k, substeps, nonlinear and acceleration, adc, records)
+        work.controlled[work.controlled.shape[0] - n_u:] = code(work.control_in[-n_s:])
+        _period(arrays, work, floor, drive, k, substeps, nonlinear, acceleration, limit_V, windup, records)
         if _gone(work.x, far):
             return k + 1
     return floor.shape[0] - 1

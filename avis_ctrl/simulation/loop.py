@@ -48,10 +48,12 @@ class SimulationRecord:
 
     @cached_property
     def clipped_dac(self) -> int:
+        """Number of demanded voltages beyond the drives' limits."""
         return int(np.count_nonzero(np.abs(self.demanded) > self.loop.limits_V))
 
     @cached_property
     def clipped_adc(self) -> int:
+        """Number of sensor voltages beyond the converter's range."""
         converter = self.loop.sensors.converter
         return int(np.count_nonzero(converter.clipped(self.sensed))) if converter else 0
 

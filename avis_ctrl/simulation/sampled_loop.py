@@ -240,10 +240,12 @@ class SampledLoop:
 
     @property
     def n_drives(self) -> int:
+        """Number of drives."""
         return len(self.rig.equations_of_motion().actuators)
 
     @property
     def period_s(self) -> float:
+        """Sample period."""
         return 1.0 / self.sample_rate_Hz
 
     @property
@@ -255,6 +257,7 @@ class SampledLoop:
 
     @property
     def delay_substeps(self) -> int:
+        """Loop delay in steps of the simulation."""
         return round(self.loop_delay_s * self.sample_rate_Hz * self.substeps)
 
     def drives(self) -> list[StateSpace]:

@@ -70,9 +70,11 @@ class SpectrumAgreement:
 
     @property
     def agrees(self) -> bool:
+        """Whether all bands lie within the acceptance bounds."""
         return not np.any(self.outside)
 
     def as_dict(self) -> dict[str, Any]:
+        """Values for a file."""
         return {"axes": list(self.axes), "midband_Hz": self.midband_Hz.tolist(), "ratio": self.ratio.tolist(),
                 "lower": self.lower.tolist(), "upper": self.upper.tolist(), "dof": self.dof.tolist(),
                 "outside": int(np.count_nonzero(self.outside)), "bands": int(self.ratio.size),

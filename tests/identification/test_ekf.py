@@ -324,6 +324,13 @@ def test_directions_that_kept_their_prior_are_those_that_move_nothing(wrong, hon
         assert np.max(np.abs((part * model.values) @ kept)) < 1e-2 * np.max(np.abs(whole))
 
 
+def test_limits_reached_in_the_warm_up_are_not_counted(wrong, campaign):
+    """A limit just below the start holds some parameters at almost every sample of both rounds."""
+    record = campaign.records[0]
+    result = identify_ekf(wrong, [record], EkfSettings(warm_up=1, lowest=0.999, prior_share=0.3))
+    assert record.header.samples / 2 < result.guarded.max() <= record.header.samples
+
+
 def test_what_was_kept_from_record_to_record_tells_more_than_a_reset(wrong, campaign):
     kept = identify_ekf(wrong, campaign, EkfSettings(reset=False))
     reset = identify_ekf(wrong, campaign, SOURCE_SETTINGS)

@@ -242,7 +242,7 @@ def test_data_that_do_not_fit(rig, campaign):
         identify_ekf(rig, [replace(record, header=replace(record.header, u_unit="N"))], names=FEW)
     with pytest.raises(InputError, match="at least one record"):
         identify_ekf(rig, [], names=FEW)
-    with pytest.raises(InputError, match="give R"):
+    with pytest.raises(InputError, match="state R"):
         identify_ekf(rig, [replace(record, header=replace(record.header, y_unit="m/s"))], HONEST_SETTINGS, FEW)
     with pytest.raises(InputError, match="sensors of the rig"):
         identify_ekf(rig, [replace(record, header=replace(record.header, y_names=tuple("abcdef")))], names=FEW)

@@ -1,5 +1,6 @@
 """The response against the exact discretisation, its derivatives against differences, transients against records."""
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from exact import discrete_avis, multisine, record
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.response import ResponseModel, positive
+from avis_ctrl.identification.response import ResponseModel, kept_lines, positive
 from avis_ctrl.identification.sample_and_hold import aliases, hold, sampled_pole
 from avis_ctrl.identification.spectra import record_block, transient_columns
 from avis_ctrl.rigs import load_rig
@@ -104,6 +105,23 @@ def test_a_record_is_response_and_transient(avis, order, corner):
     e = np.concatenate([plain.ravel().real, plain.ravel().imag])
     left = e - both @ np.linalg.lstsq(both, e, rcond=1e-12)[0]
     assert np.sqrt(np.mean(e ** 2)) > 0.1 and np.max(np.abs(left)) < 2e-5
+
+
+def test_results_on_lines_are_kept_while_their_model_lives(avis):
+    calls = []
+
+    @kept_lines
+    def size(model, omega):
+        calls.append(model.names)
+        return np.empty((len(omega), 1000))
+    omega, model, other = np.ones(10), ResponseModel.of(avis, ["mass"]), ResponseModel.of(avis, ["J1"])
+    kept = weakref.ref(size(model, omega))
+    assert size(model, omega) is kept() and size(other, omega) is size(other, omega)
+    assert size(model, omega) is kept() and size(model, omega.copy()) is not kept()
+    assert calls == [("mass",), ("J1",), ("mass",)]
+    kept = weakref.ref(size(model, omega))
+    del model
+    assert kept() is None
 
 
 def test_ideal_sensors_and_static_floor(avis):

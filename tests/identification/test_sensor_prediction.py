@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from exact import floor_velocity, multisine, record
 
+from avis_ctrl.errors import InputError
 from avis_ctrl.identification.predictor import Predictor, predict
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
@@ -54,3 +55,10 @@ def test_pieces_join():
     u = rng.normal(size=(500, 8))
     whole, parts = Predictor(model).read(u), Predictor(model)
     assert np.allclose(np.vstack([parts.read(u[:123]), parts.read(u[123:125]), parts.read(u[125:])]), whole, atol=1e-15)
+
+
+def test_a_model_without_sample_time_predicts_no_record():
+    rng, rig = np.random.default_rng(5), load_rig("avis")
+    measured = record(rig, np.zeros((100, 8)), np.zeros((100, 3)), rng)
+    with pytest.raises(InputError, match="expected a model with a sample time"):
+        predict(ResponseModel.of(rig, (), sampled=False), measured)

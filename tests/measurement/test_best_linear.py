@@ -251,7 +251,7 @@ def test_what_cannot_be_estimated_is_said(rng):
     two = Campaign("test", tuple(campaign([(r.u * k, r.y) for r, k in zip(data.records, (1, 1, 3, 3), strict=True)],
                                           RATE, "multisine", N / RATE, levels=[0.01, 0.01, 0.03, 0.03]).records))
     wrong = campaign([(rng.standard_normal((4 * N, 1)), rng.standard_normal((4 * N, 1)))], RATE, "multisine", N / RATE)
-    with pytest.raises(InputError, match="is the period right"):
+    with pytest.raises(InputError, match="check the period"):
         best_linear_approximation(wrong)
     with pytest.raises(InputError, match="level_V = "):
         best_linear_approximation(two)

@@ -76,7 +76,7 @@ def test_a_transient_is_no_distortion():
 
 
 def test_records_without_detection_lines_are_refused(rng):
-    with pytest.raises(InputError, match="odd harmonics that are left out"):
+    with pytest.raises(InputError, match="odd harmonics that are not excited"):
         distortion_levels(record(rng, lambda u: np.hstack([u, u]), 0.1, detection=False), "00")
     full = campaign([(np.tile(rng.standard_normal(N), 3)[:, None], np.zeros((3 * N, 1)))], RATE, "multisine", N / RATE)
     with pytest.raises(InputError, match="even harmonics"):

@@ -151,7 +151,7 @@ WRONG = {
     "no header": ("\n".join(GOOD[1:]), r"line 1 = '0.0,0,0': expected a header line .* found numbers"),
     "only a header": (GOOD[0], r"expected at least two lines of numbers; there are 0"),
     "only comments": ("# a = 1\n# b = 2", r"expected a header line"),
-    "twice a name": (edited(0, "t,A1,A1"), r"line 1 = 'A1': expected different names of columns"),
+    "twice a name": (edited(0, "t,A1,A1"), r"line 1 = 'A1': expected column names that differ"),
     "no time": (edited(0, "x,A1,S1"), r"t: expected a column t \(time in s\) or a comment line"),
     "unit": (edited(0, "t,A1,S1 [bar]"), r"record a: y unit = 'bar': expected a unit of V"),
     "unit of time": (edited(0, "t [h],A1,S1"), r"unit of t = 'h': expected one of s, sec, ms"),
@@ -175,5 +175,7 @@ def test_wrong_files_in_one_line(path, case, bom):
 def test_hints_that_contradict_the_time_stamps(path):
     path.write_text("\n".join(GOOD))
     assert read_measurements(path, sample_rate_Hz=4.001).sample_rate_Hz == 4.001
-    with pytest.raises(InputError, match=r"sample_rate_Hz = 5.0: expected 4 Hz, as the time stamps say"):
+    with pytest.raises(InputError, match=r"sample_rate_Hz = 0: expected 4 Hz, the rate of the time stamps"):
+        read_measurements(path, sample_rate_Hz=0)
+    with pytest.raises(InputError, match=r"sample_rate_Hz = 5.0: expected 4 Hz, the rate of the time stamps"):
         read_measurements(path, sample_rate_Hz=5.0)

@@ -398,14 +398,14 @@ def put(name, value):
 
 
 RESPONSES_REFUSED = {
-    "no averages": (group_edit(lambda g: g.attrs.pop("averages")), "averages: missing; coherence tells the errors"),
+    "no averages": (group_edit(lambda g: g.attrs.pop("averages")), "averages: missing; the errors follow"),
     "one average": (group_edit(lambda g: g.attrs.update(averages=1)), "averages = 1.0: expected 2 or more"),
     "no errors": (group_edit(lambda g: g.pop("coherence")), "pass relative_standard_deviation"),
     "coherence": (put("coherence", np.full((5, 2, 1), 1.5)), "coherence = 1.5: expected values from 0 to 1"),
-    "coherence 0": (put("coherence", np.zeros((5, 2, 1))), "0 for some entry at every line"),
+    "coherence 0": (put("coherence", np.zeros((5, 2, 1))), "expected a line at which no entry is 0"),
     "shape": (put("value", np.zeros((5, 1, 2), complex)), r"value = \(5, 1, 2\): expected shape \(5, 2, 1\)"),
     "nan": (put("value", np.full((5, 2, 1), np.nan)), "NaN or infinite: 10, the first at line 0"),
-    "text": (put("value", "abc"), "/frf: value: expected numbers, found objects"),
+    "text": (put("value", "abc"), "/frf: value = 'data set of objects': expected numbers"),
     "order": (put("frequency_Hz", [1.0, 2.0, 2.0, 3.0, 4.0]), "expected increasing frequencies"),
     "no inputs": (group_edit(lambda g: g.attrs.pop("inputs")), "/frf: inputs: missing"),
     "unit": (group_edit(lambda g: g.attrs.update(output_unit="K")), "/frf: output_unit = 'K': expected a unit of"),

@@ -178,7 +178,7 @@ def test_hints_and_columns_that_nobody_knows(valid, tmp_path):
     assert "sample_rate_Hz = '1 kHz': expected one number" in refusal(path, sample_rate_Hz="1 kHz")
     assert "excitation = 'loud': expected one of" in refusal(path, excitation="loud")
     assert "columns = 'x': expected the roles t, u, y" in refusal(path, columns={"x": "A1"})
-    assert "columns: y = 'S9': not there; the file has t, A1, S1" in refusal(path, columns={"y": "S9", "u": "A1"})
+    assert "columns: y = 'S9': not found; the file has t, A1, S1" in refusal(path, columns={"y": "S9", "u": "A1"})
     path.write_bytes(valid["h5"])
     assert "period_s = 1.0: an HDF5 campaign states this itself" in refusal(path, period_s=1.0)
 
@@ -221,8 +221,8 @@ def test_formats_that_are_read_whole_are_refused_beyond_memory_by_the_size_on_di
     path.write_bytes(valid[kind] + b"\n" * 5000 if kind == "csv" else valid[kind])
     with path.open("r+b") as stream:
         stream.truncate(3_000_000_000)  # a hole: takes no place on disk
-    assert refusal(path) == (f"{path}: holds 3 GB, and this format is read whole, up to 1.5 GB; convert it in pieces "
-                             "to an HDF5 campaign (/records/00/u and y), which is read in pieces")
+    assert refusal(path) == (f"{path}: has 3 GB; this format is read whole, up to 1.5 GB: convert the file to an HDF5 "
+                             "campaign (/records/00/u and y), which is read in pieces")
 
 
 def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeypatch):
@@ -237,12 +237,12 @@ def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeyp
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     assert path.stat().st_size < 1e6
-    assert "holds 3 GB, and this format is read whole" in refusal(path, columns={"u": "u", "y": ["y", "z"]})
+    assert "has 3 GB; this format is read whole" in refusal(path, columns={"u": "u", "y": ["y", "z"]})
     record = read_measurements(path, excitation="noise", level_V=1.0).records[0]  # one variable each stays on disk
     assert record.load(samples - 3).y.shape == (3, 1)
     monkeypatch.setattr(common, "LARGEST_IN_MEMORY", 5000)
     scipy.io.savemat(path, {"u": np.zeros(400), "y": np.zeros(400), "fs": 1.0}, do_compression=True)
-    assert path.stat().st_size < 1000 and "holds 6.5e-06 GB, and this format is read whole" in refusal(path)
+    assert path.stat().st_size < 1000 and "has 6.5e-06 GB; this format is read whole" in refusal(path)
     scipy.io.savemat(path, {"u": np.zeros(200), "y": np.zeros(200), "fs": 1.0}, do_compression=True)
     assert not isinstance(read_whole(path), str)
 
@@ -252,4 +252,4 @@ def test_csv_files_of_a_directory_count_together(valid, tmp_path):
         (tmp_path / f"{name}.csv").write_bytes(valid["csv"])
         with (tmp_path / f"{name}.csv").open("r+b") as stream:
             stream.truncate(600_000_000)
-    assert refusal(tmp_path).startswith(f"{tmp_path}: holds 1.8 GB, and this format is read whole")
+    assert refusal(tmp_path).startswith(f"{tmp_path}: has 1.8 GB; this format is read whole")

@@ -8,8 +8,9 @@ import scipy.io
 from test_formats_matlab import Matlab73, both, cells, save
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import in_short
+from avis_ctrl.measurement.campaign import Portion, in_short
 from avis_ctrl.measurement.formats import parse_columns, read_measurements, write_campaign
+from avis_ctrl.measurement.formats.records import with_header
 from avis_ctrl.measurement.formats.stored import StoredRecord
 
 
@@ -96,14 +97,14 @@ def test_everything_that_is_missing_is_said_at_once(path, rng, version):
     with pytest.raises(InputError) as caught:
         read_measurements(path)
     assert str(caught.value).startswith(f"{path}: records: missing: ") and "\n" not in str(caught.value)
-    for said in ("fs or a time vector t (record 00)", "y, what the sensors gave (record 01)",
+    for said in ("fs or a time vector t (record 00)", "y, the sensor signals (record 01)",
                  "period_s, the period in s of a multisine (not 0 or NaN) (record 00)"):
         assert said in str(caught.value)
 
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"t": np.zeros((200, 1))}, "record 00: t: expected increasing time stamps"),
-    ({"sample_rate_Hz": 99.0}, "record 00: sample_rate_Hz = 99.0: expected 100 Hz, as the time vector says"),
+    ({"sample_rate_Hz": 99.0}, "record 00: sample_rate_Hz = 99.0: expected 100 Hz, the rate of the time stamps"),
     ({"period_s": -1.0}, "record 00: period_s = -1.0: expected a positive period"),
     ({"excitation": "chirp"}, "record 00: excitation = 'chirp': expected one of multisine"),
     ({"y": np.zeros((100, 3))}, "record 00: expected equally many samples; u is 200x2, y is 100x3, t has 200"),
@@ -140,8 +141,16 @@ def test_a_variable_of_the_names_goes_before_the_names_themselves(path, rng):
     one = record(rng, labels=cells(["p", "q", "r"]))
     scipy.io.savemat(path, one)
     assert read_measurements(path, {"y_names": "labels"}).y_names == ("p", "q", "r")
-    with pytest.raises(InputError, match="y_names = 'lables': no variable of that name, and too few for names"):
+    with pytest.raises(InputError, match="y_names = 'lables': neither a variable nor a list of channel names"):
         read_measurements(path, {"y_names": "lables"})
+
+
+def test_a_part_of_a_record_can_be_renamed(path, rng):
+    scipy.io.savemat(path, record(rng))
+    part = Portion(read_measurements(path).records[0], 50, 150)
+    renamed = with_header(part, y_names=("p", "q", "r"))
+    assert renamed.header.y_names == renamed.load(10, 20).header.y_names == ("p", "q", "r")
+    np.testing.assert_array_equal(renamed.load().y, part.load().y)
 
 
 def test_names_tell_which_way_round_a_matrix_is(path, rng):

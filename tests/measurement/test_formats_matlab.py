@@ -157,7 +157,7 @@ def test_real_data_by_a_mapping(data):
     box = data / "silverbox" / "Schroeder80mV.mat"
     record = read_measurements(box, {"u": "V1", "y": "V2"}, sample_rate_Hz=610.35).records[0].load()
     np.testing.assert_array_equal(record.u[:, 0], scipy.io.loadmat(box)["V1"][0])
-    with pytest.raises(InputError, match="u: which variable is it"):
+    with pytest.raises(InputError, match="u: no variable has a usual name"):
         read_measurements(box)
     with pytest.raises(InputError, match="sample rate: expected t, fs or sample_rate_Hz"):
         read_measurements(box, {"u": "V1", "y": "V2"})
@@ -194,22 +194,22 @@ def test_channels_without_names_are_numbered(path, rng, named):
 def test_as_many_lines_as_channels_are_refused(path, rng):
     scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 3.0), "H": rng.normal(size=(2, 2, 2)),
                             "variance": np.ones((2, 2, 2)), "inputs": cells(["a", "b"]), "outputs": cells(["c", "d"])})
-    with pytest.raises(InputError, match="which dimension is the frequency cannot be told"):
+    with pytest.raises(InputError, match="the dimension of frequency is ambiguous"):
         read_measurements(path)
 
 
 WRONG = {
     "no rate": ({"sample_rate_Hz": MISSING},
                 "records: missing: sample_rate_Hz, fs or a time vector t; the records have excitation, floor"),
-    "no y": ({"y": MISSING}, "records: missing: y, what the sensors gave; the records have"),
+    "no y": ({"y": MISSING}, "records: missing: y, the sensor signals; the records have"),
     "all at once": ({"y": MISSING, "sample_rate_Hz": MISSING, "period_s": 0.0},
-                    "missing: y, what .*; sample_rate_Hz, fs or a time vector t; period_s, the period in s of a mult"),
-    "names": ({"y_names": cells(["S1", "S2"])}, "expected 2 channels, as there are names; it is 60x3"),
+                    "missing: y, the sensor signals; sample_rate_Hz, fs or a time vector t; period_s, the period"),
+    "names": ({"y_names": cells(["S1", "S2"])}, "expected 2 channels, as many as names; it is 60x3"),
     "same names": ({"y_names": cells(["S1", "S1", "S2"])}, "expected different names"),
     "lengths": ({"y": np.zeros((59, 3))}, "expected equally many samples; u is 60x2, y is 59x3, floor is 60x3"),
     "text": ({"y": "none"}, "record 00: y = 'text': expected a real matrix"),
     "cells": ({"y": cells([1.0, 2.0])}, "y = 'cell or struct array': expected a real matrix"),
-    "empty": ({"y": np.zeros((0, 0))}, "records: missing: y, what the sensors gave"),
+    "empty": ({"y": np.zeros((0, 0))}, "records: missing: y, the sensor signals"),
     "period": ({"period_s": 0.123}, "expected a whole number of samples"),
     "no period": ({"period_s": np.nan}, "missing: period_s, the period in s of a multisine"),
     "unit": ({"y_unit": "Pa"}, "record 00: y unit = 'Pa': expected a unit of V"),

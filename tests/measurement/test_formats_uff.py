@@ -90,6 +90,13 @@ def test_frequency_responses_with_coherence(path, rng, order, double, even):
     np.testing.assert_allclose(response.entry_variance[:, :, 0], expected.T, rtol=2e-3)
 
 
+def test_a_stated_rate_must_agree_with_the_increment(path, rng):
+    path.write_bytes(data_set(rng.normal(size=20), **A) + data_set(rng.normal(size=20), **S))
+    assert read_measurements(path, excitation="noise", sample_rate_Hz=100.05).sample_rate_Hz == 100.05
+    with pytest.raises(InputError, match=r"sample_rate_Hz = 50: expected 100 Hz, the rate of the time stamps"):
+        read_measurements(path, excitation="noise", sample_rate_Hz=50)
+
+
 def test_units_by_data_type_and_data_set_164(path):
     """The factor of length is file units per metre: 1000 for millimetres."""
     y = np.arange(1.0, 9.0)
@@ -101,7 +108,7 @@ def test_units_by_data_type_and_data_set_164(path):
     np.testing.assert_allclose(record.y[:, 0], 1e-3 * y)
     path.write_bytes(units(1000.0) + data_set(y, name="S1", ordinate=(11, "m/s")) + data_set(y, name="A1",
                                                                                          ordinate=(1, "V")))
-    with pytest.raises(InputError, match=r"data set 164 makes it 0.001 m/s; which is right"):
+    with pytest.raises(InputError, match=r"by data set 164 it is 0.001 m/s; state the right one with y_unit"):
         read_measurements(path)
     assert read_measurements(path, y_unit="mm/s").records[0].y[0, 0] == pytest.approx(1e-3)
     path.write_bytes(units(1000.0).replace(b"1.0000", b"1.0x00") + data_set(y, name="S1", ordinate=(11, "NONE")))
@@ -159,14 +166,14 @@ def test_numbers_that_run_together_are_told_apart_by_their_width(path, double):
 
 def test_real_samples(data):
     sample = data / "uff" / "Sample_UFF58_ascii.uff"
-    with pytest.raises(InputError, match=r"no channel is known as an input; the file has Mic 01"):
+    with pytest.raises(InputError, match=r"no channel is recognised as an input; the file has Mic 01"):
         read_measurements(sample)
     with pytest.raises(InputError, match=r"channel Mic 01: unit = 'Pa': expected a unit of V"):
         read_measurements(sample, excitation="rest")
     record = read_measurements(sample, excitation="rest", y_unit="V").records[0].load()
     assert record.header.samples == 79292 and record.header.sample_rate_Hz == 65536.0
     assert record.y[0, 0] == -1.47553e-02
-    with pytest.raises(InputError, match=r"type 1 .* or 4 .*; there is 9 \(power spectral density\)"):
+    with pytest.raises(InputError, match=r"type 1 .* or 4 .*; the file has 9 \(power spectral density\)"):
         read_measurements(data / "uff" / "sample_dataset58_psd.uff")
 
 

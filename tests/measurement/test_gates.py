@@ -28,11 +28,11 @@ from scipy import signal
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.gates import GATES, Expectation, examine
 from avis_ctrl.measurement.gates.channel_map import ChannelMap
-from avis_ctrl.measurement.gates.examine import after_missing_samples
+from avis_ctrl.measurement.gates.examine import CONSEQUENCES, OF_ALL, after_missing_samples
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples, delays, explained
-from avis_ctrl.measurement.gates.repeatability import beyond_chance
+from avis_ctrl.measurement.gates.repeatability import significance
 
 SEVERE = ("warning", "stop")
 
@@ -164,6 +164,7 @@ def test_rows_lost_from_u_and_y(clean):
     broken = changed(clean, 0, u=np.delete(old.u, lost, axis=0), y=np.delete(old.y, lost, axis=0))
     found = [f for f in alarms(broken) if f.gate == "missing samples"]
     assert "3 samples off" in found[0].sentence and "period 3" in found[0].sentence
+    assert abs(found[0].value) == 3
 
 
 def test_a_buffer_written_twice(clean):
@@ -180,6 +181,10 @@ def test_channels_are_not_called_exchanged_where_every_record_lacks_samples():
     assert [f.severity for f in judged] == ["stop", "note", "stop"] and "consequence" in judged[1].sentence
     judged = after_missing_samples([lost, mixed, copied], {"00", "01", "02"})
     assert [f.severity for f in judged] == ["stop"] * 3
+
+
+def test_gates_affected_by_missing_samples_exist(clean):
+    assert {*CONSEQUENCES, *OF_ALL} < {f.gate for f in examine(clean, known())}
 
 
 def test_records_that_overlap_in_time(clean):
@@ -220,7 +225,7 @@ def test_lines_beside_the_band_are_not_compared():
 @pytest.mark.parametrize(("T", "said"), [(46358975614.2, "far more than noise explains"),
                                          (3.04, "3.0 times the 1 % limit of noise alone")])
 def test_statistics_are_said_in_words_that_one_can_read(T, said):
-    assert beyond_chance(T).startswith(said)
+    assert significance(T).startswith(said)
 
 
 def test_records_of_different_voltages_say_how_little_their_comparison_tells():

@@ -231,7 +231,7 @@ def test_floor_velocity_as_further_inputs(rng):
     without = local_polynomial(data, band_Hz=(5, 80), floor=False)
     assert without.inputs == ("u1", "u2")
     assert np.mean(without.variance()) > 100 * np.mean(got.variance()[:, :, :2])
-    with pytest.raises(InputError, match="floor is asked for"):
+    with pytest.raises(InputError, match="floor is requested"):
         local_polynomial(noisy(Modal(rng, 1, 1, [25.0], 0.2, RATE), rng, 400, 1), floor=True)
 
 

@@ -155,6 +155,13 @@ def test_a_seed_gives_one_campaign_and_its_records_differ():
     assert np.array_equal(U[0][:, 1:], U[1][:, :-1]) and not np.any(U[0] & U[1])
 
 
+def test_records_start_after_whole_samples():
+    """The drives are silent for a whole number of samples: 7 of the 7.4 that 0.0074 s are."""
+    rig = load_rig("avis")
+    made = simulate_campaign(rig, plan({"excitation": "noise", "records": 2}, duration_s=1.0, settle_s=0.0074), 1)
+    assert [r.header.start_s for r in made.records] == pytest.approx([0.007, 1.014], abs=1e-12)
+
+
 def test_what_the_converter_reports():
     rig = load_rig("avis")
     lsb = 20.0 / 2 ** 14

@@ -116,6 +116,12 @@ def test_gain_at_rest_is_the_gain_of_python_control():
     K = StateSpace(A, rng.normal(size=(4, 2)), rng.normal(size=(3, 4)), rng.normal(size=(3, 2)), 0.01)
     assert gain_at_rest(K) == pytest.approx(control.ss(K.A, K.B, K.C, K.D, 0.01).dcgain())
     assert np.all(np.isinf(gain_at_rest(StateSpace(np.zeros((1, 1)), [[1.0]], [[1.0]], [[0.0]]))))
+    # With an integrator in other coordinates the matrix is singular only to within round-off.
+    T, slow = rng.normal(size=(5, 5)), np.diag([0.0, -1e-3, -1.0, -1e2, -1e5])
+    K = StateSpace(T @ slow @ np.linalg.inv(T), rng.normal(size=(5, 2)), rng.normal(size=(3, 5)), np.zeros((3, 2)))
+    assert np.all(np.isinf(gain_at_rest(K)))
+    K = replace(K, A=T @ (slow - np.diag([1e-4, 0, 0, 0, 0])) @ np.linalg.inv(T))
+    assert np.all(np.isfinite(gain_at_rest(K)))
 
 
 def test_offset_holds_the_voltages_that_the_gain_at_rest_says(tmp_path):

@@ -298,7 +298,7 @@ def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
     """Checks that apply to multisines and noise."""
     inputs, rate, band_Hz = settings.inputs, settings.sample_rate_Hz, settings.band_Hz
     if not inputs or len(set(inputs)) != len(inputs):
-        raise InputError("expected different names of at least one drive", field="inputs", value=inputs)
+        raise InputError("expected at least one drive, with different names", field="inputs", value=inputs)
     require_positive(rate, "sample_rate_Hz")
     require_positive(settings.limit_V, "limit_V")
     if settings.rms_V is not None:
@@ -312,4 +312,4 @@ def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
 def _check_size(voltages: float, field: str) -> None:
     if voltages > MOST_VOLTAGES:
         raise InputError(f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory; "
-                         f"these are {voltages:.3g}", field=field)
+                         f"there would be {voltages:.3g}", field=field)

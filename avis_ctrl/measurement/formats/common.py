@@ -21,6 +21,7 @@ UNITS |= {f"in{per}": (f"m{per}", 0.0254) for per in ("", "/s", "/s^2")}
 UNITS |= dict.fromkeys(("Volt", "Volts"), ("V", 1.0)) | dict.fromkeys(("g", "gn"), ("m/s^2", STANDARD_GRAVITY))
 UNITS["lbf"] = ("N", 4.4482216152605)
 INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"), ("m/s",)
+INPUT_NAME = r"u_?\w*|a[xyz]?\d+"  # usual names of inputs
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 
 # Largest file that is read whole into memory; text and compressed numbers need about twice as much during conversion.
@@ -50,7 +51,7 @@ def reading(path: object, what: str = "the file") -> Iterator[None]:
             raise
         raise error.in_file(path) from None
     except MemoryError:
-        raise InputError("the sizes it states do not fit in memory; damaged, or to be read in smaller pieces",
+        raise InputError("the stated sizes do not fit in memory: the file is damaged, or too large to be read whole",
                          file=path) from None
     except OSError as error:
         raise InputError(f"{what} cannot be read ({short(error)})", file=path) from error
@@ -100,9 +101,9 @@ def require_small(path: Path, size: int | None = None) -> int:
     """
     size = path.stat().st_size if size is None else size
     if size > LARGEST_IN_MEMORY:
-        raise InputError(f"holds {size / 1e9:.3g} GB, and this format is read whole, up to "
-                         f"{LARGEST_IN_MEMORY / 1e9:.3g} GB; convert it in pieces to an HDF5 campaign (/records/00/u "
-                         "and y), which is read in pieces", file=path)
+        raise InputError(f"has {size / 1e9:.3g} GB; this format is read whole, up to {LARGEST_IN_MEMORY / 1e9:.3g} GB: "
+                         "convert the file to an HDF5 campaign (/records/00/u and y), which is read in pieces",
+                         file=path)
     return size
 
 
@@ -165,7 +166,7 @@ def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...
         text = as_text(value, field)
         names = (text,) if count == 1 else tuple(part.strip() for part in text.split(","))
     if not all(name and name.isprintable() for name in names):
-        raise InputError("expected names that are not empty and can be printed", field=field, value=brief(names))
+        raise InputError("expected printable names that are not empty", field=field, value=brief(names))
     if count is not None and len(names) != count:
         raise InputError(f"expected one name for each channel; there are {count} channels and {len(names)} "
                          "names", field=field, value=brief(names))

@@ -23,13 +23,13 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
-from avis_ctrl.measurement.formats.common import existing_file, is_number, reading, require_small, within
+from avis_ctrl.measurement.formats.common import INPUT_NAME, existing_file, is_number, reading, require_small, within
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
-from avis_ctrl.measurement.formats.time_axis import sample_rate_from
+from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
 CHUNK = 1 << 16  # lines that are converted to numbers at once
 LONGEST_LINE = 1 << 20  # characters
-USUAL = {"t": r"t|time|t_s|time_s", "u": r"u_?\w*|a[xyz]?\d+", "y": r"y_?\w*|s[xyz]?\d+"}
+USUAL = {"t": r"t|time|t_s|time_s", "u": INPUT_NAME, "y": r"y_?\w*|s[xyz]?\d+"}
 STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s", "excitation")
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 
@@ -135,7 +135,7 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
         units.append(match[2] if match and match[1] else None)
     for name in names:
         if not name or names.count(name) > 1:
-            raise InputError("expected different names of columns, none empty", field=f"line {count}", value=name)
+            raise InputError("expected column names that differ and are not empty", field=f"line {count}", value=name)
     return Layout(names, units, separator, stated, count)
 
 
@@ -162,10 +162,10 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
     for role, wanted in (("t", "at most one column"), ("y", "at least one column")):
         if len(roles[role]) > 1 if role == "t" else not roles[role]:
             if not roles["t"] and not _followed_by_numbers(path, layout):
-                raise InputError("not a measurement file: a text, but no CSV with a header line and lines of numbers",
+                raise InputError("not a measurement file: a text without a header line followed by lines of numbers",
                                  field=f"line {layout.lines}", value=", ".join(layout.names)[:60])
-            raise InputError(f"expected {wanted}; the file has {', '.join(layout.names)}; say with columns which is "
-                             "what (roles t, u, y, floor)", field=role, value=roles[role])
+            raise InputError(f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns "
+                             "(roles t, u, y, floor)", field=role, value=roles[role])
     return roles
 
 
@@ -212,12 +212,7 @@ def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[flo
             raise InputError(f"expected one of {', '.join(TIME_UNITS)}", field="unit of t", value=unit)
         factor = TIME_UNITS[unit or "s"]
         rate, start, note = sample_rate_from(time * factor, lambda sample: f"data row {sample + 1}")
-        if hints.sample_rate_Hz is None:
-            return rate, start, note
-        if abs(rate / hints.sample_rate_Hz - 1) > 1e-3:
-            raise InputError(f"expected {rate:.9g} Hz, as the time stamps say", field="sample_rate_Hz",
-                             value=hints.sample_rate_Hz)
-        return hints.sample_rate_Hz, start, note
+        return rate if hints.sample_rate_Hz is None else agreed_rate(hints.sample_rate_Hz, rate), start, note
     if hints.sample_rate_Hz is None:
         raise InputError("expected a column t (time in s) or a comment line such as '# sample_rate_Hz = 1000'",
                          field="t")

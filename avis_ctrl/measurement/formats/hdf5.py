@@ -80,8 +80,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         used = ("averages", "relative_standard_deviation") if response else ()
         for name, value in {"columns": columns, **vars(hints)}.items():
             if value is not None and name not in used:
-                raise InputError("an HDF5 campaign states this itself; expected no such argument", field=name,
-                                 value=value)
+                raise InputError("an HDF5 campaign states this itself; omit this argument", field=name, value=value)
         stated = _check_root(file)
         group = member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
@@ -158,11 +157,7 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
 
 def _part(dataset: Any, role: str) -> Part:
     """Channels of a data set of (samples, channels); the samples stay in the file."""
-    if not isinstance(dataset, h5py.Dataset):
-        raise InputError("expected a data set, found a group", field=role)
-    shape, dtype = layout(dataset)
-    if dtype.kind not in "fiu":
-        raise InputError("expected real numbers", field=role, value=f"data set of {kind_of(dtype)}")
+    shape, _ = _layout(dataset, role, "fiu")
     if shape is None or len(shape) not in (1, 2):
         raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
@@ -173,6 +168,17 @@ def _part(dataset: Any, role: str) -> Part:
     with within(role):
         names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
     return Part(as_names(names, f"{role} names", count), unit, Columns(full_name(dataset), samples))
+
+
+def _layout(dataset: Any, field: str, kinds: str) -> tuple[tuple[int, ...] | None, np.dtype]:
+    """Shape and type of a data set of these kinds of numbers."""
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError("expected a data set, found a group", field=field)
+    shape, dtype = layout(dataset)
+    if dtype.kind not in kinds:
+        raise InputError("expected numbers" if "c" in kinds else "expected real numbers", field=field,
+                         value=f"data set of {kind_of(dtype)}")
+    return shape, dtype
 
 
 def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
@@ -190,11 +196,7 @@ def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
     dataset = member(group, name)
     if dataset is None:
         return None
-    if not isinstance(dataset, h5py.Dataset):
-        raise InputError("expected numbers, found a group", field=name)
-    shape, dtype = layout(dataset)
-    if dtype.kind not in kinds:
-        raise InputError(f"expected numbers, found {kind_of(dtype)}", field=name)
+    shape, dtype = _layout(dataset, name, kinds)
     require_small(path, math.prod(shape or ()) * dtype.itemsize)
     return values(dataset)
 

@@ -32,6 +32,7 @@ class PatientFile:
         self.kept: dict[int, bytes] = {}
 
     def write(self, data: bytes) -> int:
+        """Write, or discard after an error; never fails."""
         view = memoryview(data).cast("B")
         done = 0
         try:
@@ -46,6 +47,7 @@ class PatientFile:
         return len(view)
 
     def read(self, size: int) -> bytes:
+        """Bytes on the disk, with those that were kept in memory."""
         found = bytearray(size)
         of_disk = os.pread(self.descriptor, size, self.at)
         found[:len(of_disk)] = of_disk
@@ -57,13 +59,16 @@ class PatientFile:
         return bytes(found)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Set the position."""
         self.at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self.at, os.SEEK_END: self.end}[whence]
         return self.at
 
     def tell(self) -> int:
+        """The position."""
         return self.at
 
     def truncate(self, size: int) -> int:
+        """Cut the file to a size; never fails."""
         try:
             os.ftruncate(self.descriptor, size)
         except OSError as error:

@@ -120,7 +120,7 @@ def _sizes(tree: Mapping[str, Any], H: np.ndarray, lines: int) -> tuple[int, int
         return 1, 1
     if H.ndim == 3 and (H.shape[0] == lines) != (H.shape[2] == lines):
         return H.shape[1:] if H.shape[0] == lines else H.shape[:2]
-    raise InputError("expected inputs and outputs, names that tell which dimension is what", field="H", value=H.shape)
+    raise InputError("expected the names inputs and outputs, which identify the dimensions", field="H", value=H.shape)
 
 
 def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> np.ndarray:
@@ -136,7 +136,7 @@ def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> 
     if n_y == n_u == 1 and array.size == n:
         return array.reshape(sizes)
     if first and last:
-        raise InputError(f"as many lines as channels ({n}): which dimension is the frequency cannot be told",
+        raise InputError(f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})",
                          field=field, value=array.shape)
     if not first and not last:
         raise InputError(f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field,

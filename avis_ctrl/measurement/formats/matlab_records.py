@@ -27,7 +27,7 @@ from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.stored import Columns
-from avis_ctrl.measurement.formats.time_axis import sample_rate_from
+from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
         with within(f"record {name}"):
             period = _with_stated(hints, {"period_s": fields.get("period_s")}).period_s
         timed = hints.sample_rate_Hz or any(key in fields for key in (*USUAL["t"], *USUAL["sample_rate_Hz"], *PERIODS))
-        for what, there in (("u, the voltages played (zeros at rest)", _usual(fields, "u")),
-                            ("y, what the sensors gave", _usual(fields, "y")),
+        for what, there in (("u, the commanded voltages (zeros at rest)", _usual(fields, "u")),
+                            ("y, the sensor signals", _usual(fields, "y")),
                             ("sample_rate_Hz, fs or a time vector t", timed),
                             ("period_s, the period in s of a multisine (not 0 or NaN)",
                              period or excitation != "multisine")):
@@ -140,8 +140,8 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
     flat = fields is tree
     for role in ("u", "y"):
         if not chosen[role] and (role == "y" or hints.excitation not in ("rest", "floor")):
-            raise InputError(f"which variable is it? The file has {overview(fields)}; say with columns (such as "
-                             "u=vir, y=qm, t=t)", field=role)
+            raise InputError(f"no variable has a usual name; the file has {overview(fields)}; assign the variables "
+                             "with columns (such as u=vir, y=qm, t=t)", field=role)
     matrices = {role: [_matrix(fields[variable], variable) for variable in chosen[role]]
                 for role in ("u", "y", "floor") if chosen[role] or role == "u"}
     rate, start, note, known = _clock(fields, chosen, hints)
@@ -249,7 +249,7 @@ def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[st
             if role in channels:
                 lengths = {length for length, others in ((rows, columns), (columns, rows)) if others == channels[role]}
                 if not lengths:
-                    raise InputError(f"expected {channels[role]} channels, as there are names; it is {rows}x{columns}",
+                    raise InputError(f"expected {channels[role]} channels, as many as names; it is {rows}x{columns}",
                                      field=role)
             possible = lengths if possible is None else possible & lengths
     if not possible:
@@ -258,8 +258,8 @@ def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[st
     samples = max(possible)
     square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
     if square or (len(possible) > 1 and samples < SETTINGS.much_longer * min(possible)):
-        raise InputError(f"rows and columns could both be the samples: {shown}; expected names of the channels or a "
-                         "time vector that distinguishes them")
+        raise InputError(f"rows and columns could both be the samples: {shown}; expected channel names or a time "
+                         "vector, which distinguish them")
     return samples
 
 
@@ -280,8 +280,8 @@ def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int
     if len(value) == 1 and value[0] in tree:
         return as_names(_plain(tree[value[0]]), field, count)
     if len(value) == 1 and count is None:
-        raise InputError("no variable of that name, and too few for names of the channels themselves (A+B+...); the "
-                         f"file has {overview(tree)}", field=field, value=value[0])
+        raise InputError("neither a variable nor a list of channel names (A+B+...); the file has "
+                         f"{overview(tree)}", field=field, value=value[0])
     return as_names(list(value), field, count)
 
 
@@ -306,9 +306,8 @@ def _clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],
             if period <= 0:
                 raise InputError("expected a positive sampling period in s", field=name, value=period)
             stated = 1 / period
-    if stated is not None and rate is not None and abs(stated / rate - 1) > 1e-3:
-        raise InputError(f"expected {rate:.9g} Hz, as the time vector says", field=source, value=stated)
-    result = stated if stated is not None else rate
-    if result is None:
+    if stated is not None:
+        rate = stated if rate is None else agreed_rate(stated, rate, source)
+    if rate is None:
         raise InputError(f"expected t, fs or sample_rate_Hz; the file has {overview(tree)}", field="sample rate")
-    return result, start, note, known
+    return rate, start, note, known

@@ -121,6 +121,7 @@ class Elements:
 
     @property
     def left(self) -> int:
+        """Number of bytes not yet read."""
         return len(self.body) - self.at
 
     def next(self, what: str, *kinds: int) -> tuple[int, memoryview]:
@@ -146,9 +147,11 @@ class Elements:
         return np.frombuffer(content, self.order + ("i4" if kind == INT32 else "u4")).tolist()
 
     def text(self, what: str) -> str:
+        """Name in the next element."""
         return _printable(bytes(self.next(what, *NAME)[1]), what)
 
     def end(self) -> None:
+        """Raise InputError if another element follows."""
         if self.left >= TAG:
             raise _damaged(f"{self.left} bytes follow the last part")
 
@@ -157,7 +160,7 @@ def _printable(content: bytes, what: str) -> str:
     """Name of a variable or field; names appear in messages and must not contain control characters."""
     name = content.rstrip(b"\0").decode("utf-8", "replace")
     if not name.isprintable() or "\ufffd" in name:
-        raise _damaged(f"{what}: {name[:40]!r} is no name")
+        raise _damaged(f"{what}: {name[:40]!r} is not a name")
     return name
 
 
@@ -195,7 +198,7 @@ def _shape(dimensions: list[int]) -> tuple[int, ...]:
     """Checked dimensions, whose product cannot overflow, even for empty arrays."""
     sane = 2 <= len(dimensions) <= MOST_DIMENSIONS and min(dimensions) >= 0
     if not sane or math.prod(max(length, 1) for length in dimensions) > MOST_ELEMENTS:
-        raise _damaged(f"dimensions: {str(dimensions)[:60]} are no array's")
+        raise _damaged(f"dimensions: {str(dimensions)[:60]} are not possible")
     return tuple(dimensions)
 
 

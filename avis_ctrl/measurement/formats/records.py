@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Record, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Portion, Record, RecordHeader, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import as_number, as_text, stated_period, unit_of, units_of, within
 from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
@@ -110,7 +110,7 @@ def pick(names: Sequence[str], available: Sequence[str], role: str) -> None:
     """Raise InputError for names that are not available."""
     for name in names:
         if name not in available:
-            raise InputError(f"not there; the file has {', '.join(available) or 'nothing'}", field=f"columns: {role}",
+            raise InputError(f"not found; the file has {', '.join(available) or 'nothing'}", field=f"columns: {role}",
                              value=name)
 
 
@@ -152,8 +152,9 @@ def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float
         text = ", ".join(f"{role} has {count}" for role, count in lengths.items())
         raise InputError(f"expected equally many samples; {text}")
     if not channels["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError("expected at least one input, a column u or u_...; where it has another name, columns says so "
-                         "(u=NAME); only a record with excitation 'rest' or 'floor' has none", field="u")
+        raise InputError("expected at least one input, such as a column u or u_...; assign a column of another name "
+                         "with columns (u=NAME); only records with excitation 'rest' or 'floor' need no input",
+                         field="u")
     notes: list[str] = []
     units: dict[str, str] = {}
     samples: dict[str, Any] = {}
@@ -163,8 +164,8 @@ def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float
         samples[role] = (replace(part.samples, factors=factors) if isinstance(part.samples, Columns)
                          else part.samples * np.array(factors))
     excitation, period, level = hints.excitation, hints.period_s, hints.level_V
-    told = level is not None and (excitation is not None or period is not None)
-    rms = None if told or not channels["u"] else _root_mean_square(samples["u"], channels["u"], path)
+    stated = level is not None and (excitation is not None or period is not None)
+    rms = None if stated or not channels["u"] else _root_mean_square(samples["u"], channels["u"], path)
     if excitation is None:
         excitation = "multisine" if period is not None else "noise" if rms else "rest"
         why = {"multisine": "there is a period", "rest": "u is zero", "noise": "u is not zero and no period is stated"}
@@ -207,7 +208,9 @@ def _root_mean_square(u: np.ndarray | Columns, names: Sequence[str], path: str) 
 
 
 def with_header(record: RecordSource, **changes: Any) -> RecordSource:
-    """The record with changed header fields; records in memory and in files are dataclasses with a header."""
+    """The record with changed names, units or rate; records in memory and in files are dataclasses with a header."""
+    if isinstance(record, Portion):
+        return Portion(with_header(record.whole, **changes), record.start, record.stop)
     return replace(record, header=replace(record.header, **changes))  # type: ignore[type-var]
 
 

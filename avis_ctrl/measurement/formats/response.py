@@ -61,7 +61,7 @@ def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyRespons
     coherence, variance = fields.get("coherence"), fields.get("variance")
     if fields.get("noise") is not None and fields.get("gram") is not None:
         if factor != 1.0:
-            raise InputError("expected SI units beside noise and gram", field="units",
+            raise InputError("expected SI units for noise and gram", field="units",
                              value=str(fields["output_unit"]))
         dof = fields.get("dof", np.inf)
         common |= {field: fields.get(field) for field in COVARIANCES}
@@ -104,7 +104,7 @@ def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[
         coherence = _coherence(coherence, value.shape, averages)
         keep = np.all(coherence > 0, axis=(1, 2))
         if not keep.any():
-            raise InputError("0 for some entry at every line; expected some above 0", field="coherence")
+            raise InputError("expected a line at which no entry is 0", field="coherence")
         variance = np.zeros(value.shape)
         assert averages is not None  # checked by _coherence
         variance[keep] = coherence_variance(value[keep], coherence[keep], averages)
@@ -116,8 +116,8 @@ def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[
         variance = (relative_standard_deviation * np.abs(value)) ** 2
         method = f"{method}; stated relative standard deviation {relative_standard_deviation:g}".lstrip("; ")
     else:
-        raise InputError("neither variance nor coherence is there; pass relative_standard_deviation (such as 0.05) to "
-                         "state the errors yourself", field="uncertainty of the frequency response")
+        raise InputError("the file has neither variance nor coherence; pass relative_standard_deviation (such as 0.05) "
+                         "to state the errors", field="uncertainty of the frequency response")
     if not keep.all():
         lost = frequency_Hz[~keep]
         method += f"; {len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz"
@@ -140,7 +140,7 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
     if coherence.shape == shape[:2] and shape[2] == 1:
         coherence = coherence[:, :, None]
     if coherence.shape == shape[:2]:
-        raise InputError(f"multiple coherence of {shape[2]} inputs does not tell the errors of single entries; "
+        raise InputError(f"multiple coherence of {shape[2]} inputs does not determine the errors of single entries; "
                          "expected the ordinary coherence of each entry, or variance", field="coherence",
                          value=coherence.shape)
     if coherence.shape != shape:
@@ -149,9 +149,8 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
         worst = coherence.flat[np.argmax(np.abs(coherence - 0.5))]
         raise InputError("expected values from 0 to 1", field="coherence", value=float(worst))
     if averages is None:
-        raise InputError("missing; coherence tells the errors only together with the number of averages",
-                         field="averages")
+        raise InputError("missing; the errors follow from coherence and the number of averages", field="averages")
     if not (np.isfinite(averages) and averages >= 2):
-        raise InputError("expected 2 or more; of one average the coherence is 1 whatever the errors", field="averages",
+        raise InputError("expected 2 or more; with one average the coherence is always 1", field="averages",
                          value=averages)
     return np.minimum(coherence, 1.0)

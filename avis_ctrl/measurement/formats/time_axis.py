@@ -9,6 +9,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 
 SILENT, JITTER, GAP = 1e-3, 0.1, 1.5  # in samples: limits for rounding, for jitter, for a step without a gap
+SAME_RATE = 1e-3  # relative difference up to which a stated sample rate agrees with the time stamps
 
 
 def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {}".format,
@@ -53,6 +54,13 @@ def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {
                          f"{mean:.6g} s", field=field)
     note = f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even" if off[worst] > SILENT else ""
     return rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
+
+
+def agreed_rate(stated_Hz: float, measured_Hz: float, field: str = "sample_rate_Hz") -> float:
+    """The stated sample rate [Hz]. Raises InputError if it is not the rate of the time stamps."""
+    if abs(stated_Hz / measured_Hz - 1) > SAME_RATE:
+        raise InputError(f"expected {measured_Hz:.9g} Hz, the rate of the time stamps", field=field, value=stated_Hz)
+    return stated_Hz
 
 
 def rounded(rate: float, uncertainty: float) -> float:

@@ -17,10 +17,18 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
-from avis_ctrl.measurement.formats.common import ALLOWED, Unit, existing_file, reading, require_small, unit_of
+from avis_ctrl.measurement.formats.common import (
+    ALLOWED,
+    INPUT_NAME,
+    Unit,
+    existing_file,
+    reading,
+    require_small,
+    unit_of,
+)
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.response import response_from
-from avis_ctrl.measurement.formats.time_axis import rounded, sample_rate_from
+from avis_ctrl.measurement.formats.time_axis import agreed_rate, rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
@@ -31,7 +39,6 @@ WORDS = {0: "unknown", 2: "auto spectrum", 3: "cross spectrum", 5: "transmissibi
 LENGTHS, FORCE = {8: "m", 11: "m/s", 12: "m/s^2"}, 13
 HERTZ = {"": 1.0, "Hz": 1.0, "kHz": 1e3, "rad/s": 1 / (2 * np.pi)}
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3}
-USUAL_INPUT = r"u_?\w*|a[xyz]?\d+"
 AVERAGES = (r"(\d+)\s*averages?\b", r"\baverages?\s*[:=]?\s*(\d+)")
 
 Entry = tuple[Point, Point]
@@ -58,7 +65,7 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         if RESPONSE in kinds:
             return _response(found, hints)
         held = ", ".join(f"{kind} ({WORDS.get(kind, 'other')})" for kind in kinds) or "no data set 58"
-        raise InputError(f"expected functions of type 1 (time response) or 4 (frequency response); there is {held}",
+        raise InputError(f"expected functions of type 1 (time response) or 4 (frequency response); the file has {held}",
                          field="function type")
 
 
@@ -91,8 +98,8 @@ def axis_unit(axis: Axis, point: Point, function: Function, role: str, hint: str
         scaled = by_type is not None and by_type.factor != 1.0
         if scaled and by_type is not None and (labelled.si != by_type.si
                                                or abs(labelled.factor / by_type.factor - 1) > 1e-6):
-            raise InputError(f"data set 164 makes it {by_type.factor:g} {by_type.si}; which is right? Pass {role}_unit",
-                             field=field, value=axis.unit)
+            raise InputError(f"by data set 164 it is {by_type.factor:g} {by_type.si}; state the right one with "
+                             f"{role}_unit", field=field, value=axis.unit)
         return labelled
     if by_type is None or by_type.si not in ALLOWED[role]:
         raise InputError(f"not stated (no label, specific data type {axis.kind}); pass {role}_unit, one of "
@@ -119,7 +126,7 @@ def _clock(function: Function) -> tuple[float, float, str]:
     # The increment is printed as E13.5: its uncertainty is half a unit of the sixth digit.
     mantissa = step / 10.0 ** np.floor(np.log10(step))
     rate = rounded(1 / step, 0.5e-5 / mantissa)
-    note = f"sample rate {1 / step:.9g} Hz, of an increment printed with six digits, taken as {rate:.9g} Hz"
+    note = f"sample rate {1 / step:.9g} Hz, from an increment with six digits; taken as {rate:.9g} Hz"
     return rate, float(time[0]), note if abs(rate * step - 1) > 1e-9 else ""
 
 
@@ -128,7 +135,7 @@ def _inputs(first: Mapping[Point, Function], names: Mapping[Point, str]) -> list
     references = {function.reference for function in first.values() if function.reference.node > 0
                   or function.reference.name}
     return [names[point] for point, function in first.items()
-            if function.axes[1].kind == FORCE or point in references or re.fullmatch(USUAL_INPUT, names[point], re.I)]
+            if function.axes[1].kind == FORCE or point in references or re.fullmatch(INPUT_NAME, names[point], re.I)]
 
 
 def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig: str | None,
@@ -170,8 +177,8 @@ def _roles(takes: Mapping[Point, list[Function]], names: Mapping[Point, str], co
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(available) else []
         roles["y"] = [name for name in available if name not in roles["u"] and name not in roles["floor"]]
     if not roles["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError(f"no channel is known as an input; the file has {', '.join(available)}; say with columns "
-                         "which is what (such as u=A1, y=S1), or that the excitation was rest or floor", field="u")
+        raise InputError(f"no channel is recognised as an input; the file has {', '.join(available)}; assign the "
+                         "channels with columns (such as u=A1, y=S1), or state excitation rest or floor", field="u")
     if not roles["y"]:
         raise InputError(f"expected at least one output; the file has {', '.join(available)}", field="y")
     return roles if roles["floor"] else {role: roles[role] for role in ("u", "y")}
@@ -198,9 +205,11 @@ def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str,
             if some else np.zeros((len(every[0].value), 0))
         parts[role] = Part(roles[role], [unit.si for unit in units], array)
     # The units have already been applied.
-    record, notes = record_from(name, parts, hints.sample_rate_Hz or rate, start,
-                                replace(hints, u_unit=None, y_unit=None))
-    notes += [f"record {name}: {note}"] if note and hints.sample_rate_Hz is None else []
+    hints = replace(hints, u_unit=None, y_unit=None)
+    if hints.sample_rate_Hz is not None:
+        rate, note = agreed_rate(hints.sample_rate_Hz, rate, f"record {name}: sample_rate_Hz"), ""
+    record, notes = record_from(name, parts, rate, start, hints)
+    notes += [f"record {name}: {note}"] if note else []
     notes += [f"record {name}: channel {function.response.name} is measured along "
               f"{function.response._replace(name='').channel().split()[-1]}; its sign is kept"
               for function in every if function.response.direction < 0 and function.response.name]

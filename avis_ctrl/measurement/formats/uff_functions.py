@@ -144,7 +144,7 @@ def _function(text: bytes, title: bytes, at: int, factors: tuple[float, float], 
         start, step = (_real(word) for word in form[3:5])
         axes = tuple(_axis(line) for line in header[7:10])
     except (ValueError, IndexError):
-        raise InputError("expected the header of a data set 58; lines 6 to 10 hold something else", field=place,
+        raise InputError("expected the header of a data set 58; lines 6 to 10 cannot be read", field=place,
                          value=header[6][:40]) from None
     if data_type not in (2, 4, 5, 6) or count < 1:
         raise InputError("expected ordinate data type 2, 4, 5 or 6 and a number of values", field=place,

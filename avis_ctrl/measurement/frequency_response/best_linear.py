@@ -97,8 +97,8 @@ def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = Non
     means = [average(record, used, keep, dropped, remove) for record in records]
     data = _experiments(means, len(used.inputs))
     frequency = np.arange(keep.start, keep.stop) * rate / n
-    told = f"{dropped} periods dropped" + (", transient removed" if remove else "")
-    words = f"best linear approximation, {len(data.U)} experiments of {means[0].periods} periods, {told}"
+    treatment = f"{dropped} periods dropped" + (", transient removed" if remove else "")
+    words = f"best linear approximation, {len(data.U)} experiments of {means[0].periods} periods, {treatment}"
     return tuple(_response(data, frequency, line, active, used, smooth_lines, words)
                  for active, line in _excited_sets(data, used))
 
@@ -154,8 +154,8 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
     on = (power > SETTINGS.excited_power * power.max(axis=0)) & (power > SETTINGS.excited_over_noise * noise)
     if not np.any(on):
         if np.any(power > 0):
-            raise InputError("expected inputs that repeat from period to period: they differ as much as they drive; "
-                             "is the period right?", field="period_s")
+            raise InputError("expected inputs that repeat in each period; these differ from period to period by as "
+                             "much as their size: check the period", field="period_s")
         raise InputError("expected at least one excited line in the band", field="inputs", value=used.inputs)
     sets: dict[tuple[int, ...], list[int]] = {}
     for line in np.flatnonzero(on.any(axis=1)):
@@ -177,8 +177,8 @@ def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, ac
         both = np.concatenate([-G, np.broadcast_to(np.eye(n_y), (line.size, n_y, n_y))], axis=2)
         noise = both @ data.covariance[line][:, columns][:, :, columns] @ np.swapaxes(both.conj(), 1, 2)
     if dof == 0 and noise is None:
-        raise InputError(f"expected repeated periods or more than {len(active)} experiments: without either nothing "
-                         "tells the noise", field="records", value=len(data.U))
+        raise InputError(f"expected repeated periods or more than {len(active)} experiments, to estimate the noise",
+                         field="records", value=len(data.U))
     per_line = dof or data.dof
     half = _smoothing(smooth_lines, per_line, n_y, line.size)
     total = None

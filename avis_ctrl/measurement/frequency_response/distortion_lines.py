@@ -81,9 +81,9 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
     between = (harmonic >= harmonic[on][0]) & (harmonic <= harmonic[on][-1])
     kind = np.where(on, "excited", np.where(harmonic % 2 == 1, "odd", "even"))
     if not np.any(between & (kind == "odd")):
-        raise InputError("expected odd harmonics that are left out, to detect odd distortion", field=field)
+        raise InputError("expected odd harmonics that are not excited, to detect odd distortion", field=field)
     if mean.covariance is None:
-        raise InputError("expected at least two settled periods, to tell the noise", field=field)
+        raise InputError("expected at least two settled periods, to estimate the noise", field=field)
     # Z is divided by sqrt(n): a line of amplitude a has |Z|^2 = a^2 n / 4 and mean square a^2 / 2.
     power = 2 / n * np.abs(mean.Z[between, n_u:]) ** 2
     noise = 2 / n * np.real(np.einsum("nii->ni", mean.covariance))[between, n_u:]

@@ -116,6 +116,7 @@ class LocalFit:
 
     @property
     def dof(self) -> int:
+        """Degrees of freedom of the noise covariance on each line."""
         return degrees_of_freedom(self.records, self.n_u, self.order, self.half_width)
 
     def window(self, line_Hz: np.ndarray, keep: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -179,7 +180,7 @@ class LocalFit:
         ComputationError : inputs that cannot be distinguished, with their names, unless `partial`.
         """
         if self.dof < 1 or self._unit is None:
-            raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom are left on "
+            raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom remain on "
                              f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
                              field="half_width", value=self.half_width)
         lead, first = self._lead, self._lead + self.n_u

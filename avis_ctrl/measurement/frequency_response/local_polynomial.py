@@ -145,8 +145,8 @@ def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np
     mean = np.stack([noise[a:b].mean(axis=0) for a, b in zip(low, high, strict=True)])
     mean = (mean + np.swapaxes(mean.conj(), 1, 2)) / 2
     if least * dof < noise.shape[1]:
-        raise InputError(f"expected longer records: {least * dof} degrees of freedom cannot give a definite covariance "
-                         f"of {noise.shape[1]} outputs", field="records")
+        raise InputError(f"expected longer records: {least * dof} degrees of freedom are too few for the covariance of "
+                         f"{noise.shape[1]} outputs", field="records")
     return NoiseCovariance(mean, (count * dof).astype(float))
 
 

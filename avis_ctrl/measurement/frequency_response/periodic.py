@@ -80,9 +80,8 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
     """
     found = [r for r in campaign.records if r.header.excitation == "multisine" and r.header.periods >= 1]
     if not found:
-        raise InputError("expected multisine records that hold at least one period; other records are for "
-                         "local_polynomial or spectral_average", field="records",
-                         value=[r.header.excitation for r in campaign.records])
+        raise InputError("expected multisine records of at least one period; use local_polynomial for other records",
+                         field="records", value=[r.header.excitation for r in campaign.records])
     if level_V is not None:
         levels = sorted({r.header.level_V for r in found})
         found = [r for r in found if abs(r.header.level_V - level_V) <= SETTINGS.same_level * abs(level_V)]
@@ -94,7 +93,7 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
                          "choose one", field="level_V", value=levels)
     periods = sorted({r.header.period_s for r in found if r.header.period_s is not None})
     if len(periods) > 1:
-        raise InputError("expected records of one period; choose them by Campaign.only", field="period_s",
+        raise InputError("expected records of one period; select them with Campaign.only", field="period_s",
                          value=periods)
     return tuple(found)
 

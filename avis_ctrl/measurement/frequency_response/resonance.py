@@ -150,7 +150,7 @@ def _check_significant(with_pole: float, without: float, entries: int, free: int
     limit = float(stats.f(added, free).isf(SETTINGS.false_alarm))
     if ratio < limit:
         raise ComputationError(f"no mode found near {near_Hz:g} Hz",
-                               measured=f"a pole explains {ratio:.3g} times what noise would give it, from {f[0]:.6g} "
+                               measured=f"a pole explains {ratio:.3g} times as much as of pure noise, from {f[0]:.6g} "
                                         f"to {f[-1]:.6g} Hz; {limit:.3g} is needed",
                                cause="no resonance there, or one hidden by noise",
                                next_step="look at the response, and give near_Hz and width_Hz around a peak")

@@ -51,7 +51,7 @@ def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | 
     first = records[0].header
     lacking = [record.header.name for record in records if not record.header.floor_names]
     if floor and lacking:
-        raise InputError("the floor is asked for as an input but was not measured", field=f"record {lacking[0]}: floor")
+        raise InputError("the floor is requested as an input but was not measured", field=f"record {lacking[0]}: floor")
     use = not lacking if floor is None else floor
     for record in records:
         if use and record.header.floor_names != first.floor_names:

@@ -32,7 +32,7 @@ from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, thirds
 class MapSettings:
     """Thresholds for evidence of channel faults.
 
-    chance : probability that a correct map is reported as wrong, divided among the alternatives and delays; a stop
+    false_alarm : probability that a correct map is reported as wrong, divided among the alternatives and delays; a stop
         interrupts the work, so it is smaller than for other alarms.
     least_agreement : minimum correlation of a channel with its assigned response; a model below it describes less than
         half the power of the data and provides no evidence.
@@ -42,7 +42,7 @@ class MapSettings:
     still : fraction of a drive in the excited directions up to which it counts as not driven: round-off of the basis.
     """
 
-    chance: float = 1e-4
+    false_alarm: float = 1e-4
     least_agreement: float = 0.7
     delay_s: tuple[float, float] = (-0.005, 0.02)
     delay_step_s: float = 0.001
@@ -61,7 +61,7 @@ SETTINGS = MapSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ModelComparison:
     """Inner products of measured entry (i, j) with expected entry (k, l), and their normalisation.
 
     C : (n_y, n_y, n_u, n_u), index i, k, j, l, the delay of the pair (i, k) removed. B : (n_y, n_u, n_u), of the
@@ -97,22 +97,22 @@ class Comparison:
         return np.asarray(-self.N * np.log(left))
 
     def evidence(self, alternatives: int) -> float:
-        """Log-likelihood ratio that one of this many alternatives reaches by chance with probability `chance`."""
-        return float(np.log(alternatives / self.settings.chance))
+        """Log-likelihood ratio that one of this many wrong alternatives reaches with probability `false_alarm`."""
+        return float(np.log(alternatives / self.settings.false_alarm))
 
     def least(self, alternatives: int) -> float:
         """Minimum agreement of a channel with its assigned response."""
-        by_chance = 1 - (self.settings.chance / alternatives) ** (1 / max(self.N - 1, 1))
-        return max(self.settings.least_agreement, float(np.sqrt(by_chance)))
+        unrelated = 1 - (self.settings.false_alarm / alternatives) ** (1 / max(self.N - 1, 1))
+        return max(self.settings.least_agreement, float(np.sqrt(unrelated)))
 
-    def by_chance(self, gain: float, agreement: float, alternatives: int) -> float:
+    def p_value(self, gain: float, agreement: float, alternatives: int) -> float:
         """Upper bound on the probability that one of this many alternatives reaches this gain and agreement."""
         unrelated = max(1 - agreement ** 2, 0.0) ** max(self.N - 1, 1)
         return min(1.0, alternatives * max(float(np.exp(-gain)), unrelated))
 
 
 def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray], np.ndarray] | None = None,
-            settings: MapSettings = SETTINGS) -> Comparison | None:
+            settings: MapSettings = SETTINGS) -> ModelComparison | None:
     """Compare measured and expected spectra of records with the most common segment length; None if they are too few.
 
     response : (n,) Hz -> (n, n_y, n_u) of the model. It is used (without leakage) if the voltages do not span all
@@ -138,7 +138,8 @@ def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray
     rows_M = np.sqrt(np.einsum("f,fij->i", w, np.abs(M) ** 2))
     tried, span_s = len(settings.delays_s), settings.delay_s[1] - settings.delay_s[0]
     delays = min(tried, 1 + int(np.ceil(2 * span_s * (measured.f[-1] - measured.f[0]))))
-    return Comparison(C, B, P, rows_M, delay_s, delays, measured.rank + len(thirds(measured.f)) - 1, measured, settings)
+    N = measured.rank + len(thirds(measured.f)) - 1
+    return ModelComparison(C, B, P, rows_M, delay_s, delays, N, measured, settings)
 
 
 def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
@@ -160,8 +161,8 @@ class Faults:
 
     own, other : (n_y,) agreement of each row with its own expectation and with the one found for it; everything else as
     found. columns : for each exchanged or flipped drive, the row with the strongest evidence, and its agreement without
-    and with the fault. chance : for each exchanged or flipped row and column, an upper bound on the probability of this
-    much evidence by chance, over all alternatives and delays.
+    and with the fault. p_value : for each exchanged or flipped row and column, an upper bound on the probability of so
+    much evidence for a correct map, over all alternatives and delays.
     doubtful : rows ("row", i) and columns ("column", j) that would agree better in another order or sign, but without
     strong absolute evidence; they are not reported as faults.
     """
@@ -173,19 +174,19 @@ class Faults:
     own: np.ndarray
     other: np.ndarray
     columns: dict[int, tuple[int, float, float]]
-    chance: dict[tuple[str, int], float]
+    p_value: dict[tuple[str, int], float]
     doubtful: tuple[tuple[str, int], ...]
 
 
-def explain(comparison: Comparison) -> Faults:
+def explain(comparison: ModelComparison) -> Faults:
     """Smallest set of exchanges and flips that explains the measured rows and columns, by greedy search.
 
     Each step takes the fault with the largest gain in the likelihood of all rows together. The gain must exceed what
-    chance produces among all steps, twice that for an exchange. For columns a single row must contribute half of this,
+    noise produces among all steps, twice that for an exchange. For columns a single row must contribute half of this,
     because a wrong model makes all rows slightly wrong. A symmetric rig turned about its axis is many exchanges at
     once: one by one, the simplest comes first. At the end every affected channel must agree with its assigned response
-    by more than `Comparison.least`, and better than with its own response by more than chance produces among all steps
-    and delays. Otherwise the channel is doubtful, and no fault is reported.
+    by more than `ModelComparison.least`, and better than with its own response by more than noise produces among all
+    steps and delays. Otherwise the channel is doubtful, and no fault is reported.
     """
     n_y, n_u = len(comparison.rows_M), len(comparison.P)
     order, sign = {"row": np.arange(n_y), "column": np.arange(n_u)}, {"row": np.ones(n_y), "column": np.ones(n_u)}
@@ -210,7 +211,7 @@ def explain(comparison: Comparison) -> Faults:
     return _judged(comparison, order["row"], order["column"], r, c, alternatives * comparison.delays)
 
 
-def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
+def _judged(comparison: ModelComparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
             alternatives: int) -> Faults:
     """The faults, if the evidence for all of them is strong; otherwise no fault, and the doubtful channels."""
     n_y, n_u = len(p), len(q)
@@ -221,7 +222,7 @@ def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray,
     touched = [i for i in rows if p[i] != i or r[i] < 0]
     gain = comparison.likelihood(other) - np.maximum(comparison.likelihood(own), 0.0)
     doubtful = [("row", int(i)) for i in touched if other[i] < least or gain[i] < evidence]
-    chance = {("row", int(i)): comparison.by_chance(gain[i], other[i], alternatives) for i in touched}
+    p_value = {("row", int(i)): comparison.p_value(gain[i], other[i], alternatives) for i in touched}
     columns: dict[int, tuple[int, float, float]] = {}
     for j in map(int, straight[(q != straight) | (c < 0)]):
         cycle = cycle_of(q, j)
@@ -231,13 +232,13 @@ def _judged(comparison: Comparison, p: np.ndarray, q: np.ndarray, r: np.ndarray,
         better = comparison.likelihood(other) - np.maximum(comparison.likelihood(before), 0.0)
         best = int(np.argmax(better))
         columns[j] = best, float(before[best]), float(other[best])
-        chance["column", j] = comparison.by_chance(better.sum(), other[best], alternatives)
+        p_value["column", j] = comparison.p_value(better.sum(), other[best], alternatives)
         if other[best] < least or 2 * better[best] < evidence or better.sum() < evidence:
             doubtful.append(("column", j))
     if doubtful:
         own = comparison.agreement(straight, np.ones(n_u))[rows, rows]
         return Faults(rows, straight, ones, np.ones(n_u), own, own, {}, {}, tuple(doubtful))
-    return Faults(p, q, r, c, own, other, columns, chance, ())
+    return Faults(p, q, r, c, own, other, columns, p_value, ())
 
 
 def cycle_of(order: np.ndarray, start: int) -> list[int]:
@@ -249,7 +250,7 @@ def cycle_of(order: np.ndarray, start: int) -> list[int]:
     return found
 
 
-def _agreements(comparison: Comparison, order: dict[str, np.ndarray], sign: dict[str, np.ndarray]) -> np.ndarray:
+def _agreements(comparison: ModelComparison, order: dict[str, np.ndarray], sign: dict[str, np.ndarray]) -> np.ndarray:
     """(n_y,) agreement of each row with the expectation that order and sign assign to it."""
     a = comparison.agreement(order["column"], sign["column"])
     return np.asarray(sign["row"] * a[np.arange(len(a)), order["row"]])

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.gates.channel_faults import Comparison, Faults, compare, cycle_of, explain
+from avis_ctrl.measurement.gates.channel_faults import Faults, ModelComparison, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import (
     Expectation,
@@ -124,7 +124,7 @@ def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
                       COPIES.different, _copy_picture(kept))
 
 
-def _exchanged(faults: Faults, campaign: Campaign, comparison: Comparison) -> Iterator[Finding]:
+def _exchanged(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
     sensors, drives = campaign.y_names, campaign.u_names
     for kind, what, p, names in (("row", "Sensor", faults.p, sensors), ("column", "Drive", faults.q, drives)):
         for i in range(len(p)):
@@ -144,12 +144,12 @@ def _exchanged(faults: Faults, campaign: Campaign, comparison: Comparison) -> It
             yield Finding(ORDER, "stop",
                           f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
                           f"fitted; p-value at most "
-                          f"{max(faults.chance[kind, j] for j in cycle):.1g}). Exchange their names or their cables.",
+                          f"{max(faults.p_value[kind, j] for j in cycle):.1g}). Exchange their names or their cables.",
                           pair, value=float(gain), limit=comparison.settings.least_agreement,
                           picture=_order_picture(faults, campaign, comparison))
 
 
-def _right(faults: Faults, campaign: Campaign, comparison: Comparison) -> Finding:
+def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Finding:
     worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
     least = f"the lowest correlation is {faults.other[worst]:.2f}, of {campaign.y_names[worst]!r}"
     alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
@@ -173,7 +173,7 @@ def _right(faults: Faults, campaign: Campaign, comparison: Comparison) -> Findin
                    picture=_order_picture(faults, campaign, comparison))
 
 
-def _order_picture(faults: Faults, campaign: Campaign, comparison: Comparison) -> Picture:
+def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Picture:
     a = faults.r[:, None] * comparison.agreement(faults.q, faults.c)
     x = np.arange(len(a))
     others = np.max(np.where(np.eye(len(a), dtype=bool), -np.inf, a), axis=1) if len(a) > 1 else np.zeros(1)
@@ -183,25 +183,25 @@ def _order_picture(faults: Faults, campaign: Campaign, comparison: Comparison) -
         (Limit("least that counts as evidence", comparison.settings.least_agreement),), x_names=campaign.y_names)
 
 
-def _flipped(faults: Faults, campaign: Campaign, comparison: Comparison) -> Iterator[Finding]:
+def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
     rows, columns = ([int(k) for k in np.flatnonzero(signs < 0)] for signs in (faults.r, faults.c))
     doubt = (" It is equally possible that all other channels are reversed."
              if 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving) else "")
     said = [("Sensor", campaign.y_names[k], -float(faults.other[k]),
-             f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.chance["row", k]) for k in rows]
+             f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.p_value["row", k]) for k in rows]
     for k in columns:
         of, before, after = faults.columns[k]
         said.append(("Drive", campaign.u_names[k], before - after, "reversing it raises the correlation of sensor "
-                     f"{campaign.y_names[of]!r} from {before:.2f} to {after:.2f}", faults.chance["column", k]))
-    for what, name, value, how, chance in said:
+                     f"{campaign.y_names[of]!r} from {before:.2f} to {after:.2f}", faults.p_value["column", k]))
+    for what, name, value, how, p_value in said:
         yield Finding(POLARITY, "stop",
-                      f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {chance:.1g}). Its "
+                      f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {p_value:.1g}). Its "
                       "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
                       f"reverse the sign of the channel.{doubt}", (name,), value=value,
                       limit=-comparison.settings.least_agreement, picture=_sign_picture(faults, campaign, comparison))
 
 
-def _signs_agree(faults: Faults, campaign: Campaign, comparison: Comparison) -> Finding:
+def _signs_agree(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Finding:
     lowest = float(faults.other.min())
     return Finding(POLARITY, "note" if faults.doubtful else "ok",
                    "The signs could not be checked: the agreement of model and records is too poor."
@@ -210,7 +210,7 @@ def _signs_agree(faults: Faults, campaign: Campaign, comparison: Comparison) -> 
                    limit=comparison.settings.least_agreement, picture=_sign_picture(faults, campaign, comparison))
 
 
-def _sign_picture(faults: Faults, campaign: Campaign, comparison: Comparison) -> Picture:
+def _sign_picture(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Picture:
     return Picture("Signed correlation with the model", "sensor", "correlation [-]",
                    (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
                    (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)

@@ -36,7 +36,6 @@ class _Kept:
     rms: np.ndarray
     spread: np.ndarray
     codes: np.ndarray
-    longest: np.ndarray
     stuck: dict[int, tuple[int, int]]
     response: np.ndarray | None
     traces: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
@@ -57,18 +56,17 @@ class DeadChannel(Gate):
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         y = np.concatenate([p.y for p in seen.pieces])
         t = np.concatenate([p.time for p in seen.pieces]) - seen.header.start_s
-        stuck, longest = {}, np.zeros(y.shape[1], int)
+        stuck = {}
         for k in range(y.shape[1]):
             runs = equal_runs(y[:, k])
-            longest[k] = runs[0][0]
-            second = runs[1][0] if len(runs) > 1 else 1
-            if longest[k] < len(y) and longest[k] >= max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second):
+            longest, second = runs[0][0], runs[1][0] if len(runs) > 1 else 1
+            if max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second) <= longest < len(y):
                 stuck[k] = runs[0]
         traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
         return _Kept(seen.header.name, seen.driven, np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0), spread, codes,
-                     longest, stuck, _excess(seen), traces)
+                     stuck, _excess(seen), traces)
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         rms = np.array([k.rms for k in kept])
@@ -151,9 +149,9 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
         return None
     n_u = estimate.rank
     level = FALSE_ALARM / estimate.coherence.size
-    chance = stats.beta.isf(level, n_u, estimate.dof)
+    limit = stats.beta.isf(level, n_u, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)
-    return np.max(ratio, axis=0) / (chance / max(1 - chance, 1e-12))
+    return np.max(ratio, axis=0) / (limit / max(1 - limit, 1e-12))
 
 
 def _sine_excess(seen: Excerpt) -> np.ndarray:
@@ -161,5 +159,5 @@ def _sine_excess(seen: Excerpt) -> np.ndarray:
     piece = seen.first
     n_u = piece.u.shape[1]
     fit = fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), n_u, seen.header.sample_rate_Hz)
-    ratio = np.abs(fit.X[n_u:]) ** 2 / 4 * fit.samples / np.maximum(fit.rest[n_u:] ** 2, 1e-300)
+    ratio = np.abs(fit.X[n_u:]) ** 2 / 4 * fit.samples / np.maximum(fit.residual_rms[n_u:] ** 2, 1e-300)
     return ratio / float(stats.f.isf(FALSE_ALARM / len(ratio), 2, fit.samples - 3))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.gates.channel_map import ChannelMap
+from avis_ctrl.measurement.gates.channel_map import ORDER, POLARITY, ChannelMap
 from avis_ctrl.measurement.gates.clipping import Clipping
 from avis_ctrl.measurement.gates.dead_channel import DeadChannel
 from avis_ctrl.measurement.gates.excerpt import LONGEST, Gate, excerpt
@@ -15,7 +15,7 @@ from avis_ctrl.measurement.gates.finding import Expectation, Finding
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples
 from avis_ctrl.measurement.gates.periodicity import Periodicity
-from avis_ctrl.measurement.gates.repeatability import Comparison
+from avis_ctrl.measurement.gates.repeatability import LEVEL_DEPENDENCE, Comparison
 from avis_ctrl.measurement.gates.signal_quality import Coherence, SignalToNoise
 from avis_ctrl.measurement.gates.spikes import Spikes
 from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
@@ -23,9 +23,9 @@ from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 GATES: tuple[type[Gate], ...] = (Clipping, Spikes, DeadChannel, ChannelMap, SteppedSine, MissingSamples, Hum,
                                  SignalToNoise, Coherence, Periodicity, Comparison)
 # Gates that missing or doubled samples of any record affect.
-CONSEQUENCES = ("signal to noise", "coherence", "periodicity", "repeatability", "level dependence", "spikes")
+CONSEQUENCES = (SignalToNoise.name, Coherence.name, Periodicity.name, Comparison.name, LEVEL_DEPENDENCE, Spikes.name)
 # Gates that these affect only if every record has them.
-OF_ALL = ("channel order", "polarity")
+OF_ALL = (ORDER, POLARITY)
 
 
 def examine(campaign: Campaign, expectation: Expectation | None = None, longest: int = LONGEST) -> tuple[Finding, ...]:

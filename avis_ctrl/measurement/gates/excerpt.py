@@ -24,10 +24,12 @@ class Excerpt:
 
     @property
     def whole(self) -> bool:
+        """Whether the pieces contain all samples of the record."""
         return sum(len(piece.y) for piece in self.pieces) == self.header.samples
 
     @property
     def first(self) -> Record:
+        """First piece."""
         return self.pieces[0]
 
     @property

@@ -63,7 +63,8 @@ class Spectra:
     def driven(self) -> np.ndarray:
         """(n,) mask of lines at which the inputs have power, without the mean (lines 0 and 1)."""
         power = np.sum(np.abs(self.U) ** 2, axis=(0, 2))
-        mask = power > SETTINGS.driven * np.max(power[1:], initial=0.0)
+        power[0] = 0.0
+        mask = driven_lines(power)
         mask[:2] = False
         return mask
 
@@ -92,6 +93,11 @@ class H1:
     def unbiased_coherence(self) -> np.ndarray:
         """(n, n_y) coherence with its bias removed."""
         return self.coherence - (1 - self.coherence) * self.rank / self.dof
+
+
+def driven_lines(power: np.ndarray) -> np.ndarray:
+    """(n,) mask of lines with more than `H1Settings.driven` of the power (n,) of the strongest line."""
+    return power > SETTINGS.driven * np.max(power, initial=0.0)
 
 
 def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -10,6 +10,7 @@ from scipy import signal, stats
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.h1 import driven_lines
 
 MAINS_HZ = (50.0, 60.0)
 
@@ -128,8 +129,7 @@ def _driven(Pu: np.ndarray, excitation: str) -> np.ndarray:
     power = Pu.sum(axis=1)
     if excitation == "noise" or not power.any():
         return np.zeros(len(power), bool)
-    strong = power[power > 1e-3 * power.max()]
-    return power > 1e-6 * np.median(strong)
+    return power > 1e-6 * np.median(power[driven_lines(power)])
 
 
 def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: float, K: int) -> list[_Line] | None:

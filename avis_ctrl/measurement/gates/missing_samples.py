@@ -70,7 +70,7 @@ class MissingSamples(Gate):
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         t, delay = delays(seen)
         stepped = [one for one in delay if (step := delay_step(one, FALSE_ALARM)) is not None
-                   and SETTINGS.jump_samples < abs(step[1]) <= SETTINGS.longest_samples and not runs_away(one, step[0])
+                   and SETTINGS.jump_samples < abs(step[1]) <= SETTINGS.longest_samples and not drifts(one, step[0])
                    and explained(seen, t, *step) > SETTINGS.explains]
         block = repeated_block(seen.first.y, seen.header.period_samples)
         return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
@@ -79,15 +79,15 @@ class MissingSamples(Gate):
         level = FALSE_ALARM / max(1, sum(k.delay.size for k in kept))
         found = [*self._overlaps(kept), *(f for k in kept for f in self._faults(k, level))]
         longest = max(kept, key=lambda k: len(k.t))
-        told = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
-        vague = sum(len(k.t) > 3 for k in kept) - len(told)
-        scatter = float(max((np.std(k.delay[0]) for k in told), default=np.nan))
-        said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if told else ""
+        comparable = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
+        vague = sum(len(k.t) > 3 for k in kept) - len(comparable)
+        scatter = float(max((np.std(k.delay[0]) for k in comparable), default=np.nan))
+        said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if comparable else ""
         said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
         return found or [
-            Finding(self.name, "ok", f"No lost or repeated samples were found ({len(told)} of {len(kept)} records "
-                    f"could be compared with a moving commanded voltage{said}).", value=scatter if told else None,
-                    limit=SETTINGS.jump_samples, picture=_picture(longest))]
+            Finding(self.name, "ok", f"No lost or repeated samples were found ({len(comparable)} of {len(kept)} "
+                    f"records could be compared with a moving commanded voltage{said}).",
+                    value=scatter if comparable else None, limit=SETTINGS.jump_samples, picture=_picture(longest))]
 
     def _faults(self, k: _Kept, level: float) -> Iterator[Finding]:
         """Findings on one record."""
@@ -100,11 +100,13 @@ class MissingSamples(Gate):
                           float(SETTINGS.block_rows), picture)
         if k.clock is not None and np.any(k.clock != 0):
             p = int(np.flatnonzero(k.clock)[0])
+            # Within the period of the loss the correlation shows only part of the shift.
+            shift = float(k.clock[-1] or k.clock[p])
             yield Finding(self.name, "stop",
-                          f"The commanded voltage of record {name} is {abs(k.clock[-1] or k.clock[p]):g} samples off "
+                          f"The commanded voltage of record {name} is {abs(shift):g} samples off "
                           f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, "
                           "or the stated period is wrong. Check period_s, or repeat the record.", (), (name,),
-                          float(k.clock[p]), 0.0, picture)
+                          shift, 0.0, picture)
         steps = [step for one in k.stepped if (step := delay_step(one, level)) is not None]
         at, size = max(steps, key=lambda step: abs(step[1]), default=(0, 0.0))
         if abs(size) > SETTINGS.jump_samples:
@@ -221,7 +223,7 @@ def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
     return best[1], best[2]
 
 
-def runs_away(delay: np.ndarray, where: int) -> bool:
+def drifts(delay: np.ndarray, where: int) -> bool:
     """Whether a straight line fits the delay better than a step at `where`: two different clocks, not lost samples."""
     x = np.arange(len(delay))
     line = delay - np.polyval(np.polyfit(x, delay, 1), x)

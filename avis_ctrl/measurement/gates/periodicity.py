@@ -114,7 +114,7 @@ class Periodicity(Gate):
         reference = P - P // 2
         if drop <= reference:
             return None
-        bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference - 1 :, j] > limit).any())
+        bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference:, j] > limit).any())
         return Finding(self.name, "warning",
                        f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: "
                        f"{quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise, "

@@ -21,7 +21,7 @@ from avis_ctrl.measurement.gates.finding import (
     percent,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, h1, moving, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, moving, octaves, segment_length, spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -31,7 +31,8 @@ class ComparisonSettings:
         1.4 mrad, more than the rotation caused by rounding the voltages to four digits.
     excited : power of u at a line relative to the median of the driven lines, below which the line counts as the edge
         of the band: u and y are small there, and leakage into them differs from record to record.
-    told : ratio of T to its limit above which the message states "far more than noise explains" instead of the number.
+    largest_stated : ratio of T to its limit above which the message states "far more than noise explains" instead of
+        the number.
     notable, large : difference relative to the response above which it is a note, because gains are known to 1 % at
         best, and above which it is a warning.
     blind : noise of the comparison relative to the response, above which it hides changes that matter.
@@ -40,7 +41,7 @@ class ComparisonSettings:
 
     common: float = 1 - 1e-6
     excited: float = 0.03
-    told: float = 20.0
+    largest_stated: float = 20.0
     notable: float = 0.01
     large: float = 0.05
     blind: float = 0.2
@@ -48,6 +49,7 @@ class ComparisonSettings:
 
 
 SETTINGS = ComparisonSettings()
+LEVEL_DEPENDENCE = "level dependence"  # gate name of the findings on different levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,7 @@ class Comparison(Gate):
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
         return [*_judged(self.name, repeats, campaign, _drifted, agreed,
                          "Repeatability was not tested: no two driven records of one level and enough length."),
-                *_judged("level dependence", levels, campaign, _nonlinear, "The responses at all levels agree",
+                *_judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, "The responses at all levels agree",
                          "Dependence on the level was not tested: no driven records of one kind and enough length at "
                          f"two levels, at least a factor {SETTINGS.apart:g} apart.")]
 
@@ -136,7 +138,7 @@ class Comparison(Gate):
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
     """Sentence and records of the finding."""
     return (f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to "
-            f"{percent(d.relative[bad].max())} of the response, {beyond_chance(d.T[bad].max())}. The rig drifted or "
+            f"{percent(d.relative[bad].max())} of the response, {significance(d.T[bad].max())}. The rig drifted or "
             "was changed in between; treat its parameters as uncertain by this amount, or use only one of the two."
             ), (d.a, d.b)
 
@@ -145,12 +147,12 @@ def _nonlinear(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[
     low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
     return (f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to "
             f"{percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz), "
-            f"{beyond_chance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and include the difference "
+            f"{significance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and include the difference "
             "in the uncertainty."), ()
 
 
 def _judged(gate: str, differences: list[Difference], campaign: Campaign,
-            said: Callable[[Difference, np.ndarray, tuple[str, ...]], tuple[str, tuple[str, ...]]], agreed: str,
+            described: Callable[[Difference, np.ndarray, tuple[str, ...]], tuple[str, tuple[str, ...]]], agreed: str,
             untested: str) -> list[Finding]:
     """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
@@ -162,7 +164,7 @@ def _judged(gate: str, differences: list[Difference], campaign: Campaign,
         if bad.any():
             names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
             large = d.relative[bad].max() > SETTINGS.large
-            sentence, records = said(d, bad, names)
+            sentence, records = described(d, bad, names)
             found.append(Finding(gate, "warning" if large else "note", sentence, names, records, float(d.T[bad].max()),
                                  1.0, _picture(d, campaign.y_names)))
     if found:
@@ -229,7 +231,7 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     size = np.abs(windowed(second.y - second.y.mean(axis=0))) ** 2
     f = np.fft.rfftfreq(len(first.y), 1 / a.rate)[2:-1:2]
     driven = np.sum(np.abs(windowed(second.u)) ** 2, axis=1)
-    keep = driven > 1e-3 * driven.max()
+    keep = driven_lines(driven)
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
@@ -295,6 +297,8 @@ def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(a @ left[:, cosine > SETTINGS.common])
 
 
-def beyond_chance(T: float) -> str:
+def significance(T: float) -> str:
     """How far a statistic exceeds its 1 % limit, in words."""
-    return "far more than noise explains" if SETTINGS.told < T else f"{T:.1f} times the 1 % limit of noise alone"
+    if SETTINGS.largest_stated < T:
+        return "far more than noise explains"
+    return f"{T:.1f} times the 1 % limit of noise alone"

@@ -11,7 +11,17 @@ from scipy import stats
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
-from avis_ctrl.measurement.gates.h1 import H1, h1, moving, octaves, segment_length, spectra, thirds, usable
+from avis_ctrl.measurement.gates.h1 import (
+    H1,
+    driven_lines,
+    h1,
+    moving,
+    octaves,
+    segment_length,
+    spectra,
+    thirds,
+    usable,
+)
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
 
@@ -226,7 +236,7 @@ def _lowest_driven(chosen: list[_Coherence]) -> float:
     lowest = []
     for k in chosen:
         power = np.sum(np.abs(np.fft.rfft(k.u - k.u.mean(axis=0), axis=0)) ** 2, axis=1)
-        lowest.append(float(np.flatnonzero(power > 1e-3 * power.max())[0]) * k.rate / len(k.u))
+        lowest.append(float(np.flatnonzero(driven_lines(power))[0]) * k.rate / len(k.u))
     return min(lowest)
 
 
@@ -238,8 +248,8 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
     if seen.periodic and (periods := seen.periods("y")).shape[0] >= 3:
         Y, U = np.fft.rfft(periods[1:], axis=1), np.fft.rfft(seen.periods("u")[1:].mean(axis=0), axis=0)
         power = np.sum(np.abs(U) ** 2, axis=1)
-        keep = power > 1e-3 * power[1:].max()
-        keep[0] = False
+        power[0] = 0.0
+        keep = driven_lines(power)
         P = len(Y)
         noise = np.sum(np.abs(Y - Y.mean(axis=0)) ** 2, axis=0)[keep] / (P - 1)
         # Neighbouring lines have the same noise level: a mean over nine lines avoids division by a value that is small

@@ -12,12 +12,12 @@ KINDS = {0: "low-pass (displacement)", 1: "band-pass (velocity)", 2: "high-pass 
 
 @dataclass(frozen=True, eq=False)
 class SineFit:
-    """f Hz; X (channels,) complex amplitudes, u before y; rest (channels,) residual r.m.s.; samples."""
+    """f Hz; X (channels,) complex amplitudes, u before y; residual_rms (channels,); samples."""
 
     record: str
     f: float
     X: np.ndarray
-    rest: np.ndarray
+    residual_rms: np.ndarray
     samples: int
     t: np.ndarray
     traces: np.ndarray
@@ -45,13 +45,13 @@ def fit_sine(record: str, x: np.ndarray, n_u: int, rate: float) -> SineFit:
     def regressors(f: float) -> np.ndarray:
         return np.column_stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t), np.ones(n)])
 
-    def remains(f: float) -> float:
+    def residual(f: float) -> float:
         A = regressors(f)
         c = np.linalg.solve(A.T @ A, A.T @ centred[:, lead])
         return float(np.sum((centred[:, lead] - A @ c) ** 2))
 
     f = float(
-        minimize_scalar(remains, bounds=(max(start - rate / n, 0.1 * rate / n), start + rate / n), method="bounded",
+        minimize_scalar(residual, bounds=(max(start - rate / n, 0.1 * rate / n), start + rate / n), method="bounded",
                         options={"xatol": 1e-6 * rate / n}).x)
     A = regressors(f)
     c, *_ = np.linalg.lstsq(A, centred, rcond=None)

@@ -70,7 +70,7 @@ class SteppedSine(Gate):
                         f"No stepped-sine campaign: {len(fits)} sine records, {SETTINGS.fewest} are needed to compare "
                         "neighbours.", picture=Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ()))]
         f, X = np.array([k.f for k in fits]), np.array([k.X for k in fits])
-        rest = np.array([k.rest for k in fits]) / np.maximum(np.abs(X), 1e-300) * np.sqrt(2)
+        rest = np.array([k.residual_rms for k in fits]) / np.maximum(np.abs(X), 1e-300) * np.sqrt(2)
         silent = [j for j in range(len(names)) if np.median(rest[:, j]) > 10]
         live = [j for j in range(len(names)) if j not in silent]
         drive = _drive(rest, live, len(campaign.u_names))
