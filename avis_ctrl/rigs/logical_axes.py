@@ -119,7 +119,9 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     inertial, noise = np.array([one.inertial for one in channels]), _noise(rig, chosen)
     complaint = f"cannot be distinguished by the sensors {list(names)}"
     alone = bool(np.all(inertial))
-    absolute = wanted if alone else _absolute(H[inertial], wanted, rig.edge_m, noise[inertial])
+    absolute: list[int] = []
+    if np.any(inertial):
+        absolute = wanted if alone else _absolute(H[inertial], wanted, rig.edge_m, noise[inertial])
     relative = [k for k in wanted if k not in absolute]
     decoding, condition = np.zeros((len(wanted), len(names))), 1.0
     if absolute and alone:

@@ -224,7 +224,9 @@ def _modes(eom: Any, modes: Any, judge: Judge) -> None:
         sag = G / (2 * np.pi * vertical[0]) ** 2
         judge("sag_m", sag, f"static sag {sag:.2g} m")
     damping = np.diag(modes.shapes.T @ eom.C @ modes.shapes) / (4 * np.pi * f)
-    for zeta in (np.min(damping), np.max(damping)):
+    # Undamped modes are not compared, but must not hide the smallest damping of the others.
+    damped = damping[damping > 0]
+    for zeta in (np.min(damped, initial=np.inf), np.max(damped, initial=0.0)):
         judge("damping", zeta, f"damping ratio {zeta:.2g}")
 
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array
+
+# Condition of the eigenvectors of the balanced A above which A counts as defective, and the relative changes of A
+# that are tried in this case.
+DEFECTIVE = 1e12
+SEPARATION = (0.0, 1e-8, 1e-6, 1e-4, 1e-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +63,28 @@ class Entries:
         return whole[self.rows, self.cols] * self.size
 
 
+def _diagonalisable(K: StateSpace) -> tuple[StateSpace, Array, Array]:
+    """K with the eigenvalues and eigenvectors of its A, which is changed slightly if it has too few eigenvectors."""
+    size = 1e-6 * float(np.max(np.abs(K.poles()), initial=0.0)) or 1.0
+    _, (scale, _) = la.matrix_balance(K.A, permute=False, separate=True)
+    for change in SEPARATION:
+        # A different relative change of every row separates repeated poles and keeps decoupled channels decoupled.
+        rows = change * np.linspace(-1, 1, K.nstates)[:, None]
+        made = replace(K, A=K.A + rows * (K.A + size * np.eye(K.nstates)))
+        values, V = la.eig(made.A)
+        balanced = V / scale[:, None]
+        if not V.size or np.linalg.cond(balanced / np.linalg.norm(balanced, axis=0)) < DEFECTIVE:
+            break
+    return made, values, V
+
+
 def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
     """Modal A (1 x 1 and 2 x 2 blocks), B and C with rows of B and columns of C of equal norm, |poles|, and outputs.
 
     The outputs (n,) are those that each state affects most; the states are ordered by them.
     """
     n, vectors, sizes, channels = K.nstates, [], [], []
-    values, V = la.eig(K.A)
+    K, values, V = _diagonalisable(K)
     output = np.argmax(np.abs(K.C @ V), axis=0)
     for k in np.lexsort((np.abs(values), output)):
         if values[k].imag > 0:

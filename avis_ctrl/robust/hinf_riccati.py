@@ -136,19 +136,19 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
     """Bracket the optimum to a relative tolerance: geometric steps, then regula falsi on rho(X Y), or bisection.
 
     proved : search for a proved lower bound if the test is in doubt just below the optimum.
-    ComputationError if even gamma = limit times the initial value fails.
+    ComputationError if even gamma = limit times the initial value, or that without a hint, fails.
     """
     floor, natural = direct_term_bound(plant), natural_gamma(plant)
     nothing = SETTINGS.zero_gamma * natural
     start = max(hint or natural, floor * (1 + 2 * tolerance), nothing)
     search = _Search(plant, floor)
-    step, factor = start, 1.05 if hint else 4.0
-    while search.upper is None:
-        search.try_gamma(step)
-        step, factor = step * factor, factor ** 2
-        if step > limit * start:
+    step, factor, largest = start, 1.05 if hint else 4.0, limit * max(start, natural)
+    while not search.try_gamma(step):
+        if step >= largest:
             raise ComputationError("no controller was found at any gamma", measured=f"gamma up to {step:.3g} tried",
                                    cause=search.reason, next_step="check weights and scaling of the plant")
+        step, factor = min(step * factor, largest), factor ** 2
+    assert search.upper is not None
     factor = 1.05 if hint else 4.0
     while search.failed <= max(floor, 0.0) and search.upper.gamma > nothing:
         step = search.upper.gamma / factor

@@ -128,11 +128,12 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     form, bracket, notes = problem.solve(tolerance, gamma_hint)
     status = Status.REGULARISED if notes else Status.OPTIMAL
     bounds = bracket.lower, bracket.upper.gamma
+    doubt: tuple[str, ...] = ()
     if method == "lmi":
-        from avis_ctrl.robust.hinf_lmi import lmi_gamma
+        from avis_ctrl.robust.hinf_lmi import UNCERTIFIED, lmi_gamma
 
         optimum = lmi_gamma(P, nmeas, ncon)
-        bounds = optimum.lower, optimum.upper
+        bounds, doubt = (optimum.lower, optimum.upper), (UNCERTIFIED,) if optimum.violation > 0 else ()
     result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff,
                                      far_poles == "gain")
     if notes and method != "lmi":
@@ -149,7 +150,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
         notes = (*notes, *_doubt_of_gamma(P, result))
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
-                   limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
+                   limited_by=bracket.limited_by, notes=(*notes, *doubt, *result.notes, *rate))
 
 
 def hinf_controller(P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None,

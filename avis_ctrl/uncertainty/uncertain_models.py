@@ -38,18 +38,18 @@ def real(name: str, nominal: float, *, percent: float | tuple[float, float] | No
     >>> (1 / k + k**2).substitute(k=2.5)
     array([[6.65]])
     """
-    size = percent if percent is not None else plus_minus
-    if isinstance(size, (int, float)) and size < 0:
-        raise InputError("expected half a range, not negative", field=name, value=size)
     if sum(one is not None for one in (percent, plus_minus, range)) != 1:
         raise InputError("expected exactly one of percent, plus_minus and range", field=name)
     try:
         if range is not None:
             low, high = (float(v) for v in range)
         else:
-            down, up = np.broadcast_to(np.asarray(percent if percent is not None else plus_minus, float), 2).tolist()
+            size = percent if percent is not None else plus_minus
+            down, up = np.broadcast_to(np.asarray(size, float), 2).tolist()
+            if min(down, up) < 0:
+                raise InputError("expected half a range, not negative", field=name, value=size)
             unit = abs(nominal) / 100 if percent is not None else 1.0
-            low, high = nominal - abs(down) * unit, nominal + abs(up) * unit
+            low, high = nominal - down * unit, nominal + up * unit
         element = RealParameter(name, 1, 1, float(nominal), low, high)
     except (TypeError, ValueError) as error:
         raise error if isinstance(error, InputError) else InputError("expected numbers", field=name) from None

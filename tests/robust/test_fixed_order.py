@@ -208,3 +208,21 @@ def test_decentralised_loops_see_their_own_signal_alone():
         musyn(P.select(slice(0, 7), slice(0, 8)), blocks, 1, 2, structure="decentralised")
     with pytest.raises(InputError, match="'full' or 'decentralised'"):
         musyn(P, blocks, 2, 2, structure="diagonal")
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_entries_of_a_controller_with_repeated_poles(order):
+    """A chain of equal lags has one eigenvector; the entries represent a controller with nearly the same response."""
+    A = 100.0 * np.kron(np.eye(order, k=-1) - np.eye(order), np.eye(2))
+    K = StateSpace(A, np.eye(2 * order, 2), np.eye(2, 2 * order, 2 * order - 2), np.zeros((2, 2)))
+    form = Entries.of(K)
+    omega = np.geomspace(1.0, 1e4, 30)
+    expected = K.frequency_response(omega)
+    error = np.linalg.norm(form.controller(form.start).frequency_response(omega) - expected, axis=(1, 2))
+    assert np.max(error / np.linalg.norm(expected, axis=(1, 2))) < 1e-3
+
+
+def test_the_grid_does_not_depend_on_the_unit_of_time():
+    system = StateSpace(-np.diag([1.0, 30.0]), np.ones((2, 1)), np.ones((1, 2)), [[0.0]])
+    slow = replace(system, A=1e-12 * system.A, B=1e-12 * system.B)
+    assert np.allclose(frequency_grid(slow), 1e-12 * frequency_grid(system), rtol=1e-9)
