@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.file_errors import dotted
 from avis_ctrl.rigs.plausible_ranges import RANGES, PlausibleRanges, Range
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.unit_slips import Entry, G, Place, Slip, apart, dotted, entries, slips
+from avis_ctrl.rigs.unit_slips import Entry, G, Place, Slip, apart, entries, slips
 
 Build = Callable[[dict[str, Any]], Rig]
 Judge = Callable[..., None]

@@ -92,10 +92,15 @@ class MotorSection(Section):
     limit_V: Positive
 
 
-class DriveSection(Section):
+class PlacedSection(Section):
+    """A drive or sensor at any position."""
+
     name: Name
     position_m: Point
     direction: Direction
+
+
+class DriveSection(PlacedSection):
     constant_N_per_V: Positive
     limit_V: Positive | None = None
 
@@ -112,10 +117,7 @@ class GeophoneSection(Section):
     preamplifier_gain: Positive
 
 
-class GeophoneAtSection(Section):
-    name: Name
-    position_m: Point
-    direction: Direction
+class GeophoneAtSection(PlacedSection):
     sensitivity_Vs_per_m: Positive
     suspension_Hz: Positive
     suspension_damping: Positive
@@ -125,10 +127,7 @@ class GeophoneAtSection(Section):
     noise_rms_V: NotNegative | None = None
 
 
-class AccelerometerAtSection(Section):
-    name: Name
-    position_m: Point
-    direction: Direction
+class AccelerometerAtSection(PlacedSection):
     sensitivity_Vs2_per_m: Positive
     low_corner_Hz: Positive
     noise_m_per_s2_rtHz: NotNegative | None = None
@@ -136,10 +135,7 @@ class AccelerometerAtSection(Section):
     noise_rms_V: NotNegative | None = None
 
 
-class PositionSensorSection(Section):
-    name: Name
-    position_m: Point
-    direction: Direction
+class PositionSensorSection(PlacedSection):
     sensitivity_V_per_m: Positive
     bandwidth_Hz: Positive | None = None
     noise_m_rtHz: NotNegative | None = None

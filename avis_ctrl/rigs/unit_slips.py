@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.rigs.file_errors import dotted
 from avis_ctrl.rigs.rigid_body import GRAVITY
 
 G = GRAVITY
@@ -160,11 +161,6 @@ def _named(scope: int, name: tuple[Any, ...], members: list[Entry]) -> tuple[str
                               for entry in members))
     shown_keys = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
     return shown_keys, values[:3] if len(values) > 1 else values[0]
-
-
-def dotted(place: Place) -> str:
-    """("isolator", 1, "position_m", 0) as isolator[2].position_m[1], counted from 1."""
-    return "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
 
 
 def apart(slip: Slip, mended: dict[str, Any]) -> float:

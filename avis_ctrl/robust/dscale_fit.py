@@ -17,8 +17,9 @@ bump of height at most one in log y, and the basis follows the solution.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import clarabel
 import numpy as np
@@ -31,6 +32,7 @@ from avis_ctrl.robust.scalings import ScalarScaling
 POSITIVITY_MARGIN = 1e-7
 # log t / weight above which a point imposes no constraint in double precision.
 SLACK_LIMIT = 25.0
+Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
@@ -69,31 +71,42 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
         return MagnitudeFit(best, error, error if order == 0 else 0.0, 0)
     unit = float(np.exp(np.mean(np.log(omega))))
     problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, initial_roots(omega / unit, target, order))
+
+    def attempt(level: float) -> tuple[ScalarScaling, float] | None:
+        nonlocal problem
+        found = problem.solve(2 * level)
+        if found is None:
+            return None
+        p, q = found
+        fitted = _spectral_factor(p, q, unit)
+        problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
+        return fitted, float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
+    return MagnitudeFit(*bisection(best, error, attempt, tolerance))
+
+
+def bisection(best: Fitted, error: float, attempt: Callable[[float], tuple[Fitted, float] | None], tolerance: float
+              ) -> tuple[Fitted, float, float, int]:
+    """Bisection on the error of a fit, from the fit `best`: the last fit, its error, the proved bound, and the solves.
+
+    attempt : function of a level, a fit with its error, or None if the level is proved infeasible.
+    """
     lower, solves = 0.0, 0
     while error - lower > tolerance and solves < 40:
         level = (lower + error) / 2
         solves += 1
         try:
-            candidate = problem.solve(2 * level)
-        except ComputationError:
-            # Neither solved nor proved infeasible: keep the best fit so far, with its bound.
+            found = attempt(level)
+        except (ComputationError, InputError):
+            # Neither solved nor proved infeasible, or no stable factor because of round-off: keep the best fit so far.
             break
-        if candidate is None:
+        if found is None:
             lower = level
             continue
-        p, q = candidate
-        try:
-            fitted = _spectral_factor(p, q, unit)
-        except ComputationError:
-            # Round-off moved a root onto the axis: as above.
-            break
-        achieved = float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
-        if achieved >= error:
+        if found[1] >= error:
             # Feasible, but no better after factorisation: the limit of double precision.
             break
-        best, error = fitted, achieved
-        problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
-    return MagnitudeFit(best, error, lower, solves)
+        best, error = found
+    return best, error, lower, solves
 
 
 def _checked(omega: np.ndarray, magnitude: np.ndarray, order: int,

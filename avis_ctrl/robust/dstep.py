@@ -244,18 +244,14 @@ def band_of(omega: np.ndarray) -> tuple[float, float]:
     return (10 * low, high / 10) if high > 1e3 * low else (low, high)
 
 
-def peak_of(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """sigma_max(D N D^-1) (n_omega,) with the realised scalings."""
-    return _sigma(points.omega, points.M, scalings)
-
-
 def _sigma(omega: np.ndarray, M: np.ndarray, scalings: Scalings) -> np.ndarray:
+    """sigma_max(D M D^-1) (n_omega,) with the realised scalings."""
     left, right = scalings.response(omega)
     return np.linalg.norm(left @ M @ right, ord=2, axis=(1, 2))
 
 
 def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
-    sigma = peak_of(points, scalings)
+    sigma = _sigma(points.omega, points.M, scalings)
     return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / points.yardstick)) - 1)
 
 

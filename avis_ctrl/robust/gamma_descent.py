@@ -15,7 +15,6 @@ that transform a plant to normal form. Differences of the data are therefore not
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,12 +150,10 @@ class _CouplingSlope:
 
 
 def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float], *,
-            evaluations: int = 40, tolerance: float = 1e-3,
-            stop: Callable[[float], bool] = lambda gamma: False) -> Descent:
+            evaluations: int = 40, tolerance: float = 1e-3) -> Descent:
     """Quasi-Newton descent (BFGS with bounds) on log gamma over the parameters of the scalar scalings.
 
-    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`, or
-    when `stop(gamma)`, called before every step, returns true.
+    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`.
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     low, high = np.array(parameter_box(scalings, band)).T
@@ -164,7 +161,7 @@ def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tupl
     gamma, slope = gamma_and_gradient(problem, here)
     first, count, trail = gamma, 1, [gamma]
     H = np.eye(low.size)
-    while count < evaluations and not stop(gamma):
+    while count < evaluations:
         theta = parameters(here)
         step = _direction(H, slope, theta, low, high)
         found = None

@@ -30,14 +30,14 @@ def _level_matrix(M, p_z, p_w, F):
 
 
 @njit(cache=True)
-def _factor(F):
-    """Lower Cholesky factor in place of F; False if F is not positive definite."""
+def factor(F, least):
+    """Lower Cholesky factor in place of F; False if F is not positive definite: a squared pivot not above `least`."""
     n = F.shape[0]
     for j in range(n):
         total = F[j, j].real
         for k in range(j):
             total -= F[j, k].real ** 2 + F[j, k].imag ** 2
-        if not total > 0.0:
+        if not total > least:
             return False
         root = np.sqrt(total)
         F[j, j] = root
@@ -50,7 +50,7 @@ def _factor(F):
 
 
 @njit(cache=True)
-def _invert(L):
+def invert(L):
     """Inverse of L in place of the lower factor L."""
     n = L.shape[0]
     for j in range(n):
@@ -116,9 +116,9 @@ def _derivatives(M, p, lam, of_z, of_w, copies, gradient, slope, hessian, fallin
     falling[n_b] = 0.0
     for s in range(M.shape[0]):
         _level_matrix(M[s], p[of_z], lam * p[of_w], F)
-        if not _factor(F):
+        if not factor(F, 0.0):
             return False
-        _invert(F)
+        invert(F)
         for i in range(n_w):
             for j in range(i + 1, n_w):
                 F[i, j] = 0.0
@@ -152,7 +152,7 @@ def _inside(M, p, lam, of_z, of_w, F):
             return False
     for s in range(M.shape[0]):
         _level_matrix(M[s], p[of_z], lam * p[of_w], F)
-        if not _factor(F):
+        if not factor(F, 0.0):
             return False
     return True
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu_lmi import Array, dagger
+from avis_ctrl.robust.mu_lower import aligned
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -67,20 +68,7 @@ def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
     M11, M12, M21 = M[:, :n_z, :n_w], M[:, :n_z, n_w:], M[:, n_z:, :n_w]
     x = np.linalg.solve(np.eye(n_z) - M11 @ delta, M12 @ v[..., None])[..., 0]
     a = np.linalg.solve(dagger(np.eye(n_w) - delta @ M11), dagger(M21) @ u[..., None])[..., 0]
-    new = np.zeros_like(delta)
-    for block, w, z in structure.slices():
-        ak, xk = a[:, w], x[:, z]
-        if block.kind == "full":
-            size = np.linalg.norm(ak, axis=1) * np.linalg.norm(xk, axis=1)
-            new[:, w, z] = ak[:, :, None] * np.conj(xk[:, None, :]) / np.where(size > 0, size, 1.0)[:, None, None]
-            continue
-        product = np.sum(ak * np.conj(xk), axis=1)
-        if block.kind == "real":
-            value = np.where(product.real >= 0, 1.0, -1.0).astype(complex)
-        else:
-            value = np.where(np.abs(product) > 0, product / np.maximum(np.abs(product), 1e-300), 1.0)
-        new[:, w, z] = value[:, None, None] * np.eye(block.rows)
-    return new
+    return aligned(a, x, structure, lambda product, _: np.where(product >= 0, 1.0, -1.0))
 
 
 def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20,

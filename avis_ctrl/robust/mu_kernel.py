@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from avis_ctrl.robust.mu_diagonal_kernel import factor, invert
+
 
 class PathSettings(NamedTuple):
     """central : Newton decrement below which a point counts as the analytic centre.
@@ -62,27 +64,10 @@ def _matrix(theta, entries, lam):
 def _inverse(A):
     """Inverse of a Hermitian matrix by its Cholesky factor; NaN if it is not positive definite."""
     n = A.shape[0]
-    L = np.zeros((n, n), np.complex128)
-    for j in range(n):
-        for i in range(j, n):
-            total = A[i, j]
-            for k in range(j):
-                total -= L[i, k] * np.conj(L[j, k])
-            if i > j:
-                L[i, j] = total / L[j, j].real
-            elif total.real > 0:
-                L[j, j] = np.sqrt(total.real)
-            else:
-                for k in range(n):
-                    L[k, k] = np.nan
-                return L
-    for j in range(n):
-        L[j, j] = 1.0 / L[j, j].real
-        for i in range(j + 1, n):
-            total = 0j
-            for k in range(j, i):
-                total -= L[i, k] * L[k, j]
-            L[i, j] = total / L[i, i].real
+    L = A.copy()
+    if not factor(L, 0.0):
+        return np.full((n, n), np.nan + 0j)
+    invert(L)
     S = np.zeros((n, n), np.complex128)
     for i in range(n):
         for j in range(i + 1):
@@ -221,24 +206,10 @@ def _to_centre(M, x, lam, form, core, trace, is_g, settings):
 @njit(cache=True)
 def _positive(A):
     """Whether a Hermitian matrix is positive definite, with a round-off margin; overwrites its lower triangle."""
-    n = A.shape[0]
     least = 0.0
-    for i in range(n):
+    for i in range(A.shape[0]):
         least = max(least, 1e-14 * A[i, i].real)
-    for j in range(n):
-        total = A[j, j].real
-        for k in range(j):
-            total -= A[j, k].real ** 2 + A[j, k].imag ** 2
-        if not total > least:
-            return False
-        root = np.sqrt(total)
-        A[j, j] = root
-        for i in range(j + 1, n):
-            value = A[i, j]
-            for k in range(j):
-                value -= A[i, k] * np.conj(A[j, k])
-            A[i, j] = value / root
-    return True
+    return factor(A, least)
 
 
 @njit(cache=True)

@@ -17,6 +17,7 @@ det(I - M Delta) = 0 with minimum ||Delta||. The initial Delta come from the nul
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -259,7 +260,7 @@ def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
 def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
            rng: np.random.Generator) -> Array:
     """Initial perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
-    return np.stack([_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None]
+    return np.stack([aligned(w, (M @ w[..., None])[..., 0], structure, _least_squares) / beta[:, None, None]
                      for w in null_vectors(M, scalings, beta, structure, count, rng)])
 
 
@@ -280,8 +281,15 @@ def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStru
     return np.stack(made)
 
 
-def _aligned(w: Array, z: Array, structure: BlockStructure) -> Array:
-    """Delta of norm 1 that best satisfies w = Delta z, block by block."""
+def _least_squares(product: Array, square: Array) -> Array:
+    return np.clip(product / np.maximum(square, 1e-300), -1, 1)
+
+
+def aligned(w: Array, z: Array, structure: BlockStructure, real: Callable[[Array, Array], Array]) -> Array:
+    """Delta of norm 1 that best satisfies w = Delta z, block by block.
+
+    real : value of a real block in -1..1, a function of Re(z^H w) and |z|^2.
+    """
     delta = np.zeros((w.shape[0], structure.n_w, structure.n_z), complex)
     for block, iw, iz in structure.slices():
         wk, zk = w[:, iw], z[:, iz]
@@ -291,7 +299,7 @@ def _aligned(w: Array, z: Array, structure: BlockStructure) -> Array:
             continue
         product = np.sum(np.conj(zk) * wk, axis=1)
         if block.kind == "real":
-            value = np.clip(product.real / np.maximum(np.sum(np.abs(zk) ** 2, axis=1), 1e-300), -1, 1).astype(complex)
+            value = real(product.real, np.sum(np.abs(zk) ** 2, axis=1))
         else:
             value = np.where(np.abs(product) > 0, product / np.maximum(np.abs(product), 1e-300), 1.0)
         delta[:, iw, iz] = value[:, None, None] * np.eye(block.rows)

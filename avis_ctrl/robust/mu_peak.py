@@ -19,6 +19,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
+from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, cover
 from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
@@ -189,7 +190,7 @@ def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
     """N as a stable system of this package, and its blocks."""
     if not 1e-5 <= slack <= 0.1:
         raise InputError("expected 1e-5 to 0.1", field="slack", value=slack)
-    N = N if isinstance(N, StateSpace) else StateSpace.from_control(N)
+    N = as_system(N, "N")
     if not N.is_stable():
         poles = N.poles()
         worst = poles[np.argmax(np.abs(poles) if N.dt else poles.real)]

@@ -69,6 +69,9 @@ def test_axes_out_of_reach_are_named():
         sensor_axes(rig, COORDINATES, ["Sz1", "Sz2", "Sz3", "Sx2", "Sy1"])
     with pytest.raises(InputError, match="out of"):
         sensor_axes(rig, ("z",), ["Sz9"])
+    for axes, words in ((actuator_axes, "cannot be pushed"), (sensor_axes, "cannot be distinguished")):
+        with pytest.raises(InputError, match=f"x and z {words}"):
+            axes(rig, ("x", "z"), [])
 
 
 def test_two_motors_on_a_line_cannot_tell_z_from_the_roll():
