@@ -106,8 +106,9 @@ def _scaled(plant: Plant, size: float) -> Plant:
 
 
 def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float], str]:
-    import cvxpy as cp
+    import cvxpy
 
+    cp: Any = cvxpy
     n = plant.n
     gamma = cp.Variable(nonneg=True)
     constraints, variables = [], []
