@@ -110,14 +110,17 @@ class StateSpace:
 
     @property
     def nstates(self) -> int:
+        """Number of states."""
         return self.A.shape[0]
 
     @property
     def ninputs(self) -> int:
+        """Number of inputs."""
         return self.D.shape[1]
 
     @property
     def noutputs(self) -> int:
+        """Number of outputs."""
         return self.D.shape[0]
 
     def poles(self) -> np.ndarray:

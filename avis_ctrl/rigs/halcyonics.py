@@ -49,6 +49,7 @@ class Load:
     Iyz: float = 0.0
 
     def position(self) -> np.ndarray:
+        """Centre of mass (3,) [m] relative to that of the plate."""
         return np.array([self.L7, self.L8, self.L9])
 
     def inertia(self) -> np.ndarray:

@@ -149,6 +149,7 @@ class GeophoneAt(Channel):
     noise_rms_V: float | None = None
 
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None) -> Sensor:
+        """The channel of this instrument."""
         corner, damping = self.suspension_Hz, self.suspension_damping
         if self.compensated_Hz is not None and self.compensated_damping is not None:
             # The filter is assumed to match this suspension exactly: its zeros cancel the geophone's poles.
@@ -171,6 +172,7 @@ class AccelerometerAt(Channel):
     noise_rms_V: float | None = None
 
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
+        """The channel of this instrument."""
         gain = self.sensitivity_Vs2_per_m * self.preamplifier_gain
         noise = _noise_rms(self.noise_rms_V, self.noise_m_per_s2_rtHz, gain, acquisition, ambient)
         return Sensor(self.name, self.position, self.direction, "acceleration", (0j,),
@@ -204,6 +206,7 @@ class PositionSensorAt(Channel):
     noise_rms_V: float | None = None
 
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
+        """The channel of this instrument."""
         gain = self.sensitivity_V_per_m * self.preamplifier_gain
         poles = () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
         noise = _noise_rms(self.noise_rms_V, self.noise_m_rtHz, gain, acquisition, ambient)

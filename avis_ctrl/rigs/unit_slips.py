@@ -85,6 +85,7 @@ class Slip:
 
     @property
     def one_of_list(self) -> bool:
+        """Whether it changes a single number of a list."""
         return self.scope == 0 and isinstance(self.entries[0].place[-1], int)
 
     @property

@@ -31,6 +31,7 @@ class Entries:
 
     @staticmethod
     def of(K: StateSpace, decentralised: bool = False) -> Entries:
+        """K in modal form, with its free entries; decentralised: u_k depends on y_k only."""
         A, B, C, rate, channel = _modal(K)
         n = rate.size
         whole = np.block([[A, B], [C, K.D]])
@@ -49,17 +50,20 @@ class Entries:
         return Entries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
 
     def matrix(self, x: Array) -> Array:
+        """[A B; C D] for the normalised entries x."""
         n = self.K.nstates
         whole = np.zeros((n + self.K.noutputs, n + self.K.ninputs))
         whole[self.rows, self.cols] = x * self.size
         return whole
 
     def controller(self, x: Array) -> StateSpace:
+        """The controller with the normalised entries x."""
         n, whole = self.K.nstates, self.matrix(x)
         return StateSpace(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], 0.0, self.K.inputs,
                           self.K.outputs)
 
     def slope(self, whole: Array) -> Array:
+        """Derivatives with respect to x from those with respect to [A B; C D]."""
         return whole[self.rows, self.cols] * self.size
 
 

@@ -242,6 +242,7 @@ def triangle(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gram_cone(size: int) -> Any:
+    """Cone of a positive semidefinite Gram matrix."""
     return clarabel.NonnegativeConeT(1) if size == 1 else clarabel.PSDTriangleConeT(size)
 
 

@@ -79,6 +79,7 @@ class PointwiseScalings:
 
     @property
     def peak(self) -> float:
+        """Largest upper bound of mu."""
         return float(np.max(self.mu))
 
     def shape(self, k: int) -> np.ndarray:

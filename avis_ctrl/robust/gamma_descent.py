@@ -44,6 +44,7 @@ class ScaledProblem:
 
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> ScaledProblem:
+        """The problem of P; nmeas, ncon : number of measurements and controls, which are last."""
         of_u, of_y = rank_margins(Plant.of(P, nmeas, ncon))
         return ScaledProblem(balance(P), nmeas, ncon, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
 

@@ -80,6 +80,7 @@ class ScalingSpace:
 
     @staticmethod
     def of(structure: BlockStructure, level: Array | None = None) -> ScalingSpace:
+        """Scalings of a structure; level (n_w,) : the columns that lambda multiplies, all by default."""
         n_w, n_z = structure.n_w, structure.n_z
         level = np.ones(n_w, bool) if level is None else np.asarray(level, bool)
         form: list[tuple[int, int, complex, int]] = []
@@ -110,6 +111,7 @@ class ScalingSpace:
         return ScalingSpace(structure, level, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0], ~in_core)
 
     def scalings(self, theta: Array) -> Scalings:
+        """Matrices of the parameters theta (B, p)."""
         n_w = self.structure.n_w
         K = self.form.matrix(theta)
         return Scalings(-K[:, n_w:, n_w:], K[:, :n_w, :n_w], 1j * K[:, :n_w, n_w:])
@@ -139,6 +141,7 @@ def _hermitian_basis(n: int) -> list[list[tuple[int, int, complex]]]:
 
 
 def dagger(A: Array) -> Array:
+    """Conjugate transpose of each matrix."""
     return np.conj(np.swapaxes(A, -1, -2))
 
 

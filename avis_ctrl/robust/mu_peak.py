@@ -77,15 +77,20 @@ class Stability(Protocol):
     """Bounds of mu of the blocks without performance: a `MuPeak`, or the part of it that a caller keeps."""
 
     @property
-    def upper(self) -> float: ...
+    def upper(self) -> float:
+        """Upper bound of mu."""
     @property
-    def lower(self) -> float: ...
+    def lower(self) -> float:
+        """Lower bound of mu."""
     @property
-    def omega(self) -> float: ...
+    def omega(self) -> float:
+        """Frequency [rad/s] of the lower bound."""
     @property
-    def guaranteed(self) -> bool: ...
+    def guaranteed(self) -> bool:
+        """Whether the upper bound holds at all frequencies."""
     @property
-    def delta(self) -> Array | None: ...
+    def delta(self) -> Array | None:
+        """Perturbation that attains the lower bound."""
 
 
 # Result of a search at some frequencies: bounds with their proofs.

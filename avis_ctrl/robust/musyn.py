@@ -167,11 +167,13 @@ class DKIteration:
 
     @property
     def best(self) -> Loop:
+        """The loop with the smallest peak of mu."""
         assert self.state.best is not None
         return self.state.best
 
     @property
     def history(self) -> tuple[Iteration, ...]:
+        """The iterations in order."""
         return self.state.history
 
     @cached_property

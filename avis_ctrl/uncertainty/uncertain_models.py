@@ -198,6 +198,7 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
 
 
 def of_element(element: Element, lft: np.ndarray) -> UncertainSystem:
+    """The uncertain number of an element; lft (2, 2): its dependence on delta."""
     return UncertainSystem(lft[:1, :1], lft[:1, 1:], lft[1:, :1], lft[1:, 1:], (element,), (1,))
 
 

@@ -33,10 +33,14 @@ class Rig(Protocol):
     """Interface of a rig that this module requires."""
 
     @property
-    def edge_m(self) -> float: ...
-    def parameters(self) -> dict[str, Any]: ...
-    def with_parameters(self, values: dict[str, float]) -> Any: ...
-    def equations_of_motion(self) -> Any: ...
+    def edge_m(self) -> float:
+        """As in `Rig`."""
+    def parameters(self) -> dict[str, Any]:
+        """As in `Rig`."""
+    def with_parameters(self, values: dict[str, float]) -> Any:
+        """As in `Rig`."""
+    def equations_of_motion(self) -> Any:
+        """As in `Rig`."""
 
 
 @dataclass(frozen=True)

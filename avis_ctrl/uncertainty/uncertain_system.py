@@ -89,6 +89,7 @@ class UncertainSystem:
 
     @property
     def nstates(self) -> int:
+        """Number of states."""
         return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
 
     @property
