@@ -66,8 +66,8 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
     if problem["type"] in ("model_type", "dict_type", "model_attributes_type"):
         return InputError("expected a section of keys", field=field, value=value)
     words = problem["msg"].removeprefix("Value error, ")
-    for said, plain in _PLAIN:
-        words = re.sub(said, plain, words)
+    for pattern, plain in _PLAIN:
+        words = re.sub(pattern, plain, words)
     if problem["type"] == "float_type" and isinstance(value, str):
         words += " without quotes and without unit"
     return InputError(words, field=field, value=value)

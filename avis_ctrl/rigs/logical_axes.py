@@ -224,8 +224,8 @@ def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: 
     basis = np.linalg.qr(own)[0]
     _, sizes, V = np.linalg.svd(rest - basis @ (basis.T @ rest), full_matrices=False)
     kept = V[sizes > REACH.weakest * np.linalg.svd(H * scale, compute_uv=False)[0]]
-    told = np.hstack([H[:, wanted], rest @ kept.T])
-    return _weighted(told, len(wanted), noise)
+    separated = np.hstack([H[:, wanted], rest @ kept.T])
+    return _weighted(separated, len(wanted), noise)
 
 
 def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], complaint: str) -> None:

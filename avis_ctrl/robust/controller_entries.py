@@ -17,7 +17,7 @@ SEPARATION = (0.0, 1e-8, 1e-6, 1e-4, 1e-2)
 
 
 @dataclass(frozen=True, eq=False)
-class Entries:
+class ControllerEntries:
     """K with tridiagonal A (modal blocks), and its free entries, each normalised by its typical size.
 
     rows, cols : indices of the free entries of [A B; C D]; size : typical sizes; start : normalised values.
@@ -30,7 +30,7 @@ class Entries:
     start: Array
 
     @staticmethod
-    def of(K: StateSpace, decentralised: bool = False) -> Entries:
+    def of(K: StateSpace, decentralised: bool = False) -> ControllerEntries:
         """K in modal form, with its free entries; decentralised: u_k depends on y_k only."""
         A, B, C, rate, channel = _modal(K)
         n = rate.size
@@ -47,7 +47,7 @@ class Entries:
         unit[n:, n:] = np.linalg.norm(K.D) + np.max(np.abs(C).sum(axis=0) * np.abs(B).sum(axis=1) / rate, initial=0.0)
         unit[unit == 0] = 1.0
         rows, cols = np.nonzero(free)
-        return Entries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
+        return ControllerEntries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
 
     def matrix(self, x: Array) -> Array:
         """[A B; C D] for the normalised entries x."""

@@ -36,7 +36,7 @@ Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
-class MagnitudeFit:
+class ScalarFit:
     """A fitted d(s) with its error recomputed from the realised roots.
 
     error : max over the points of weight |log(|d| / target)|.
@@ -51,7 +51,7 @@ class MagnitudeFit:
 
 
 def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None = None,
-                  tolerance: float = 1e-3) -> MagnitudeFit:
+                  tolerance: float = 1e-3) -> ScalarFit:
     """Best log-Chebyshev fit of |d| at the frequencies by a d(s) of the given order.
 
     Parameters
@@ -68,7 +68,7 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     omega, target, weight = _checked(omega, magnitude, order, weight)
     best, error = _constant_fit(target, weight)
     if order == 0 or error <= tolerance:
-        return MagnitudeFit(best, error, error if order == 0 else 0.0, 0)
+        return ScalarFit(best, error, error if order == 0 else 0.0, 0)
     unit = float(np.exp(np.mean(np.log(omega))))
     problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, initial_roots(omega / unit, target, order))
 
@@ -81,7 +81,7 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
         fitted = _spectral_factor(p, q, unit)
         problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
         return fitted, float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
-    return MagnitudeFit(*bisection(best, error, attempt, tolerance))
+    return ScalarFit(*bisection(best, error, attempt, tolerance))
 
 
 def bisection(best: Fitted, error: float, attempt: Callable[[float], tuple[Fitted, float] | None], tolerance: float
@@ -145,8 +145,8 @@ def initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarr
     arrange = np.argsort(position)
     position, target = position[arrange], target[arrange]
     step = np.abs(np.diff(target)) + 0.05 * np.diff(position) + 1e-9
-    share = np.concatenate([[0.0], np.cumsum(step)]) / np.sum(step) if step.size else np.zeros(1)
-    return -np.exp(2 * np.interp((np.arange(order) + 0.5) / order, share, position)).astype(complex)
+    fraction = np.concatenate([[0.0], np.cumsum(step)]) / np.sum(step) if step.size else np.zeros(1)
+    return -np.exp(2 * np.interp((np.arange(order) + 0.5) / order, fraction, position)).astype(complex)
 
 
 class _Feasibility:

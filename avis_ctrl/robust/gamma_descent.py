@@ -217,13 +217,13 @@ def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
     return V @ H @ V.T + np.outer(s, s) / curvature
 
 
-def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
-          max_states: int, share: float = 0.5) -> Scalings | None:
+def with_added_pairs(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
+                     max_states: int, fraction: float = 0.5) -> Scalings | None:
     """The scalings with one more zero-pole pair in the blocks, and at the frequencies, where gamma is most sensitive.
 
     A zero and a pole that cancel change nothing, but gamma has a slope with respect to their distance. Pairs are tried
-    at two frequencies per decade in all blocks at once. Blocks whose slope is at least the fraction `share` of the
-    largest get a pair. None if all slopes vanish, or if no more states are allowed.
+    at two frequencies per decade in all blocks at once. Blocks whose slope is at least `fraction` of the largest get a
+    pair. None if all slopes vanish, or if no more states are allowed.
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
@@ -238,7 +238,7 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
         return None
     best = np.argmax(np.abs(slopes), axis=0)
     strength = np.abs(slopes[best, range(len(free))])
-    for threshold in (share, 0.999):
+    for threshold in (fraction, 0.999):
         larger = scalings
         for number, (at, group, size) in enumerate(zip(best, free, strength, strict=True)):
             if size >= threshold * np.max(strength):

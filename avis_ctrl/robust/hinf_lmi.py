@@ -61,7 +61,7 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
     for _ in range(6):
         scaled = _balanced(_scaled(plant, size))
         R, S, bounds, status = _optimum(scaled)
-        upper, violation, R, S = _certified(scaled, R, S, bounds[1])
+        upper, violation, R, S = certified(scaled, R, S, bounds[1])
         if violation > 0:
             status = f"{status}, {UNCERTIFIED}"
         found = LmiOptimum(upper * size, min(bounds[0], upper) * size, R, S, violation, status)
@@ -165,8 +165,8 @@ def _sides(plant: Plant) -> list[tuple[np.ndarray, ...]]:
     return sides
 
 
-def _certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float
-               ) -> tuple[float, float, np.ndarray, np.ndarray]:
+def certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float
+              ) -> tuple[float, float, np.ndarray, np.ndarray]:
     """Smallest gamma, from that of the solver upwards, at which the inequalities are verified; largest eigenvalue;
     the R and S of this verification."""
     coupling = la.eigvalsh(np.block([[R, np.eye(plant.n)], [np.eye(plant.n), S]])) if plant.n else np.ones(1)

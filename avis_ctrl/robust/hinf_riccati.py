@@ -118,7 +118,7 @@ def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarra
     return bool(q @ r > 0 and rho - (q @ E_x @ q + rho * r @ E_y @ r) / (q @ r) > gamma ** 2)
 
 
-def keeps(plant: Plant, test: GammaTest) -> bool:
+def norm_is_confirmed(plant: Plant, test: GammaTest) -> bool:
     """Whether the measured norm of the loop with the central controller of a passed test is below its gamma."""
     m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
     form = NormalForm(plant, np.eye(m2), np.eye(p2), np.zeros((p2, m2)))
@@ -182,7 +182,7 @@ class _Search:
     def try_gamma(self, gamma: float) -> bool:
         outcome = gamma_test(self.plant, gamma)
         self.tests += 1
-        passed = outcome.feasible and (not outcome.doubtful or keeps(self.plant, outcome))
+        passed = outcome.feasible and (not outcome.doubtful or norm_is_confirmed(self.plant, outcome))
         self.lower = max(self.lower, outcome.forbidden)
         if passed:
             self.second, self.upper = self.upper, outcome

@@ -24,9 +24,9 @@ from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, cover
 from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
 from avis_ctrl.robust.mu_lmi import Array
-from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
+from avis_ctrl.robust.mu_lower import SETTINGS, MuLowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
-from avis_ctrl.robust.mu_upper import UpperBound, highest, skewed_upper_bound, upper_bound
+from avis_ctrl.robust.mu_upper import UpperBound, bound_of_peak, skewed_upper_bound, upper_bound
 from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
@@ -238,7 +238,7 @@ class _Scan:
 
     @staticmethod
     def of(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> _Scan:
-        omega, found = _searched(N, band, slack, lambda M: highest(M[:, None], structure, accuracy_of(slack)))
+        omega, found = _searched(N, band, slack, lambda M: bound_of_peak(M[:, None], structure, accuracy_of(slack)))
         order = np.argsort(omega)
         return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
 
@@ -316,7 +316,7 @@ def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, band: Inte
                  lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
 
 
-def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,
+def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: MuLowerBound,
                    done: Cover, band: Interval) -> tuple[float, float, Array | None]:
     """Largest verified lower bound: thorough search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))

@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import rig_file
-from avis_ctrl.rigs.plausibility import UnusualRig, _modes, judged, plausible
+from avis_ctrl.rigs.plausibility import UnusualRig, judge_modes, judged, plausible
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion
 
@@ -208,5 +208,5 @@ def test_an_undamped_mode_does_not_hide_the_smallest_damping_of_the_others():
     f, zeta, compared = np.arange(1.0, 7.0), np.array([0.0, 1e-5, 0.1, 0.1, 0.1, 0.2]), []
     eom = EquationsOfMotion(np.eye(6), np.diag(4 * np.pi * f * zeta), np.diag((2 * np.pi * f) ** 2), np.zeros((6, 6)),
                             np.zeros((6, 6)), np.zeros((6, 1)), ("A",))
-    _modes(eom, eom.natural_frequencies(), lambda kind, value, words: compared.append((kind, value)))
+    judge_modes(eom, eom.natural_frequencies(), lambda kind, value, words: compared.append((kind, value)))
     assert [value for kind, value in compared if kind == "damping"] == pytest.approx([1e-5, 0.2])

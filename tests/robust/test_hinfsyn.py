@@ -22,7 +22,7 @@ from avis_ctrl.lti import (
 )
 from avis_ctrl.lti.realisation import hankel_singular_values
 from avis_ctrl.robust.hinf_bounds import hinf_lower_bound
-from avis_ctrl.robust.hinf_lmi import UNCERTIFIED, _certified, lmi_gamma
+from avis_ctrl.robust.hinf_lmi import UNCERTIFIED, certified, lmi_gamma
 from avis_ctrl.robust.hinf_plant import Plant
 from avis_ctrl.robust.hinf_riccati import gamma_test
 from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
@@ -406,6 +406,6 @@ def test_matrices_of_the_matrix_inequalities_are_their_certificate():
     assert la.eigvalsh(coupling)[0] >= -1e-12 * la.norm(coupling)
     assert (UNCERTIFIED in optimum.status) == (optimum.violation > 0)
     plant = Plant.of(scalar_plant(), 1, 1)
-    upper, violation, R, S = _certified(plant, np.eye(1), 0.5 * np.eye(1), 100.0)
+    upper, violation, R, S = certified(plant, np.eye(1), 0.5 * np.eye(1), 100.0)
     assert la.eigvalsh(np.block([[R, np.eye(1)], [np.eye(1), S]]))[0] >= 0
     assert upper == 100.0 and violation <= 0
