@@ -37,8 +37,10 @@ def balance(system: StateSpace) -> StateSpace:
 def gramian_factors(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     """Square-root factors L_c, L_o of the controllability and observability Gramians of a stable system."""
     if not system.is_stable():
-        raise ComputationError("Gramians exist for stable systems only",
-                               measured=f"largest real part {np.max(system.poles().real):.3g} rad/s")
+        poles = system.poles()
+        raise ComputationError("Gramians exist for stable systems only", measured=(
+            f"largest magnitude of a pole {np.max(np.abs(poles)):.3g}" if system.dt else
+            f"largest real part {np.max(poles.real):.3g} rad/s"))
     if system.dt:
         Wc = la.solve_discrete_lyapunov(system.A, system.B @ system.B.T)
         Wo = la.solve_discrete_lyapunov(system.A.T, system.C.T @ system.C)

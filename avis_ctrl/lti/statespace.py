@@ -30,13 +30,13 @@ RESOLVENT_BLOCK = 16
 RESOLVENT_PROBES, RESOLVENT_TOLERANCE = 6, 1e-6
 
 
-def _names(given: Iterable[str] | None, count: int, prefix: str, what: str) -> Names:
-    if given is None or (count and not (names := tuple(given))):
+def _names(given: Iterable[str] | None, count: int, prefix: str, what: str, different: bool = True) -> Names:
+    names = () if given is None else tuple(str(name) for name in given)
+    if not names:
         return tuple(f"{prefix}{k}" for k in range(count))
-    names = tuple(str(name) for name in given)
     if len(names) != count:
         raise InputError(f"expected {count} {what} names, got {len(names)}: {names}")
-    if len(set(names)) != count:
+    if different and len(set(names)) != count:
         twice = sorted({name for name in names if names.count(name) > 1})
         raise InputError(f"{what} names must differ; {twice} appear more than once")
     return names
@@ -100,8 +100,7 @@ class StateSpace:
         object.__setattr__(self, "inputs", _names(self.inputs, n_u, "u", "input"))
         object.__setattr__(self, "outputs", _names(self.outputs, n_y, "y", "output"))
         # State names are informative only: after a connection two parts may have states of the same name.
-        states = tuple(self.states) if len(tuple(self.states)) == n else tuple(f"x{k}" for k in range(n))
-        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "states", _names(self.states, n, "x", "state", different=False))
 
     # -- sizes and properties -------------------------------------------------------------
     @property
@@ -111,14 +110,17 @@ class StateSpace:
 
     @property
     def nstates(self) -> int:
+        """Number of states."""
         return self.A.shape[0]
 
     @property
     def ninputs(self) -> int:
+        """Number of inputs."""
         return self.D.shape[1]
 
     @property
     def noutputs(self) -> int:
+        """Number of outputs."""
         return self.D.shape[0]
 
     def poles(self) -> np.ndarray:
@@ -132,12 +134,10 @@ class StateSpace:
 
     # -- evaluation -----------------------------------------------------------------------
     def __call__(self, s: complex) -> np.ndarray:
-        """Transfer matrix (n_y, n_u) at the complex point s (or z)."""
-        if not self.nstates:
+        """Transfer matrix (n_y, n_u) at the complex point s (or z); inf at a pole."""
+        if not self.nstates or np.isinf(s):
             return self.D.astype(complex)
-        if np.isinf(s):
-            return self.D.astype(complex)
-        return self.C @ np.linalg.solve(s * np.eye(self.nstates) - self.A, self.B.astype(complex)) + self.D
+        return _eliminated(self.A, self.B, self.C, np.array([s]))[0] + self.D
 
     def frequency_response(self, omega: np.ndarray) -> np.ndarray:
         """Transfer matrices (n_omega, n_y, n_u) at the frequencies omega [rad/s]; inf gives D."""
@@ -150,7 +150,7 @@ class StateSpace:
         return response
 
     def dcgain(self) -> np.ndarray:
-        """Real transfer matrix at zero frequency."""
+        """Real transfer matrix at zero frequency; inf if there is a pole."""
         return self(1.0 if self.dt else 0.0).real
 
     # -- algebra --------------------------------------------------------------------------

@@ -13,7 +13,12 @@ from avis_ctrl.lti.statespace import StateSpace, gain, tf
 
 
 def pade_coefficients(order: int) -> np.ndarray:
-    """Coefficients of N(x), by descending power, where N(-x)/N(x) is the [n/n] Pade approximant of exp(-x)."""
+    """Coefficients of N(x), by descending power, where N(-x)/N(x) is the [n/n] Pade approximant of exp(-x).
+
+    Raises InputError for an order outside 1..10.
+    """
+    if not (isinstance(order, int) and 1 <= order <= 10):
+        raise InputError("a whole number from 1 to 10", field="pade_order", value=order)
     return np.array([comb(order, k) * factorial(2 * order - k) / factorial(2 * order)
                      for k in range(order, -1, -1)])
 
@@ -29,11 +34,9 @@ def pade_delay(delay_s: float, order: int = 2, input_name: str = "u", output_nam
     InputError : a negative or non-finite delay, an order outside 1..10.
     """
     require_positive(delay_s, "delay_s", zero_allowed=True)
-    if not (isinstance(order, int) and 1 <= order <= 10):
-        raise InputError("a whole number from 1 to 10", field="pade_order", value=order)
+    denominator = pade_coefficients(order)
     if delay_s == 0:
         return gain(1.0, [input_name], [output_name])
-    denominator = pade_coefficients(order)
     numerator = denominator * (-1.0) ** np.arange(order, -1, -1)
     unit = tf(list(numerator), list(denominator))
     gramian = la.solve_continuous_lyapunov(unit.A, -unit.B @ unit.B.T)
@@ -49,8 +52,6 @@ def zero_order_hold(sample_time_s: float, order: int = 2, input_name: str = "u",
     The factor s of the numerator is cancelled analytically, so that the gain at zero frequency is exactly 1.
     """
     require_positive(sample_time_s, "sample_time_s")
-    if not (isinstance(order, int) and 1 <= order <= 10):
-        raise InputError("a whole number from 1 to 10", field="pade_order", value=order)
     denominator = pade_coefficients(order)
     # N(x) - N(-x) is twice the odd part of N; division by x lowers each power by one.
     odd = np.where(np.arange(order, -1, -1) % 2 == 1, 2.0 * denominator, 0.0)

@@ -15,7 +15,17 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
-from avis_ctrl.rigs.instruments import Drive, FloorSensor, GeophoneAt, Instrument, Sensor, Tolerances, Triple, with_gain
+from avis_ctrl.rigs.instruments import (
+    Drive,
+    FloorSensor,
+    GeophoneAt,
+    Instrument,
+    Sensor,
+    Tolerances,
+    Triple,
+    triple,
+    with_gain,
+)
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
@@ -141,8 +151,8 @@ class AvisTable(Rig):
         for axis, value in zip(AXES, self.centre_of_mass, strict=True):
             found[f"com_{axis}"] = Parameter(value, "m", "centre of mass from the geometric centre")
         for number, isolator in enumerate(self.isolators, 1):
-            for kind, triple in (("k", isolator.stiffness), ("c", isolator.damping), ("p", isolator.position)):
-                for axis, value in zip(AXES, triple, strict=True):
+            for kind, values in (("k", isolator.stiffness), ("c", isolator.damping), ("p", isolator.position)):
+                for axis, value in zip(AXES, values, strict=True):
                     found[f"isolator{number}.{kind}_{axis}"] = Parameter(
                         value, _UNITS[kind], f"{_WORDS[kind]} of isolator {number} along {axis}")
         for drive in self.all_drives:
@@ -311,8 +321,7 @@ class AvisTable(Rig):
     def _at(self, isolator: int) -> Triple:
         if not 1 <= isolator <= len(self.isolators):
             raise InputError(f"expected an isolator from 1 to {len(self.isolators)}", field="isolator", value=isolator)
-        x, y, z = self.isolators[isolator - 1].position
-        return x, y, z
+        return triple(self.isolators[isolator - 1].position)
 
 
 def _across(direction: Triple) -> tuple[int, int]:
@@ -334,9 +343,8 @@ def _moved(one: Any, values: Mapping[str, float]) -> Any:
     if rest <= 0:
         raise InputError("expected components of a unit vector", field=f"direction.{one.name}", value=n.tolist())
     n[along] = np.copysign(np.sqrt(rest), n[along])
-    return replace(one, position=place, direction=(float(n[0]), float(n[1]), float(n[2])))
+    return replace(one, position=place, direction=triple(n))
 
 
 def _unit(axis: str) -> Triple:
-    x, y, z = (1.0 if axis == one else 0.0 for one in AXES)
-    return x, y, z
+    return triple(axis == one for one in AXES)

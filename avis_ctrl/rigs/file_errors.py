@@ -55,7 +55,7 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
     problems = error.errors()
     problem = min(problems, key=lambda one: one["type"] != "extra_forbidden")
     *parents, last = problem["loc"] or ("file",)
-    field = _dotted(problem["loc"])
+    field = dotted(problem["loc"])
     if problem["type"] == "extra_forbidden":
         value = None if isinstance(problem["input"], (dict, list)) else problem["input"]
         absent = [str(one["loc"][-1]) for one in problems if one["type"] == "missing" and [*one["loc"][:-1]] == parents]
@@ -66,14 +66,14 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
     if problem["type"] in ("model_type", "dict_type", "model_attributes_type"):
         return InputError("expected a section of keys", field=field, value=value)
     words = problem["msg"].removeprefix("Value error, ")
-    for said, plain in _PLAIN:
-        words = re.sub(said, plain, words)
+    for pattern, plain in _PLAIN:
+        words = re.sub(pattern, plain, words)
     if problem["type"] == "float_type" and isinstance(value, str):
         words += " without quotes and without unit"
     return InputError(words, field=field, value=value)
 
 
-def _dotted(place: Sequence[int | str]) -> str:
+def dotted(place: Sequence[int | str]) -> str:
     """("isolator", 1, "position_m") as isolator[2].position_m, counted from 1 as in the sources."""
     words = (f"[{part + 1}]" if isinstance(part, int) else f".{part if part.isprintable() else repr(part)}"
              for part in place)

@@ -14,6 +14,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 
 Quantity = Literal["displacement", "velocity", "acceleration"]
+# Order of the time derivative of displacement.
 DERIVATIVES: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
 

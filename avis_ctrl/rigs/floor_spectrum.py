@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass, replace
 from importlib import resources
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,7 +95,7 @@ def shipped_spectrum(name: str) -> SpectrumModel:
     return spectra[name]
 
 
-def spectrum_from_table(name: str, table: dict) -> SpectrumModel:
+def spectrum_from_table(name: str, table: dict[str, Any]) -> SpectrumModel:
     """A model from its TOML table: corner frequencies in Hz, damping ratios, static ASD."""
     def pairs(key: str) -> tuple[tuple[float, float], ...]:
         return tuple((2 * np.pi * float(f), float(z)) for f, z in table.get(key, []))

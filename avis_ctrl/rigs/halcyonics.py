@@ -13,7 +13,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
-from avis_ctrl.rigs.instruments import Sensor, Tolerances, Triple, white_rms
+from avis_ctrl.rigs.instruments import Sensor, Tolerances, triple, white_rms
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix
@@ -49,6 +49,7 @@ class Load:
     Iyz: float = 0.0
 
     def position(self) -> np.ndarray:
+        """Centre of mass (3,) [m] relative to that of the plate."""
         return np.array([self.L7, self.L8, self.L9])
 
     def inertia(self) -> np.ndarray:
@@ -257,7 +258,7 @@ class Halcyonics(Rig):
         axes, acc = self.actuator_axes(), self.accelerometers
         noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
         pole = complex(-2 * np.pi * acc.low_corner_Hz)
-        bare = [Sensor(f"acc_{name}", _triple(axes[name][0]), _triple(axes[name][1]), "acceleration", (0j,), (pole,),
+        bare = [Sensor(f"acc_{name}", triple(axes[name][0]), triple(axes[name][1]), "acceleration", (0j,), (pole,),
                        acc.sensitivity_Vs2_per_m, noise, noise_density=acc.noise_m_per_s2_rtHz) for name in acc.at]
         return tuple(one.with_electronics(self.electronics, 1.0, self.converter, self.sample_rate_Hz) for one in bare)
 
@@ -283,8 +284,3 @@ class Halcyonics(Rig):
                                                    if name.startswith("load.")})
         plain: dict[str, Any] = {name: value for name, value in values.items() if name in _SCALARS}
         return replace(self, k_s=springs, e=constants, load=load, **plain)
-
-
-def _triple(values: np.ndarray) -> Triple:
-    x, y, z = values.tolist()
-    return x, y, z

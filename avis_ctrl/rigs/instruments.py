@@ -8,8 +8,8 @@ displacement of the payload relative to the chassis.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -18,11 +18,16 @@ from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
+from avis_ctrl.rigs.floor_motion import DERIVATIVES as ORDER
+from avis_ctrl.rigs.floor_motion import Quantity
 
-Quantity = Literal["velocity", "acceleration", "displacement"]
 Triple = tuple[float, float, float]
-# Order of the time derivative of displacement.
-ORDER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
+
+
+def triple(values: Iterable[float]) -> Triple:
+    """Three numbers as floats."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 def unit_vector(direction: Triple, field: str) -> Triple:
@@ -32,26 +37,28 @@ def unit_vector(direction: Triple, field: str) -> Triple:
         raise InputError("expected a vector that is not zero", field=field, value=list(direction))
     if abs(length - 1.0) <= 1e-12:
         return direction
-    x, y, z = (float(part) / length for part in direction)
-    return x, y, z
+    return triple(part / length for part in direction)
 
 
 @dataclass(frozen=True)
-class Drive:
-    """A force at any position [m]: constant_N_per_V * volts along direction (unit vector with sign).
-
-    limit_V : voltage limit; None for the rig's common limit.
-    """
+class Channel:
+    """A drive or sensor at a position [m] with a direction (unit vector with sign)."""
 
     name: str
     position: Triple
     direction: Triple
+
+
+@dataclass(frozen=True)
+class Drive(Channel):
+    """A force constant_N_per_V * volts along the direction. limit_V : None for the rig's common limit."""
+
     constant_N_per_V: float
     limit_V: float | None = None
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Channel):
     """A sensor channel of any kind.
 
     Attributes
@@ -69,9 +76,6 @@ class Sensor:
     flicker_rms_V : r.m.s. per sample of a white noise whose density is that of the 1/f noise at 1 Hz.
     """
 
-    name: str
-    position: Triple
-    direction: Triple
     quantity: Quantity
     zeros: tuple[complex, ...]
     poles: tuple[complex, ...]
@@ -133,12 +137,9 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class GeophoneAt:
+class GeophoneAt(Channel):
     """A geophone of a rig file. compensated_Hz : None for no filter. noise_rms_V : None for the ambient noise."""
 
-    name: str
-    position: Triple
-    direction: Triple
     sensitivity_Vs_per_m: float
     suspension_Hz: float
     suspension_damping: float
@@ -148,6 +149,7 @@ class GeophoneAt:
     noise_rms_V: float | None = None
 
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None) -> Sensor:
+        """The channel of this instrument."""
         corner, damping = self.suspension_Hz, self.suspension_damping
         if self.compensated_Hz is not None and self.compensated_damping is not None:
             # The filter is assumed to match this suspension exactly: its zeros cancel the geophone's poles.
@@ -160,12 +162,9 @@ class GeophoneAt:
 
 
 @dataclass(frozen=True)
-class AccelerometerAt:
+class AccelerometerAt(Channel):
     """A charge-amplified accelerometer of a rig file: S s/(s + w) from acceleration, with white output noise."""
 
-    name: str
-    position: Triple
-    direction: Triple
     sensitivity_Vs2_per_m: float
     low_corner_Hz: float
     noise_m_per_s2_rtHz: float | None = None
@@ -173,6 +172,7 @@ class AccelerometerAt:
     noise_rms_V: float | None = None
 
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
+        """The channel of this instrument."""
         gain = self.sensitivity_Vs2_per_m * self.preamplifier_gain
         noise = _noise_rms(self.noise_rms_V, self.noise_m_per_s2_rtHz, gain, acquisition, ambient)
         return Sensor(self.name, self.position, self.direction, "acceleration", (0j,),
@@ -196,12 +196,9 @@ def _noise_rms(rms_V: float | None, density: float | None, gain: float, acquisit
 
 
 @dataclass(frozen=True)
-class PositionSensorAt:
+class PositionSensorAt(Channel):
     """A position sensor of a rig file, payload relative to chassis. bandwidth_Hz : first-order lag, None for none."""
 
-    name: str
-    position: Triple
-    direction: Triple
     sensitivity_V_per_m: float
     bandwidth_Hz: float | None = None
     noise_m_rtHz: float | None = None
@@ -209,6 +206,7 @@ class PositionSensorAt:
     noise_rms_V: float | None = None
 
     def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
+        """The channel of this instrument."""
         gain = self.sensitivity_V_per_m * self.preamplifier_gain
         poles = () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
         noise = _noise_rms(self.noise_rms_V, self.noise_m_rtHz, gain, acquisition, ambient)

@@ -116,10 +116,12 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
     H, channels = matrix[chosen], [rig.sensors()[k] for k in chosen]
     wanted = _positions(COORDINATES, axes, "axes")
     others = [k for k in range(6) if k not in wanted]
-    inertial, noise = np.array([one.inertial for one in channels]), _noise(rig, chosen)
+    inertial, noise = np.array([one.inertial for one in channels], bool), _noise(rig, chosen)
     complaint = f"cannot be distinguished by the sensors {list(names)}"
     alone = bool(np.all(inertial))
-    absolute = wanted if alone else _absolute(H[inertial], wanted, rig.edge_m, noise[inertial])
+    absolute: list[int] = []
+    if np.any(inertial):
+        absolute = wanted if alone else _absolute(H[inertial], wanted, rig.edge_m, noise[inertial])
     relative = [k for k in wanted if k not in absolute]
     decoding, condition = np.zeros((len(wanted), len(names))), 1.0
     if absolute and alone:
@@ -188,8 +190,8 @@ def _noise(rig: Rig, chosen: list[int]) -> np.ndarray:
     for k in chosen:
         density = all_of[k].motion_density(rig.converter, rig.sample_rate_Hz)
         found.append(density * np.exp(-np.mean(np.log(np.abs(all_of[k].as_velocity(omega))))))
-    share = np.maximum(np.array(found) / max(*found, np.finfo(float).tiny), 1e-3)
-    return np.ones(len(share)) if np.ptp(share) < 1e-9 else share
+    relative = np.maximum(np.array(found) / max([*found, np.finfo(float).tiny]), 1e-3)
+    return np.ones(len(found)) if np.all(relative > np.max(relative, initial=0.0) - 1e-9) else relative
 
 
 def _edge_scale(edge_m: float) -> np.ndarray:
@@ -222,14 +224,14 @@ def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: 
     basis = np.linalg.qr(own)[0]
     _, sizes, V = np.linalg.svd(rest - basis @ (basis.T @ rest), full_matrices=False)
     kept = V[sizes > REACH.weakest * np.linalg.svd(H * scale, compute_uv=False)[0]]
-    told = np.hstack([H[:, wanted], rest @ kept.T])
-    return _weighted(told, len(wanted), noise)
+    separated = np.hstack([H[:, wanted], rest @ kept.T])
+    return _weighted(separated, len(wanted), noise)
 
 
 def _require_reach(H: np.ndarray, wanted: list[int], coordinates: list[int], complaint: str) -> None:
     """Raises InputError if a combination of the wanted columns of H, rotations at the edge, is too weak."""
     _, sizes, V = np.linalg.svd(H[:, wanted], full_matrices=True)
-    there = int(np.sum(sizes > REACH.weakest * np.linalg.svd(H, compute_uv=False)[0]))
+    there = int(np.sum(sizes > REACH.weakest * np.max(np.linalg.svd(H, compute_uv=False), initial=0.0)))
     if there < len(wanted):
         shares = np.linalg.norm(V[there:], axis=0)
         weak = [COORDINATES[k] for k, share in zip(coordinates, shares, strict=True) if share > 0.1]

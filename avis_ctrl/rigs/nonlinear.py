@@ -63,7 +63,7 @@ def rig_arrays(body: MountedBody) -> RigArrays:
 
 
 @njit(cache=True)
-def rotation(angles):
+def rotation(angles: np.ndarray) -> np.ndarray:
     """Body to earth axes for the 3-2-1 angles (phi_x, phi_y, phi_z) [rad], (3, 3): R3(phi_z) R2(phi_y) R1(phi_x).
 
     The matrix of Rademakers' eq. 2.4. Eq. 2.3 there reads like a transformation from earth to body axes, but the
@@ -79,14 +79,14 @@ def rotation(angles):
 
 
 @njit(cache=True)
-def _cross(out, a, b):
+def _cross(out: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True)
-def body_rates(omega, angles, rates):
+def body_rates(omega: np.ndarray, angles: np.ndarray, rates: np.ndarray) -> None:
     """Angular velocity in body axes from the rates of the angles (Rademakers, eq. 2.5), written to omega.
 
     The source states eq. 2.5 "with respect to" the earth frame; its components are in body axes.
@@ -98,7 +98,8 @@ def body_rates(omega, angles, rates):
 
 
 @njit(cache=True)
-def _point_motion(place, speed, R, omega, p, q, q_dot):
+def _point_motion(place: np.ndarray, speed: np.ndarray, R: np.ndarray, omega: np.ndarray, p: np.ndarray, q: np.ndarray,
+                  q_dot: np.ndarray) -> None:
     """Displacement and velocity of the body-fixed point p in earth axes."""
     # Scalars, not small arrays: this runs for every mount at every step.
     t0, t1, t2 = omega[1] * p[2] - omega[2] * p[1], omega[2] * p[0] - omega[0] * p[2], omega[0] * p[1] - omega[1] * p[0]
@@ -108,7 +109,7 @@ def _point_motion(place, speed, R, omega, p, q, q_dot):
 
 
 @njit(cache=True)
-def _add_force(wrench, arm, R, force):
+def _add_force(wrench: np.ndarray, arm: np.ndarray, R: np.ndarray, force: np.ndarray) -> None:
     """Add a force in earth axes at the body point `arm` to force and moment in body axes."""
     f0 = R[0, 0] * force[0] + R[1, 0] * force[1] + R[2, 0] * force[2]
     f1 = R[0, 1] * force[0] + R[1, 1] * force[1] + R[2, 1] * force[2]
@@ -122,7 +123,8 @@ def _add_force(wrench, arm, R, force):
 
 
 @njit(cache=True)
-def _mount_wrench(wrench, R, omega, q, q_dot, q_ch, q_ch_dot, arrays):
+def _mount_wrench(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.ndarray, q_dot: np.ndarray,
+                  q_ch: np.ndarray, q_ch_dot: np.ndarray, arrays: RigArrays) -> None:
     """Force and moment of the springs and dampers of eqs. 2.15-2.16, in body axes about the reference point."""
     R_ch, omega_ch = rotation(q_ch[3:]), np.empty_like(omega)
     body_rates(omega_ch, q_ch[3:], q_ch_dot[3:])
@@ -142,7 +144,8 @@ def _mount_wrench(wrench, R, omega, q, q_dot, q_ch, q_ch_dot, arrays):
 
 
 @njit(cache=True)
-def _generalised_wrench(wrench, R, q, q_dot, q_ch, q_ch_dot, arrays):
+def _generalised_wrench(wrench: np.ndarray, R: np.ndarray, q: np.ndarray, q_dot: np.ndarray, q_ch: np.ndarray,
+                        q_ch_dot: np.ndarray, arrays: RigArrays) -> None:
     """Generalised forces of the 6 x 6 stiffness and damping, converted to body axes by inv(W)^T."""
     Q = np.empty_like(wrench)
     for i in range(6):
@@ -160,7 +163,8 @@ def _generalised_wrench(wrench, R, q, q_dot, q_ch, q_ch_dot, arrays):
 
 
 @njit(cache=True)
-def _accelerations(wrench, R, omega, q, q_dot, arrays):
+def _accelerations(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.ndarray, q_dot: np.ndarray,
+                   arrays: RigArrays) -> np.ndarray:
     """Newton-Euler equations about the reference point in body axes, eqs. 2.8-2.14; returns q''."""
     c = arrays.centre_of_mass
     turning, momentum = np.empty_like(omega), np.empty_like(omega)
@@ -194,7 +198,8 @@ def _accelerations(wrench, R, omega, q, q_dot, arrays):
 
 
 @njit(cache=True)
-def payload_acceleration(q, q_dot, u, q_ch, q_ch_dot, arrays):
+def payload_acceleration(q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, q_ch: np.ndarray, q_ch_dot: np.ndarray,
+                         arrays: RigArrays) -> np.ndarray:
     """q'' (6,) of the payload.
 
     Parameters

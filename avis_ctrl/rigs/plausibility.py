@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.rigs.file_errors import dotted
 from avis_ctrl.rigs.plausible_ranges import RANGES, PlausibleRanges, Range
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.unit_slips import Entry, G, Place, Slip, apart, dotted, entries, slips
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, Modes
+from avis_ctrl.rigs.unit_slips import Entry, G, Place, UnitError, apart, entries, unit_errors
 
 Build = Callable[[dict[str, Any]], Rig]
 Judge = Callable[..., None]
@@ -28,7 +30,7 @@ ALIKE = ("constant_N_per_V", "sensitivity_Vs_per_m", "sensitivity_Vs2_per_m", "s
 class SlipCost:
     """Weights that decide which unit error ("slip") is the likeliest, in squared decades beyond the usual range.
 
-    scope : times the squared scope of the slip (`Slip.scope`). rank : per position in the list of likely wrong units.
+    scope : times the squared scope (`UnitError.scope`). rank : per position in the list of likely wrong units.
     off_centre : if all properties of the table are at the ends of their usual ranges. apart : if the corrected numbers
     are a decade from the others of the same unit and section. near : a second field is named if its cost is within this
     of the best. better : an unusual rig is taken for a slip if the correction reduces the cost below this fraction.
@@ -83,26 +85,26 @@ def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = R
         likely = _likely(content, build, ranges) if _of_numbers(error.value) else []
         if not likely:
             raise
-        first, said = likely[0], error.expected
+        first, words = likely[0], error.expected
         if error.field and not error.field.startswith(first.field):
-            said = f"it makes {error.field} invalid ({said})"
-        raise InputError(f"{said}; {_asked(likely)}", field=first.field, value=first.value) from None
+            words = f"it makes {error.field} invalid ({words})"
+        raise InputError(f"{words}; {_asked(likely)}", field=first.field, value=first.value) from None
     found = judged(content, rig, ranges)
     odd = sorted((one for one in found if one.unusual > 1e-9), key=lambda one: (-one.refused, -one.unusual))
     if not odd:
         return ""
     refused = odd[0].refused > 0
     worst = {one.kind: one for one in reversed(odd) if one.refused > 0 or not refused}
-    said = ", ".join([one.words for one in odd if worst.get(one.kind) is one][:2])
+    words = ", ".join([one.words for one in odd if worst.get(one.kind) is one][:2])
     likely = _likely(content, build, ranges, np.inf if refused else _cost(found))
     if not refused:
         hint = f"; {likely[0].field}: {_asked(likely)}" if likely else ""
-        return f"unusual for a table: {said}{hint}"
+        return f"unusual for a table: {words}{hint}"
     if likely:
-        raise InputError(f"{said}: not possible for a real table; {_asked(likely)}", field=likely[0].field,
+        raise InputError(f"{words}: not possible for a real table; {_asked(likely)}", field=likely[0].field,
                          value=likely[0].value)
-    raise InputError(f"{said}: not possible for a real table, and no single wrong unit explains it; check the units of "
-                     "the keys", field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
+    raise InputError(f"{words}: not possible for a real table, and no single wrong unit explains it; check the units "
+                     "of the keys", field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
 
 
 def _of_numbers(value: Any) -> bool:
@@ -110,7 +112,7 @@ def _of_numbers(value: Any) -> bool:
     return bool(len(values)) and all(isinstance(one, (int, float)) and not isinstance(one, bool) for one in values)
 
 
-def _asked(likely: Sequence[Slip]) -> str:
+def _asked(likely: Sequence[UnitError]) -> str:
     first, *others = likely
     also = "".join(f", or {one.field} = {_shown(one.meant)} ({one.words})" for one in others[:1])
     return f"did you mean {_shown(first.meant)} ({first.words}){also}?"
@@ -122,15 +124,15 @@ def _shown(value: Any) -> str:
     return f"{value:g}"
 
 
-def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now: float = np.inf) -> list[Slip]:
+def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now: float = np.inf) -> list[UnitError]:
     """Slips whose correction leaves nothing impossible and a cost well below `now`: the best, and one nearly as good.
 
     Single numbers of lists are tried only if something is impossible and no wider slip explains it.
     """
-    found: list[tuple[float, Slip]] = []
+    found: list[tuple[float, UnitError]] = []
     before, _, _ = _outcome(content, build, ranges)
     idle: set[Place] = set()
-    for slip in slips(content):
+    for slip in unit_errors(content):
         if slip.one_of_list and (found or np.isfinite(now)):
             break
         if idle.issuperset(entry.place for entry in slip.entries):
@@ -186,7 +188,7 @@ def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) 
     eom, body = rig.equations_of_motion(), rig.mounted_body()
     modes = eom.natural_frequencies()
     if np.all(modes.frequencies_Hz > 0):
-        _modes(eom, modes, judge)
+        judge_modes(eom, modes, judge)
         _clock(rig, float(modes.frequencies_Hz[-1]), judge)
     places = np.array([mount.position for mount in body.mounts])
     centre = places.mean(axis=0)
@@ -195,7 +197,7 @@ def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) 
         _shape(rig, body, centre, radius, judge)
     _drives(rig, eom, radius, judge)
     _alike(numbers, body, judge)
-    _hearing(content, judge)
+    _signal_levels(content, judge)
     return found
 
 
@@ -211,20 +213,23 @@ def _single_keys(numbers: Sequence[Entry], ranges: PlausibleRanges, judge: Judge
             judge(entry.key, abs(entry.value), f"{entry.value:g} {of.unit}".rstrip(), dotted(entry.place), of)
 
 
-def _modes(eom: Any, modes: Any, judge: Judge) -> None:
+def judge_modes(eom: EquationsOfMotion, modes: Modes, judge: Judge) -> None:
+    """Natural frequencies, static sag and modal damping."""
     f = modes.frequencies_Hz
-    said = f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz"
-    judge("slowest_Hz", f[0], said)
-    judge("mode_Hz", f[0], said)
-    judge("mode_Hz", f[-1], said)
-    judge("spread", f[-1] / f[0], f"{said}, ratio {f[-1] / f[0]:.3g}")
+    words = f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz"
+    judge("slowest_Hz", f[0], words)
+    judge("mode_Hz", f[0], words)
+    judge("mode_Hz", f[-1], words)
+    judge("spread", f[-1] / f[0], f"{words}, ratio {f[-1] / f[0]:.3g}")
     rises = modes.shapes[2] ** 2 * np.diag(eom.M)[2]
     vertical = f[rises > 0.2]
     if len(vertical):
         sag = G / (2 * np.pi * vertical[0]) ** 2
         judge("sag_m", sag, f"static sag {sag:.2g} m")
     damping = np.diag(modes.shapes.T @ eom.C @ modes.shapes) / (4 * np.pi * f)
-    for zeta in (np.min(damping), np.max(damping)):
+    # Undamped modes are not compared, but must not hide the smallest damping of the others.
+    damped = damping[damping > 0]
+    for zeta in (np.min(damped, initial=np.inf), np.max(damped, initial=0.0)):
         judge("damping", zeta, f"damping ratio {zeta:.2g}")
 
 
@@ -290,7 +295,7 @@ def _clock(rig: Rig, f: float, judge: Judge) -> None:
           "fastest mode")
 
 
-def _hearing(content: dict[str, Any], judge: Judge) -> None:
+def _signal_levels(content: dict[str, Any], judge: Judge) -> None:
     """Full scale of the velocity sensors, and their signal and noise relative to converter range and floor motion."""
     def of(section: str, key: str) -> float | None:
         part = content.get(section)
@@ -308,7 +313,8 @@ def _hearing(content: dict[str, Any], judge: Judge) -> None:
             judge("floor_share", share, f"the floor motion alone, {floor:.2g} m/s, uses a fraction of {share:.2g} of "
                                         f"the converter's range at {name}")
             own = max(noise, full * 2.0 ** (1 - bits) / np.sqrt(12)) / gain
-            judge("deaf", own / floor, f"noise of {name} {own:.2g} m/s, {own / floor:.3g} times the floor motion")
+            ratio = own / floor
+            judge("noise_ratio", ratio, f"noise of {name} {own:.2g} m/s, {ratio:.3g} times the floor motion")
 
 
 def _velocity_sensors(content: dict[str, Any]) -> Iterator[tuple[str, float]]:

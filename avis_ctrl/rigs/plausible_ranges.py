@@ -58,8 +58,8 @@ class PlausibleRanges:
         the same force over the stiffness. travel_share : travel_m over the radius of the mounts' circle.
     samples_per_cycle : of the fastest mode. delay_cycles : loop delay in cycles of the fastest mode.
     full_scale_m_per_s : converter range over sensitivity and gain of a velocity sensor.
-    deaf : noise of a velocity sensor (its own or the converter's) over the floor velocity. floor_share : voltage due to
-        floor motion over the converter range.
+    noise_ratio : noise of a velocity sensor (its own or the converter's) over the floor velocity.
+    floor_share : voltage due to floor motion over the converter range.
     keys : single keys of a rig file, by name; zero is always allowed.
     """
 
@@ -81,7 +81,7 @@ class PlausibleRanges:
     delay_cycles: Range = Range(0.0, 0.0, 0.4, 1.5, "", "a loop that is late by a cycle of the modes damps none")
     full_scale_m_per_s: Range = Range(2e-5, 1e-4, 0.5, 3.0, "m/s", "a table moves by micrometres to millimetres a "
                                                                    "second")
-    deaf: Range = Range(0.0, 0.0, 12.0, 50.0, "", "a sensor that does not hear the floor measures nothing")
+    noise_ratio: Range = Range(0.0, 0.0, 12.0, 50.0, "", "a sensor that does not hear the floor measures nothing")
     floor_share: Range = Range(0.0, 0.0, 0.1, 0.3, "", "the floor alone must not fill the converter")
     keys: Mapping[str, Range] = field(default_factory=lambda: MappingProxyType({
         "mass_kg": Range(0.02, 0.3, 1e5, 1e6, "kg", "from a mirror to a foundation"),

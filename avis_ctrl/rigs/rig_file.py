@@ -27,6 +27,7 @@ from avis_ctrl.rigs.instruments import (
     Instrument,
     PositionSensorAt,
     Tolerances,
+    triple,
     unit_vector,
 )
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
@@ -121,10 +122,10 @@ def _avis(file: AvisFile) -> AvisTable:
     J[0, 1], J[0, 2], J[1, 2] = payload.inertia_offdiagonal_kgm2
     _check_inertia(J + np.triu(J, 1).T, "payload.inertia_kgm2", payload.inertia_kgm2)
     isolators = tuple(_isolator(one) for one in file.isolator)
-    inertia = (*_triple(payload.inertia_kgm2), *_triple(payload.inertia_offdiagonal_kgm2))
+    inertia = (*triple(payload.inertia_kgm2), *triple(payload.inertia_offdiagonal_kgm2))
     rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True) if motors else ()
     drives = tuple(Drive(**_at_place(one)) for one in file.drive)
-    table = AvisTable(file.name, payload.mass_kg, inertia, _triple(payload.centre_of_mass_m), isolators,
+    table = AvisTable(file.name, payload.mass_kg, inertia, triple(payload.centre_of_mass_m), isolators,
                       tuple(LinearMotor(*row) for row in rows), _common_limit(file),
                       Geophones(**_tuples(geophones)) if geophones else None,
                       Acquisition(**_tuples(file.acquisition)), _ambient(file.ambient), drives=drives,
@@ -183,8 +184,8 @@ def _distinct(field: str, names: list[str], some: bool = True) -> None:
 
 def _isolator(section: IsolatorSection) -> Isolator:
     offset = np.subtract(section.chassis_point_m or section.position_m, section.position_m)
-    return Isolator(_triple(section.position_m), _triple(section.stiffness_N_per_m), _triple(section.damping_Ns_per_m),
-                    _triple(offset.tolist()))
+    return Isolator(triple(section.position_m), triple(section.stiffness_N_per_m), triple(section.damping_Ns_per_m),
+                    triple(offset.tolist()))
 
 
 def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
@@ -253,11 +254,6 @@ def _same_length(section: str, content: dict[str, Any], keys: tuple[str, ...]) -
             raise InputError(f"expected as many entries as {section}.{keys[0]} has, which is {len(names)}; there are "
                              f"{len(content[key])}",
                              field=f"{section}.{key}", value=content[key])
-
-
-def _triple(values: list[float]) -> tuple[float, float, float]:
-    x, y, z = values
-    return float(x), float(y), float(z)
 
 
 def _tuples(section: BaseModel) -> dict[str, Any]:

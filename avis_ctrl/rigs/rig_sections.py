@@ -69,6 +69,8 @@ Spectrum = Annotated[str, AfterValidator(_shipped)]
 
 
 class AvisPayload(Section):
+    """The payload; its inertia is about its centre of mass."""
+
     mass_kg: Positive
     inertia_kgm2: PositiveVector
     inertia_offdiagonal_kgm2: Vector = [0.0, 0.0, 0.0]
@@ -76,6 +78,8 @@ class AvisPayload(Section):
 
 
 class IsolatorSection(Section):
+    """Spring and damper along the earth axes; chassis_point_m : position_m by default."""
+
     position_m: Point
     stiffness_N_per_m: PositiveVector
     damping_Ns_per_m: DampingVector
@@ -92,15 +96,24 @@ class MotorSection(Section):
     limit_V: Positive
 
 
-class DriveSection(Section):
+class PlacedSection(Section):
+    """A drive or sensor at any position."""
+
     name: Name
     position_m: Point
     direction: Direction
+
+
+class DriveSection(PlacedSection):
+    """A drive at any position; limit_V : that of [actuators] by default."""
+
     constant_N_per_V: Positive
     limit_V: Positive | None = None
 
 
 class GeophoneSection(Section):
+    """Geophones in the isolators, along their axes."""
+
     names: list[str]
     isolator: list[int]
     axis: list[Axis]
@@ -112,10 +125,9 @@ class GeophoneSection(Section):
     preamplifier_gain: Positive
 
 
-class GeophoneAtSection(Section):
-    name: Name
-    position_m: Point
-    direction: Direction
+class GeophoneAtSection(PlacedSection):
+    """A geophone at any position."""
+
     sensitivity_Vs_per_m: Positive
     suspension_Hz: Positive
     suspension_damping: Positive
@@ -125,10 +137,9 @@ class GeophoneAtSection(Section):
     noise_rms_V: NotNegative | None = None
 
 
-class AccelerometerAtSection(Section):
-    name: Name
-    position_m: Point
-    direction: Direction
+class AccelerometerAtSection(PlacedSection):
+    """An accelerometer at any position."""
+
     sensitivity_Vs2_per_m: Positive
     low_corner_Hz: Positive
     noise_m_per_s2_rtHz: NotNegative | None = None
@@ -136,10 +147,9 @@ class AccelerometerAtSection(Section):
     noise_rms_V: NotNegative | None = None
 
 
-class PositionSensorSection(Section):
-    name: Name
-    position_m: Point
-    direction: Direction
+class PositionSensorSection(PlacedSection):
+    """A position sensor, payload relative to chassis, at any position."""
+
     sensitivity_V_per_m: Positive
     bandwidth_Hz: Positive | None = None
     noise_m_rtHz: NotNegative | None = None
@@ -148,6 +158,8 @@ class PositionSensorSection(Section):
 
 
 class FloorSensorSection(Section):
+    """A sensor of floor velocity along one axis."""
+
     name: Name
     axis: Axis
     noise_rms_m_per_s: NotNegative
@@ -185,6 +197,8 @@ class ElectronicsSection(Section):
 
 
 class AcquisitionSection(Section):
+    """Converter and timing of the controller."""
+
     sample_rate_Hz: Positive
     adc_bits: Annotated[int, BeforeValidator(bits_of)]
     adc_range_V: Positive
@@ -192,11 +206,15 @@ class AcquisitionSection(Section):
 
 
 class AmbientSection(Section):
+    """R.m.s. of floor motion and sensor noise."""
+
     floor_velocity_rms_m_per_s: NotNegative
     sensor_noise_rms_V: NotNegative
 
 
 class AvisFile(Section):
+    """A rig file of a payload on isolators."""
+
     name: str
     payload: AvisPayload
     isolator: Annotated[list[IsolatorSection], Field(min_length=3)]
@@ -214,6 +232,8 @@ class AvisFile(Section):
 
 
 class PlateSection(Section):
+    """The plate of the Halcyonics table."""
+
     mass_kg: Positive
     inertia_kgm2: PositiveVector
     L1_m: PositiveLength
@@ -241,6 +261,8 @@ class SuspensionSection(Section):
 
 
 class VoiceCoilSection(Section):
+    """Voice-coil actuators A1..A8 of the Halcyonics table."""
+
     names: Annotated[list[str], Field(min_length=8, max_length=8)]
     constant_N_per_V: Annotated[list[Positive], Field(min_length=8, max_length=8)]
     reaction_mass_kg: Positive
@@ -249,6 +271,8 @@ class VoiceCoilSection(Section):
 
 
 class AccelerometerSection(Section):
+    """Built-in accelerometers of the Halcyonics table, at these actuators."""
+
     at: Annotated[list[str], Field(min_length=1)]
     sensitivity_Vs2_per_m: Positive
     low_corner_Hz: Positive
@@ -259,6 +283,8 @@ class AccelerometerSection(Section):
 
 
 class LoadSection(Section):
+    """A load on the plate; `_total` is the inertia of plate and load."""
+
     mass_kg: Positive
     L7_m: Length
     L8_m: Length
@@ -272,6 +298,8 @@ class LoadSection(Section):
 
 
 class HalcyonicsFile(Section):
+    """A rig file of the Halcyonics table."""
+
     name: str
     payload: PlateSection
     suspension: SuspensionSection

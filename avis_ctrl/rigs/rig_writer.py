@@ -59,8 +59,8 @@ def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = 
         text += f"\n{title}\n" if title else ""
         for line in lines:
             dotted = f"{name}.{line.key}" if name else line.key
-            said = [left.pop(known) for known in (dotted, *line.parameters) if known in left]
-            text += f"{line.key} = {_toml(line.value)}" + (f"  {_comment('; '.join(said))}" if said else "") + "\n"
+            own = [left.pop(known) for known in (dotted, *line.parameters) if known in left]
+            text += f"{line.key} = {_toml(line.value)}" + (f"  {_comment('; '.join(own))}" if own else "") + "\n"
     if left:
         raise InputError(f"the file of the rig {rig.name} has no such line or parameter", field="comments",
                          value=next(iter(left)))

@@ -44,11 +44,13 @@ class Filter:
     leading: float = 1.0
 
     def system(self) -> StateSpace:
+        """The filter as a state-space system."""
         zeros, poles = (np.real_if_close(np.array(roots, complex)) for roots in (self.zeros, self.poles))
         return cascade(zeros, poles, self.leading)
 
     @property
     def is_one(self) -> bool:
+        """Whether it is the identity."""
         return not self.zeros and not self.poles and self.leading == 1.0
 
     def over(self, other: Filter) -> Filter:
@@ -103,6 +105,7 @@ class Sensing:
 
     @property
     def axes(self) -> tuple[str, ...]:
+        """Names of the measured axes."""
         return self.decoder.axes
 
     @property

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.rigs.file_errors import dotted
 from avis_ctrl.rigs.rigid_body import GRAVITY
 
 G = GRAVITY
@@ -55,7 +56,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Slip:
+class UnitError:
     """Numbers that were all given in a unit other than that of their key.
 
     field, value : as in messages. factor : to the key's unit. unit : in which they were probably given. rank : position
@@ -84,6 +85,7 @@ class Slip:
 
     @property
     def one_of_list(self) -> bool:
+        """Whether it changes a single number of a list."""
         return self.scope == 0 and isinstance(self.entries[0].place[-1], int)
 
     @property
@@ -120,7 +122,7 @@ def unit_of(key: str) -> str:
     return next((ending for ending in UNITS if key.endswith(ending)), "")
 
 
-def slips(content: dict[str, Any]) -> Iterator[Slip]:
+def unit_errors(content: dict[str, Any]) -> Iterator[UnitError]:
     """All possible single unit errors: in one number, a list, a key, or a unit in a section or in the whole file.
 
     Single numbers of lists come last.
@@ -144,7 +146,7 @@ def slips(content: dict[str, Any]) -> Iterator[Slip]:
         ending = unit_of(members[0].key)
         for rank, (factor, unit) in enumerate(RATIOS.get(ending) or UNITS[ending]):
             field, value = _named(scope, name, members)
-            yield Slip(field, value, tuple(members), factor, unit, rank, scope)
+            yield UnitError(field, value, tuple(members), factor, unit, rank, scope)
 
 
 def _named(scope: int, name: tuple[Any, ...], members: list[Entry]) -> tuple[str, Any]:
@@ -162,12 +164,7 @@ def _named(scope: int, name: tuple[Any, ...], members: list[Entry]) -> tuple[str
     return shown_keys, values[:3] if len(values) > 1 else values[0]
 
 
-def dotted(place: Place) -> str:
-    """("isolator", 1, "position_m", 0) as isolator[2].position_m[1], counted from 1."""
-    return "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
-
-
-def apart(slip: Slip, mended: dict[str, Any]) -> float:
+def apart(slip: UnitError, mended: dict[str, Any]) -> float:
     """Mean squared distance, in decades, of the corrected numbers from the median of the others of their unit."""
     there = {entry.place for entry in slip.entries}
     first = slip.entries[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
@@ -10,9 +10,14 @@ import scipy.linalg as la
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array
 
+# Condition of the eigenvectors of the balanced A above which A counts as defective, and the relative changes of A
+# that are tried in this case.
+DEFECTIVE = 1e12
+SEPARATION = (0.0, 1e-8, 1e-6, 1e-4, 1e-2)
+
 
 @dataclass(frozen=True, eq=False)
-class Entries:
+class ControllerEntries:
     """K with tridiagonal A (modal blocks), and its free entries, each normalised by its typical size.
 
     rows, cols : indices of the free entries of [A B; C D]; size : typical sizes; start : normalised values.
@@ -25,7 +30,8 @@ class Entries:
     start: Array
 
     @staticmethod
-    def of(K: StateSpace, decentralised: bool = False) -> Entries:
+    def of(K: StateSpace, decentralised: bool = False) -> ControllerEntries:
+        """K in modal form, with its free entries; decentralised: u_k depends on y_k only."""
         A, B, C, rate, channel = _modal(K)
         n = rate.size
         whole = np.block([[A, B], [C, K.D]])
@@ -41,21 +47,39 @@ class Entries:
         unit[n:, n:] = np.linalg.norm(K.D) + np.max(np.abs(C).sum(axis=0) * np.abs(B).sum(axis=1) / rate, initial=0.0)
         unit[unit == 0] = 1.0
         rows, cols = np.nonzero(free)
-        return Entries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
+        return ControllerEntries(K, rows, cols, unit[rows, cols], whole[rows, cols] / unit[rows, cols])
 
     def matrix(self, x: Array) -> Array:
+        """[A B; C D] for the normalised entries x."""
         n = self.K.nstates
         whole = np.zeros((n + self.K.noutputs, n + self.K.ninputs))
         whole[self.rows, self.cols] = x * self.size
         return whole
 
     def controller(self, x: Array) -> StateSpace:
+        """The controller with the normalised entries x."""
         n, whole = self.K.nstates, self.matrix(x)
         return StateSpace(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], 0.0, self.K.inputs,
                           self.K.outputs)
 
     def slope(self, whole: Array) -> Array:
+        """Derivatives with respect to x from those with respect to [A B; C D]."""
         return whole[self.rows, self.cols] * self.size
+
+
+def _diagonalisable(K: StateSpace) -> tuple[StateSpace, Array, Array]:
+    """K with the eigenvalues and eigenvectors of its A, which is changed slightly if it has too few eigenvectors."""
+    size = 1e-6 * float(np.max(np.abs(K.poles()), initial=0.0)) or 1.0
+    _, (scale, _) = la.matrix_balance(K.A, permute=False, separate=True)
+    for change in SEPARATION:
+        # A different relative change of every row separates repeated poles and keeps decoupled channels decoupled.
+        rows = change * np.linspace(-1, 1, K.nstates)[:, None]
+        made = replace(K, A=K.A + rows * (K.A + size * np.eye(K.nstates)))
+        values, V = la.eig(made.A)
+        balanced = V / scale[:, None]
+        if not V.size or np.linalg.cond(balanced / np.linalg.norm(balanced, axis=0)) < DEFECTIVE:
+            break
+    return made, values, V
 
 
 def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
@@ -64,7 +88,7 @@ def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
     The outputs (n,) are those that each state affects most; the states are ordered by them.
     """
     n, vectors, sizes, channels = K.nstates, [], [], []
-    values, V = la.eig(K.A)
+    K, values, V = _diagonalisable(K)
     output = np.argmax(np.abs(K.C @ V), axis=0)
     for k in np.lexsort((np.abs(values), output)):
         if values[k].imag > 0:

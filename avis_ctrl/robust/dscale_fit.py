@@ -17,8 +17,9 @@ bump of height at most one in log y, and the basis follows the solution.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import clarabel
 import numpy as np
@@ -31,10 +32,11 @@ from avis_ctrl.robust.scalings import ScalarScaling
 POSITIVITY_MARGIN = 1e-7
 # log t / weight above which a point imposes no constraint in double precision.
 SLACK_LIMIT = 25.0
+Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
-class MagnitudeFit:
+class ScalarFit:
     """A fitted d(s) with its error recomputed from the realised roots.
 
     error : max over the points of weight |log(|d| / target)|.
@@ -49,7 +51,7 @@ class MagnitudeFit:
 
 
 def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None = None,
-                  tolerance: float = 1e-3) -> MagnitudeFit:
+                  tolerance: float = 1e-3) -> ScalarFit:
     """Best log-Chebyshev fit of |d| at the frequencies by a d(s) of the given order.
 
     Parameters
@@ -66,34 +68,45 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
     omega, target, weight = _checked(omega, magnitude, order, weight)
     best, error = _constant_fit(target, weight)
     if order == 0 or error <= tolerance:
-        return MagnitudeFit(best, error, error if order == 0 else 0.0, 0)
+        return ScalarFit(best, error, error if order == 0 else 0.0, 0)
     unit = float(np.exp(np.mean(np.log(omega))))
     problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, initial_roots(omega / unit, target, order))
+
+    def attempt(level: float) -> tuple[ScalarScaling, float] | None:
+        nonlocal problem
+        found = problem.solve(2 * level)
+        if found is None:
+            return None
+        p, q = found
+        fitted = _spectral_factor(p, q, unit)
+        problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
+        return fitted, float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
+    return ScalarFit(*bisection(best, error, attempt, tolerance))
+
+
+def bisection(best: Fitted, error: float, attempt: Callable[[float], tuple[Fitted, float] | None], tolerance: float
+              ) -> tuple[Fitted, float, float, int]:
+    """Bisection on the error of a fit, from the fit `best`: the last fit, its error, the proved bound, and the solves.
+
+    attempt : function of a level, a fit with its error, or None if the level is proved infeasible.
+    """
     lower, solves = 0.0, 0
     while error - lower > tolerance and solves < 40:
         level = (lower + error) / 2
         solves += 1
         try:
-            candidate = problem.solve(2 * level)
-        except ComputationError:
-            # Neither solved nor proved infeasible: keep the best fit so far, with its bound.
+            found = attempt(level)
+        except (ComputationError, InputError):
+            # Neither solved nor proved infeasible, or no stable factor because of round-off: keep the best fit so far.
             break
-        if candidate is None:
+        if found is None:
             lower = level
             continue
-        p, q = candidate
-        try:
-            fitted = _spectral_factor(p, q, unit)
-        except ComputationError:
-            # Round-off moved a root onto the axis: as above.
-            break
-        achieved = float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
-        if achieved >= error:
+        if found[1] >= error:
             # Feasible, but no better after factorisation: the limit of double precision.
             break
-        best, error = fitted, achieved
-        problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
-    return MagnitudeFit(best, error, lower, solves)
+        best, error = found
+    return best, error, lower, solves
 
 
 def _checked(omega: np.ndarray, magnitude: np.ndarray, order: int,
@@ -132,8 +145,8 @@ def initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarr
     arrange = np.argsort(position)
     position, target = position[arrange], target[arrange]
     step = np.abs(np.diff(target)) + 0.05 * np.diff(position) + 1e-9
-    share = np.concatenate([[0.0], np.cumsum(step)]) / np.sum(step) if step.size else np.zeros(1)
-    return -np.exp(2 * np.interp((np.arange(order) + 0.5) / order, share, position)).astype(complex)
+    fraction = np.concatenate([[0.0], np.cumsum(step)]) / np.sum(step) if step.size else np.zeros(1)
+    return -np.exp(2 * np.interp((np.arange(order) + 0.5) / order, fraction, position)).astype(complex)
 
 
 class _Feasibility:
@@ -229,6 +242,7 @@ def triangle(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gram_cone(size: int) -> Any:
+    """Cone of a positive semidefinite Gram matrix."""
     return clarabel.NonnegativeConeT(1) if size == 1 else clarabel.PSDTriangleConeT(size)
 
 

@@ -25,6 +25,7 @@ from avis_ctrl.robust.dscale_fit import (
     POSITIVITY_MARGIN,
     SLACK_LIMIT,
     basis_scale,
+    bisection,
     gram_cone,
     half_line_coefficients,
     half_line_rows,
@@ -63,27 +64,14 @@ def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndar
     unit = float(np.exp(np.mean(np.log(omega))))
     problem = _Feasibility.of(omega / unit, whitened, weight, degree)
     best = _with_right_factor(gain(np.eye(C.shape[0])), C)
-    error, lower, solves = _error(best, omega, X, weight), 0.0, 0
-    while error - lower > tolerance and solves < 40:
-        level = (lower + error) / 2
-        solves += 1
-        try:
-            found = problem.solve(2 * level)
-        except ComputationError:
-            break
+
+    def attempt(level: float) -> tuple[MatrixScaling, float] | None:
+        found = problem.solve(2 * level)
         if found is None:
-            lower = level
-            continue
-        try:
-            candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
-        except (ComputationError, InputError):
-            # No stable factor because of round-off: keep the best fit so far.
-            break
-        achieved = _error(candidate, omega, X, weight)
-        if achieved >= error:
-            break
-        best, error = candidate, achieved
-    return HermitianFit(best, error, lower, solves)
+            return None
+        candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
+        return candidate, _error(candidate, omega, X, weight)
+    return HermitianFit(*bisection(best, _error(best, omega, X, weight), attempt, tolerance))
 
 
 def _checked(omega: np.ndarray, X: np.ndarray, degree: int,

@@ -31,7 +31,7 @@ FIT_TOLERANCE = 2e-2
 MATRIX_FIT_TOLERANCE = 2e-2
 # Refinement ends when a linear program predicts a smaller gain than this: a tenth of the allowed cost of a fit.
 REFINEMENT = 1e-3
-# Below this fraction of the peak any misfit is harmless; above it, mu itself is the yardstick. Steps with a large gain
+# Below this fraction of the peak any misfit is harmless; above it, mu itself is the reference. Steps with a large gain
 # need little of the mu profile; the last steps depend on it.
 BROAD_FLOOR, DETAILED_FLOOR = 0.5, 0.3
 # Number of points of the check between grid points, and the ratio to the peak above which they are added to the grid.
@@ -79,6 +79,7 @@ class PointwiseScalings:
 
     @property
     def peak(self) -> float:
+        """Largest upper bound of mu."""
         return float(np.max(self.mu))
 
     def shape(self, k: int) -> np.ndarray:
@@ -86,7 +87,7 @@ class PointwiseScalings:
         return self.X[k] / np.exp(2 * self.log_d[:, k])[:, None, None]
 
     @property
-    def yardstick(self) -> np.ndarray:
+    def reference(self) -> np.ndarray:
         """Reference for the loop scaled by the realised D(s) (n_omega,): mu, but at least a fraction of its peak."""
         return np.maximum(self.mu, self.floor * self.peak)
 
@@ -116,7 +117,7 @@ class PointwiseScalings:
 
 @dataclass(frozen=True)
 class DStep:
-    """Realised scalings, the peak of the scaled loop, and their cost: largest relative excess over the yardstick."""
+    """Realised scalings, the peak of the scaled loop, and their cost: largest relative excess over the reference."""
 
     scalings: Scalings
     peak: float
@@ -153,7 +154,7 @@ def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors
     """
     for floor in floors:
         at = replace(points, floor=floor)
-        for chosen in (partial(_anew, at), partial(_continued, at, start)):
+        for chosen in (partial(_from_constants, at), partial(_from_start, at, start)):
             step = _settled(at, loop, chosen(allowed_cost, max_states), start, allowed_cost, max_states)
             yield step
             if step.cost <= allowed_cost:
@@ -164,7 +165,7 @@ def tightened(points: PointwiseScalings, loop: StateSpace, start: Scalings, allo
               max_states: int) -> DStep:
     """Scalings continued from `start` that lower only the peak of the scaled loop N(s), not its values below."""
     points = replace(points, floor=1.0)
-    step = _continued(points, start, allowed_cost, max_states)
+    step = _from_start(points, start, allowed_cost, max_states)
     return _settled(points, loop, step, start, allowed_cost, max_states)
 
 
@@ -179,7 +180,7 @@ def _settled(points: PointwiseScalings, loop: StateSpace, step: DStep, start: Sc
         if not omega.size:
             break
         points = points.extended(omega, M)
-        step = _continued(points, step.scalings, allowed_cost, max_states)
+        step = _from_start(points, step.scalings, allowed_cost, max_states)
     else:
         measured = _measured(points, loop, dense, response, step.scalings)[0]
     return min(measured, first, key=lambda found: found.cost)
@@ -199,33 +200,34 @@ def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, re
     top = (sigma[1:-1] >= sigma[:-2]) & (sigma[1:-1] > sigma[2:]) & (sigma[1:-1] > BETWEEN * step.peak)
     at = np.flatnonzero(top) + 1
     at = at[np.argsort(sigma[at])[::-1][:4]]
-    yardstick = np.interp(np.log(omega), np.log(points.omega), points.yardstick)
-    cost = max(step.cost, float(np.max(sigma / yardstick)) - 1)
+    reference = np.interp(np.log(omega), np.log(points.omega), points.reference)
+    cost = max(step.cost, float(np.max(sigma / reference)) - 1)
     return DStep(scalings, max(step.peak, float(np.max(sigma))), cost), omega[at], M[at]
 
 
-def _anew(points: PointwiseScalings, allowed_cost: float, max_states: int) -> DStep:
+def _from_constants(points: PointwiseScalings, allowed_cost: float, max_states: int) -> DStep:
     """Greedy search for the smallest orders whose realised scalings cost less than `allowed_cost` of peak mu.
 
     All orders start at zero. Blocks whose misfit explains most of the excess get a higher order, as long as the
     scalings add at most `max_states` states to the plant.
     """
-    return _grown(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
+    return _raised_orders(points, _evaluated(points, _refined(points, _constants(points))), allowed_cost, max_states)
 
 
-def _continued(points: PointwiseScalings, start: Scalings, allowed_cost: float, max_states: int) -> DStep:
+def _from_start(points: PointwiseScalings, start: Scalings, allowed_cost: float, max_states: int) -> DStep:
     """The given scalings, refined if that helps, with orders raised as needed."""
     kept = min(_evaluated(points, start), _evaluated(points, _refined(points, start)), key=lambda step: step.cost)
-    return _grown(points, kept, allowed_cost, max_states)
+    return _raised_orders(points, kept, allowed_cost, max_states)
 
 
-def _grown(points: PointwiseScalings, best: DStep, allowed_cost: float, max_states: int) -> DStep:
+def _raised_orders(points: PointwiseScalings, best: DStep, allowed_cost: float, max_states: int) -> DStep:
     """Raise orders where the misfit costs most, until the cost is allowed or no increase helps."""
     while best.cost > allowed_cost:
-        share = _blame(points, best.scalings)
-        if not np.any(share > 0):
+        contribution = _blame(points, best.scalings)
+        if not np.any(contribution > 0):
             break
-        candidates = (_raised(points, best, np.flatnonzero(share >= part * np.max(share)), max_states, by, matrices)
+        most = np.max(contribution)
+        candidates = (_raised(points, best, np.flatnonzero(contribution >= part * most), max_states, by, matrices)
                       # Matrices last: their scalar factors usually suffice, and are refined jointly with the rest.
                       for matrices in (False, True)
                       # One more order may not help where two do: a resonance needs a pair of roots.
@@ -244,19 +246,15 @@ def band_of(omega: np.ndarray) -> tuple[float, float]:
     return (10 * low, high / 10) if high > 1e3 * low else (low, high)
 
 
-def peak_of(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """sigma_max(D N D^-1) (n_omega,) with the realised scalings."""
-    return _sigma(points.omega, points.M, scalings)
-
-
 def _sigma(omega: np.ndarray, M: np.ndarray, scalings: Scalings) -> np.ndarray:
+    """sigma_max(D M D^-1) (n_omega,) with the realised scalings."""
     left, right = scalings.response(omega)
     return np.linalg.norm(left @ M @ right, ord=2, axis=(1, 2))
 
 
 def _evaluated(points: PointwiseScalings, scalings: Scalings) -> DStep:
-    sigma = peak_of(points, scalings)
-    return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / points.yardstick)) - 1)
+    sigma = _sigma(points.omega, points.M, scalings)
+    return DStep(scalings, float(np.max(sigma)), float(np.max(sigma / points.reference)) - 1)
 
 
 def _constants(points: PointwiseScalings) -> Scalings:
@@ -344,37 +342,37 @@ def _sensitivities(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     """(n_omega, n_blocks) cost of a misfit: closeness to the peak times the contribution to the singular vectors."""
     left, right = scalings.response(points.omega)
     U, _, Vh = np.linalg.svd(left @ points.M @ right)
-    share = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
-                      for _, w, z in points.structure.slices()], axis=1)
+    contribution = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
+                             for _, w, z in points.structure.slices()], axis=1)
     # A block that is not part of a loop does not contribute.
-    relative = share / np.maximum(np.max(share, axis=0), np.finfo(float).tiny)
+    relative = contribution / np.maximum(np.max(contribution, axis=0), np.finfo(float).tiny)
     weight = _closeness(points)[:, None] * np.maximum(relative, 1e-2)
     return np.maximum(weight / np.max(weight, axis=0), 1e-3)
 
 
 def _blame(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
-    """Part of the excess over the yardstick explained by the misfit of each group (n_groups,), to first order."""
+    """Part of the excess over the reference explained by the misfit of each group (n_groups,), to first order."""
     left, right = scalings.response(points.omega)
     U, s, Vh = np.linalg.svd(left @ points.M @ right)
-    excess = np.maximum(np.log(s[:, 0] / points.yardstick), 0.0)
-    share = np.zeros(len(scalings.parts))
+    excess = np.maximum(np.log(s[:, 0] / points.reference), 0.0)
+    contribution = np.zeros(len(scalings.parts))
     for k, (_, w, z) in enumerate(points.structure.slices()):
         part = scalings.parts[k]
         slope = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) - np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
         if isinstance(part, ScalarScaling):
             misfit = part.log_magnitude(points.omega) - points.log_d[:, k]
-            share[k] = float(np.max(excess * np.maximum(slope * misfit, 0.0)))
+            contribution[k] = float(np.max(excess * np.maximum(slope * misfit, 0.0)))
         else:
             fitted = left[:, z, z]
             ratio = np.linalg.solve(np.conj(np.swapaxes(fitted, 1, 2)) @ fitted, points.X[k])
             distance = np.max(np.abs(np.log(np.abs(np.linalg.eigvals(ratio)))), axis=1)
             weight = np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
-            share[k] = float(np.max(excess * weight * distance)) / 2
-    return np.array([np.sum(share[list(blocks)]) for blocks in scalings.members])
+            contribution[k] = float(np.max(excess * weight * distance)) / 2
+    return np.array([np.sum(contribution[list(blocks)]) for blocks in scalings.members])
 
 
 def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> Scalings:
-    """Minimise max over frequency of log(sigma_max(D N D^-1) / yardstick) by linear programs in a trust region."""
+    """Minimise max over frequency of log(sigma_max(D N D^-1) / reference) by linear programs in a trust region."""
     if len(scalings.parts) < 2:
         return scalings
     box = np.array(parameter_box(scalings, band_of(points.omega)))
@@ -398,12 +396,12 @@ def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> S
 
 
 def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of the largest singular values relative to the yardstick near the peak (n,), slopes (n, n_theta)."""
+    """Logarithms of the largest singular values relative to the reference near the peak (n,), slopes (n, n_theta)."""
     left, right = scalings.response(points.omega)
     U, s, Vh = np.linalg.svd(left @ points.M @ right, full_matrices=False)
     kept = min(kept, s.shape[1])
     log_s = np.log(np.maximum(s[:, :kept], 1e-300))
-    log_ref = np.log(points.yardstick)
+    log_ref = np.log(points.reference)
     top = np.argwhere(log_s - log_ref[:, None] > np.max(log_s[:, 0] - log_ref) - 0.7)
     at, which = top[:, 0], top[:, 1]
     u, v = np.swapaxes(U, 1, 2)[at, which], Vh[at, which]

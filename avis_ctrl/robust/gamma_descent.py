@@ -15,7 +15,6 @@ that transform a plant to normal form. Differences of the data are therefore not
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +44,7 @@ class ScaledProblem:
 
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> ScaledProblem:
+        """The problem of P; nmeas, ncon : number of measurements and controls, which are last."""
         of_u, of_y = rank_margins(Plant.of(P, nmeas, ncon))
         return ScaledProblem(balance(P), nmeas, ncon, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
 
@@ -151,12 +151,10 @@ class _CouplingSlope:
 
 
 def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float], *,
-            evaluations: int = 40, tolerance: float = 1e-3,
-            stop: Callable[[float], bool] = lambda gamma: False) -> Descent:
+            evaluations: int = 40, tolerance: float = 1e-3) -> Descent:
     """Quasi-Newton descent (BFGS with bounds) on log gamma over the parameters of the scalar scalings.
 
-    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`, or
-    when `stop(gamma)`, called before every step, returns true.
+    P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`.
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     low, high = np.array(parameter_box(scalings, band)).T
@@ -164,7 +162,7 @@ def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tupl
     gamma, slope = gamma_and_gradient(problem, here)
     first, count, trail = gamma, 1, [gamma]
     H = np.eye(low.size)
-    while count < evaluations and not stop(gamma):
+    while count < evaluations:
         theta = parameters(here)
         step = _direction(H, slope, theta, low, high)
         found = None
@@ -219,13 +217,13 @@ def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
     return V @ H @ V.T + np.outer(s, s) / curvature
 
 
-def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
-          max_states: int, share: float = 0.5) -> Scalings | None:
+def with_added_pairs(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
+                     max_states: int, fraction: float = 0.5) -> Scalings | None:
     """The scalings with one more zero-pole pair in the blocks, and at the frequencies, where gamma is most sensitive.
 
     A zero and a pole that cancel change nothing, but gamma has a slope with respect to their distance. Pairs are tried
-    at two frequencies per decade in all blocks at once. Blocks whose slope is at least the fraction `share` of the
-    largest get a pair. None if all slopes vanish, or if no more states are allowed.
+    at two frequencies per decade in all blocks at once. Blocks whose slope is at least `fraction` of the largest get a
+    pair. None if all slopes vanish, or if no more states are allowed.
     """
     problem = ScaledProblem.of(P, nmeas, ncon)
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
@@ -240,7 +238,7 @@ def grown(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[
         return None
     best = np.argmax(np.abs(slopes), axis=0)
     strength = np.abs(slopes[best, range(len(free))])
-    for threshold in (share, 0.999):
+    for threshold in (fraction, 0.999):
         larger = scalings
         for number, (at, group, size) in enumerate(zip(best, free, strength, strict=True)):
             if size >= threshold * np.max(strength):

@@ -35,7 +35,7 @@ from avis_ctrl.robust.hinf_settings import SETTINGS
 
 
 @dataclass(frozen=True)
-class LowerBound:
+class HinfLowerBound:
     """No stabilising controller achieves a norm below `gamma`.
 
     point : s [rad/s] where the bound is attained (of the bilinear image if P is sampled); nan for the Riccati test.
@@ -47,7 +47,7 @@ class LowerBound:
     source: str
 
 
-def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = None) -> LowerBound:
+def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = None) -> HinfLowerBound:
     """The largest of the pointwise bounds and, if applicable, the bound of the Riccati test (within 0.1 %).
 
     omega : frequencies [rad/s] to evaluate; default: 400 over the range of the plant poles, with two decades beyond.
@@ -59,22 +59,22 @@ def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = N
     if min(rank_margins(plant)) >= SETTINGS.rank_tolerance:
         lower = find_gamma(normal_form(plant).plant, 1e-3).lower
         if lower > best.gamma:
-            return LowerBound(float(lower), complex(np.nan), "the two-Riccati test fails there")
+            return HinfLowerBound(float(lower), complex(np.nan), "the two-Riccati test fails there")
     return best
 
 
-def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> LowerBound:
+def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> HinfLowerBound:
     """Largest Parrott bound over frequencies on the imaginary axis and the zeros in the right half plane."""
     plant = in_usual_units(plant)
     if omega is None:
         poles = np.abs(plant.sample_points())
         omega = np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)
-    best = LowerBound(parrott_at_infinity(plant), complex(np.inf), "directions free at infinite frequency")
+    best = HinfLowerBound(parrott_at_infinity(plant), complex(np.inf), "directions free at infinite frequency")
     for s, source in [*((1j * w, "directions free at one frequency") for w in omega),
                       *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant))]:
         value = pointwise(plant, s, at_zero=s.real > 0)
         if value > best.gamma:
-            best = LowerBound(value, complex(s), source)
+            best = HinfLowerBound(value, complex(s), source)
     return best
 
 

@@ -25,6 +25,8 @@ from avis_ctrl.lti.bilinear import continuous_image
 from avis_ctrl.robust.hinf_plant import Plant, as_plant, check_stabilisable
 from avis_ctrl.robust.riccati import solve_riccati
 
+UNCERTIFIED = "upper bound not certified"
+
 
 @dataclass(frozen=True)
 class LmiOptimum:
@@ -33,7 +35,8 @@ class LmiOptimum:
     upper : gamma at which the returned R and S satisfy the inequalities, verified by their eigenvalues.
     lower : dual objective, a lower bound to the accuracy of the solver (about 1e-6 relative).
     R, S : (n, n) certificates in the balanced coordinates.
-    violation : largest eigenvalue of the inequalities at (R, S, upper), relative to gamma; negative if certified.
+    violation : largest eigenvalue of the inequalities at (R, S, upper), relative to gamma; not positive if certified.
+    status : that of the solver, with a remark if `upper` is not certified.
     """
 
     upper: float
@@ -58,7 +61,9 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
     for _ in range(6):
         scaled = _balanced(_scaled(plant, size))
         R, S, bounds, status = _optimum(scaled)
-        upper, violation = _certified(scaled, R, S, bounds[1])
+        upper, violation, R, S = certified(scaled, R, S, bounds[1])
+        if violation > 0:
+            status = f"{status}, {UNCERTIFIED}"
         found = LmiOptimum(upper * size, min(bounds[0], upper) * size, R, S, violation, status)
         settled = best is not None and abs(found.upper - best.upper) < 1e-5 * best.upper
         if best is None or found.upper < best.upper:
@@ -101,8 +106,9 @@ def _scaled(plant: Plant, size: float) -> Plant:
 
 
 def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float], str]:
-    import cvxpy as cp
+    import cvxpy
 
+    cp: Any = cvxpy
     n = plant.n
     gamma = cp.Variable(nonneg=True)
     constraints, variables = [], []
@@ -159,8 +165,10 @@ def _sides(plant: Plant) -> list[tuple[np.ndarray, ...]]:
     return sides
 
 
-def _certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float) -> tuple[float, float]:
-    """Smallest gamma, from that of the solver upwards, at which the inequalities are verified; largest eigenvalue."""
+def certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float
+              ) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """Smallest gamma, from that of the solver upwards, at which the inequalities are verified; largest eigenvalue;
+    the R and S of this verification."""
     coupling = la.eigvalsh(np.block([[R, np.eye(plant.n)], [np.eye(plant.n), S]])) if plant.n else np.ones(1)
     # R and S are shifted equally until [R I; I S] >= 0; gamma is then increased to compensate.
     lift = max(0.0, -float(coupling[0]) * (1 + 1e-6))
@@ -175,5 +183,5 @@ def _certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float) -> tupl
                               [B1.T, D11.T, -level * np.eye(m)]])
             worst = max(worst, float(la.eigvalsh(N.T @ inner @ N)[-1]))
         if worst <= 0:
-            return level, worst / max(level, 1e-300)
-    return gamma, worst / max(gamma, 1e-300)
+            return level, worst / max(level, 1e-300), R, S
+    return gamma, worst / max(gamma, 1e-300), R, S

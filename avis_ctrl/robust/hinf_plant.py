@@ -49,6 +49,7 @@ class Plant:
 
     @property
     def n(self) -> int:
+        """Number of states."""
         return self.A.shape[0]
 
     def sample_points(self) -> np.ndarray:

@@ -118,7 +118,7 @@ def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarra
     return bool(q @ r > 0 and rho - (q @ E_x @ q + rho * r @ E_y @ r) / (q @ r) > gamma ** 2)
 
 
-def keeps(plant: Plant, test: GammaTest) -> bool:
+def norm_is_confirmed(plant: Plant, test: GammaTest) -> bool:
     """Whether the measured norm of the loop with the central controller of a passed test is below its gamma."""
     m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
     form = NormalForm(plant, np.eye(m2), np.eye(p2), np.zeros((p2, m2)))
@@ -136,19 +136,19 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
     """Bracket the optimum to a relative tolerance: geometric steps, then regula falsi on rho(X Y), or bisection.
 
     proved : search for a proved lower bound if the test is in doubt just below the optimum.
-    ComputationError if even gamma = limit times the initial value fails.
+    ComputationError if even gamma = limit times the initial value, or that without a hint, fails.
     """
     floor, natural = direct_term_bound(plant), natural_gamma(plant)
     nothing = SETTINGS.zero_gamma * natural
     start = max(hint or natural, floor * (1 + 2 * tolerance), nothing)
     search = _Search(plant, floor)
-    step, factor = start, 1.05 if hint else 4.0
-    while search.upper is None:
-        search.try_gamma(step)
-        step, factor = step * factor, factor ** 2
-        if step > limit * start:
+    step, factor, largest = start, 1.05 if hint else 4.0, limit * max(start, natural)
+    while not search.try_gamma(step):
+        if step >= largest:
             raise ComputationError("no controller was found at any gamma", measured=f"gamma up to {step:.3g} tried",
                                    cause=search.reason, next_step="check weights and scaling of the plant")
+        step, factor = min(step * factor, largest), factor ** 2
+    assert search.upper is not None
     factor = 1.05 if hint else 4.0
     while search.failed <= max(floor, 0.0) and search.upper.gamma > nothing:
         step = search.upper.gamma / factor
@@ -182,7 +182,7 @@ class _Search:
     def try_gamma(self, gamma: float) -> bool:
         outcome = gamma_test(self.plant, gamma)
         self.tests += 1
-        passed = outcome.feasible and (not outcome.doubtful or keeps(self.plant, outcome))
+        passed = outcome.feasible and (not outcome.doubtful or norm_is_confirmed(self.plant, outcome))
         self.lower = max(self.lower, outcome.forbidden)
         if passed:
             self.second, self.upper = self.upper, outcome

@@ -128,11 +128,12 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     form, bracket, notes = problem.solve(tolerance, gamma_hint)
     status = Status.REGULARISED if notes else Status.OPTIMAL
     bounds = bracket.lower, bracket.upper.gamma
+    doubt: tuple[str, ...] = ()
     if method == "lmi":
-        from avis_ctrl.robust.hinf_lmi import lmi_gamma
+        from avis_ctrl.robust.hinf_lmi import UNCERTIFIED, lmi_gamma
 
         optimum = lmi_gamma(P, nmeas, ncon)
-        bounds = optimum.lower, optimum.upper
+        bounds, doubt = (optimum.lower, optimum.upper), (UNCERTIFIED,) if optimum.violation > 0 else ()
     result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff,
                                      far_poles == "gain")
     if notes and method != "lmi":
@@ -149,7 +150,7 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
         notes = (*notes, *_doubt_of_gamma(P, result))
     rate = _rate_note(result, sample_rate_Hz)
     return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
-                   limited_by=bracket.limited_by, notes=(*notes, *result.notes, *rate))
+                   limited_by=bracket.limited_by, notes=(*notes, *doubt, *result.notes, *rate))
 
 
 def hinf_controller(P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None,
@@ -210,18 +211,18 @@ class _Problem:
         """Normal form, regularised as requested, with a note about the regularisation."""
         if not (of_D12 or of_D21 or of_states):
             return normal_form(self.plant), ()
-        said = []
+        reasons = []
         if of_D12:
-            said.append(f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised "
+            reasons.append(f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised "
                         "at infinite frequency")
         if of_D21:
-            said.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is noisy "
+            reasons.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is noisy "
                         "at infinite frequency")
         if of_states:
-            said.append("a zero of u -> z or w -> y lies on, or too near, the imaginary axis or infinity")
+            reasons.append("a zero of u -> z or w -> y lies on, or too near, the imaginary axis or infinity")
         extra = f"; extra channels of relative size {epsilon:.0e} were added for the synthesis alone"
         plant = regularised(self.plant, epsilon, of_D12, of_D21, of_states)
-        return normal_form(plant), ("; ".join(said) + extra,)
+        return normal_form(plant), ("; ".join(reasons) + extra,)
 
     def solve(self, tolerance: float, hint: float | None,
               proved: bool = True) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
@@ -278,8 +279,8 @@ class _Problem:
             if best is None or result.gamma < best.gamma:
                 best = result
             if result.gamma <= target * (1 + 1e-5):
-                said = f"the back-off was raised from {100 * backoff:.3g} % to {100 * margin:.3g} %" if k else ""
-                return self._slower(form, result, gamma, target) if slow else result, said
+                note = f"the back-off was raised from {100 * backoff:.3g} % to {100 * margin:.3g} %" if k else ""
+                return self._slower(form, result, gamma, target) if slow else result, note
         if best is None or not np.isfinite(best.gamma):
             raise ComputationError("no controller's closed loop was measured to be stable",
                                    measured=f"gamma from {gamma:.4g} upwards tried",
@@ -292,8 +293,8 @@ class _Problem:
         plant_fastest = float(np.max(np.abs(la.eigvals(self.plant.A)), initial=0.0))
         if not result.fastest_pole > SETTINGS.far_beyond * plant_fastest > 0:
             return result
-        for share in SETTINGS.closer:
-            test = gamma_test(form.plant, gamma + share * (target - gamma))
+        for fraction in SETTINGS.closer:
+            test = gamma_test(form.plant, gamma + fraction * (target - gamma))
             if not test.feasible:
                 continue
             try:
@@ -302,10 +303,10 @@ class _Problem:
             except (ComputationError, np.linalg.LinAlgError):
                 continue
             if found.gamma <= target * (1 + SETTINGS.loop_accuracy) and found.fastest_pole < result.fastest_pole:
-                said = (f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
+                note = (f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
                         f"{plant_fastest:.3g}: those far beyond it were replaced by their gain, the fastest left has "
                         f"{found.fastest_pole:.3g}, and all figures are of that controller")
-                return replace(found, notes=(said,))
+                return replace(found, notes=(note,))
         return result
 
     def measured(self, K: StateSpace) -> Synthesis:

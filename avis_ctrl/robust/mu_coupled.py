@@ -12,7 +12,7 @@ import numpy as np
 
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array
-from avis_ctrl.uncertainty.blocks import BlockStructure
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def coupled(N: StateSpace, structure: BlockStructure) -> Coupled:
     return Coupled(rest, left, structure, w, z)
 
 
-def _places(places: list, kept: Array, structure: BlockStructure) -> tuple[Array, Array]:
+def _places(places: list[tuple[Block, slice, slice]], kept: Array, structure: BlockStructure) -> tuple[Array, Array]:
     w, z = np.zeros(structure.n_w, bool), np.zeros(structure.n_z, bool)
     for (_, iw, iz), keep in zip(places, kept, strict=True):
         w[iw] = z[iz] = keep

@@ -24,8 +24,8 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.lti import StateSpace
-from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
-from avis_ctrl.robust.mu_upper import enough
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual
+from avis_ctrl.robust.mu_upper import bound_for_goal
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Interval = tuple[float, float]
@@ -42,7 +42,7 @@ def midpoint(low: float, high: float) -> float:
     return 2 * low if np.isinf(high) else float(np.sqrt(low) * np.sqrt(high))
 
 
-def possible_crossings(N: StateSpace, scalings: Scalings) -> Array:
+def possible_crossings(N: StateSpace, scalings: LmiScalings) -> Array:
     """Sorted superset of the frequencies [rad/s] >= 0 where Phi is singular. The scalings have no batch axis."""
     if not N.nstates:
         return np.zeros(0)
@@ -67,17 +67,17 @@ def possible_crossings(N: StateSpace, scalings: Scalings) -> Array:
     return np.unique(np.abs(values.imag[near & (values.imag >= -1e-10 * size)]))
 
 
-def _positive(N: StateSpace, scalings: Scalings, omega: Array) -> Array:
+def _positive(N: StateSpace, scalings: LmiScalings, omega: Array) -> Array:
     """Whether Phi(omega) > 0 at each frequency, with a round-off margin."""
     M = N.frequency_response(omega)[:, None]
-    repeated = Scalings(*(np.broadcast_to(s, (omega.size, *s.shape)) for s in scalings))
+    repeated = LmiScalings(*(np.broadcast_to(s, (omega.size, *s.shape)) for s in scalings))
     level = np.ones(N.ninputs, bool)
     F = residual(M, repeated, np.ones(omega.size), level)[:, 0]
     root = np.linalg.inv(np.linalg.cholesky(scalings.X_w))
     return np.linalg.eigvalsh(root @ F @ dagger(root))[:, 0] > 1e-10
 
 
-def proved_intervals(N: StateSpace, scalings: Scalings, inside: Interval) -> list[Interval]:
+def proved_intervals(N: StateSpace, scalings: LmiScalings, inside: Interval) -> list[Interval]:
     """Closed parts of an interval on which Phi > 0 with the given scalings."""
     low, high = inside
     crossings = possible_crossings(N, scalings)
@@ -155,14 +155,14 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
     gaps, state.gaps = state.gaps, []
     omega = np.array([_points(*gap) for gap in gaps])
     M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
-    shared = enough(M, structure, accuracy_of(slack), 1.0)
+    shared = bound_for_goal(M, structure, accuracy_of(slack), 1.0)
     open_gaps = []
     for k, gap in enumerate(gaps):
         if shared.beta[k] >= 1.0:
             open_gaps.append(gap)
             continue
         state.intervals += 1
-        proved = proved_intervals(unit, Scalings(*(s[k] for s in shared.scalings)), gap)
+        proved = proved_intervals(unit, LmiScalings(*(s[k] for s in shared.scalings)), gap)
         state.gaps += _without(gap, proved)
     if open_gaps:
         _split_or_raise(N, unit, structure, bound, state, open_gaps, slack)
@@ -175,7 +175,7 @@ def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, 
     unit : N scaled so that the level is one.
     """
     middles = np.array([midpoint(*gap) for gap in open_gaps])
-    at_one = enough(unit.frequency_response(middles)[:, None], structure, accuracy_of(slack), 1.0).beta
+    at_one = bound_for_goal(unit.frequency_response(middles)[:, None], structure, accuracy_of(slack), 1.0).beta
     above = middles[at_one >= 1.0]
     needed = bound(N.frequency_response(above)[:, None]) if above.size else above
     narrow = [gap for gap in open_gaps if _is_narrow(gap)]

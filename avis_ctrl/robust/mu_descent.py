@@ -24,7 +24,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, lft_lower
-from avis_ctrl.robust.controller_entries import Entries
+from avis_ctrl.robust.controller_entries import ControllerEntries
 from avis_ctrl.robust.frequency_grid import frequency_grid, merged, resonances
 from avis_ctrl.robust.mu_lmi import Array, dagger, residual
 from avis_ctrl.robust.mu_scan import refine_maxima
@@ -129,7 +129,7 @@ class Task:
         """The best of K and the controllers after each stage of descent from K."""
         best, omega = self.measured(K)
         for sharpness in stages:
-            form = Entries.of(K, self.decentralised)
+            form = ControllerEntries.of(K, self.decentralised)
             K = form.controller(_bfgs(Objective(self, form, omega, sharpness).value, form.start, self.settings))
             step, omega = self.measured(K, omega)
             best = min(best, step, key=lambda one: one.peak)
@@ -153,7 +153,7 @@ class Objective:
     with its slope."""
 
     task: Task
-    form: Entries
+    form: ControllerEntries
     omega: Array
     sharpness: float
 

@@ -13,9 +13,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from avis_ctrl.robust.mu_kernel import Array, PathSettings, factor, invert
+
 
 @njit(cache=True)
-def _level_matrix(M, p_z, p_w, F):
+def _level_matrix(M: Array, p_z: Array, p_w: Array, F: Array) -> None:
     """F = diag(p_w) - M^H diag(p_z) M, lower triangle."""
     n_z, n_w = M.shape
     for i in range(n_w):
@@ -30,40 +32,7 @@ def _level_matrix(M, p_z, p_w, F):
 
 
 @njit(cache=True)
-def _factor(F):
-    """Lower Cholesky factor in place of F; False if F is not positive definite."""
-    n = F.shape[0]
-    for j in range(n):
-        total = F[j, j].real
-        for k in range(j):
-            total -= F[j, k].real ** 2 + F[j, k].imag ** 2
-        if not total > 0.0:
-            return False
-        root = np.sqrt(total)
-        F[j, j] = root
-        for i in range(j + 1, n):
-            s = F[i, j]
-            for k in range(j):
-                s -= F[i, k] * np.conj(F[j, k])
-            F[i, j] = s / root
-    return True
-
-
-@njit(cache=True)
-def _invert(L):
-    """Inverse of L in place of the lower factor L."""
-    n = L.shape[0]
-    for j in range(n):
-        L[j, j] = 1.0 / L[j, j].real
-        for i in range(j + 1, n):
-            s = 0j
-            for k in range(j, i):
-                s -= L[i, k] * L[k, j]
-            L[i, j] = s / L[i, i].real
-
-
-@njit(cache=True)
-def _add_block_norms(X, rows, cols, weight, out):
+def _add_block_norms(X: Array, rows: Array, cols: Array, weight: float, out: Array) -> None:
     """out[rows[i], cols[j]] += weight |X[i, j]|^2."""
     for i in range(X.shape[0]):
         for j in range(X.shape[1]):
@@ -71,7 +40,7 @@ def _add_block_norms(X, rows, cols, weight, out):
 
 
 @njit(cache=True)
-def _solve_positive(H, b):
+def _solve_positive(H: Array, b: Array) -> Array:
     """Solution of H x = b for positive definite H, scaled to unit diagonal, with a small ridge for singular H."""
     n = b.size
     d, A = np.empty(n), np.empty((n, n))
@@ -102,7 +71,8 @@ def _solve_positive(H, b):
 
 
 @njit(cache=True)
-def _derivatives(M, p, lam, of_z, of_w, copies, gradient, slope, hessian, falling):
+def _derivatives(M: Array, p: Array, lam: float, of_z: Array, of_w: Array, copies: Array, gradient: Array,
+                 slope: Array, hessian: Array, falling: Array) -> bool:
     """Gradient, its derivative by lambda, and Hessian of the barrier at (p, lam); False outside its domain.
 
     falling (n_blocks + 1,) : tr(S P_w S dF/dp_k), and tr(S P_w S P_w), for the rate at which F decreases.
@@ -116,9 +86,9 @@ def _derivatives(M, p, lam, of_z, of_w, copies, gradient, slope, hessian, fallin
     falling[n_b] = 0.0
     for s in range(M.shape[0]):
         _level_matrix(M[s], p[of_z], lam * p[of_w], F)
-        if not _factor(F):
+        if not factor(F, 0.0):
             return False
-        _invert(F)
+        invert(F)
         for i in range(n_w):
             for j in range(i + 1, n_w):
                 F[i, j] = 0.0
@@ -145,20 +115,21 @@ def _derivatives(M, p, lam, of_z, of_w, copies, gradient, slope, hessian, fallin
 
 
 @njit(cache=True)
-def _inside(M, p, lam, of_z, of_w, F):
+def _inside(M: Array, p: Array, lam: float, of_z: Array, of_w: Array, F: Array) -> bool:
     """Whether p > 0 and F > 0."""
     for k in range(p.size):
         if not p[k] > 0.0:
             return False
     for s in range(M.shape[0]):
         _level_matrix(M[s], p[of_z], lam * p[of_w], F)
-        if not _factor(F):
+        if not factor(F, 0.0):
             return False
     return True
 
 
 @njit(cache=True)
-def follow_diagonal(M, of_z, of_w, copies, lam, floor, tolerance, settings):
+def follow_diagonal(M: Array, of_z: Array, of_w: Array, copies: Array, lam: Array, floor: Array, tolerance: float,
+                    settings: PathSettings) -> tuple[Array, Array]:
     """Scalings (B, n_blocks) and the levels (B,) that they prove, from p = 1 at lam (B,) to the minimum or `floor`.
 
     M (B, n_shared, n_z, n_w) complex, of_z (n_z,) and of_w (n_w,) the block of each entry, copies (n_blocks,) the
@@ -213,7 +184,7 @@ def follow_diagonal(M, of_z, of_w, copies, lam, floor, tolerance, settings):
 
 
 @njit(cache=True)
-def balanced_squares(norm2, sweeps):
+def balanced_squares(norm2: Array, sweeps: int) -> Array:
     """Squares (B, n) of Osborne's scalings from the squared norms (B, n, n) of the off-diagonal blocks."""
     batch, n = norm2.shape[:2]
     d2 = np.ones((batch, n))
@@ -229,7 +200,7 @@ def balanced_squares(norm2, sweeps):
 
 
 @njit(cache=True)
-def level_squares(norm2, enough2, most):
+def level_squares(norm2: Array, enough2: Array, most: float) -> Array:
     """d2 (B, n) > 0 such that every norm2_kj d2_k / d2_j is at most the largest geometric mean of norm2 (B, n, n)
     around a cycle of blocks, or at most enough2 (B,) if that is larger; 1 if there is no cycle and enough2 is zero.
     The mean does not depend on the units of the signals.

@@ -15,7 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu_lmi import Array, dagger
+from avis_ctrl.robust.mu_lower import aligned
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -49,7 +51,13 @@ def perturbed(M: Array, delta: Array) -> Array:
 
 
 def _gain(M: Array, delta: Array) -> Array:
-    return np.linalg.norm(perturbed(M, delta), ord=2, axis=(-2, -1))
+    """Largest singular values (B,); inf where Delta makes the loop singular."""
+    try:
+        return np.linalg.norm(perturbed(M, delta), ord=2, axis=(-2, -1))
+    except np.linalg.LinAlgError:
+        # One singular matrix ends the computation of the whole stack.
+        return np.array([np.inf]) if len(M) == 1 else np.concatenate(
+            [_gain(M[[k]], delta[[k]]) for k in range(len(M))])
 
 
 def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
@@ -60,25 +68,18 @@ def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
     M11, M12, M21 = M[:, :n_z, :n_w], M[:, :n_z, n_w:], M[:, n_z:, :n_w]
     x = np.linalg.solve(np.eye(n_z) - M11 @ delta, M12 @ v[..., None])[..., 0]
     a = np.linalg.solve(dagger(np.eye(n_w) - delta @ M11), dagger(M21) @ u[..., None])[..., 0]
-    new = np.zeros_like(delta)
-    for block, w, z in structure.slices():
-        ak, xk = a[:, w], x[:, z]
-        if block.kind == "full":
-            size = np.linalg.norm(ak, axis=1) * np.linalg.norm(xk, axis=1)
-            new[:, w, z] = ak[:, :, None] * np.conj(xk[:, None, :]) / np.where(size > 0, size, 1.0)[:, None, None]
-            continue
-        product = np.sum(ak * np.conj(xk), axis=1)
-        if block.kind == "real":
-            value = np.where(product.real >= 0, 1.0, -1.0).astype(complex)
-        else:
-            value = np.where(np.abs(product) > 0, product / np.maximum(np.abs(product), 1e-300), 1.0)
-        new[:, w, z] = value[:, None, None] * np.eye(block.rows)
-    return new
+    return aligned(a, x, structure, lambda product, _: np.where(product >= 0, 1.0, -1.0))
 
 
 def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20,
                seed: int = 0) -> WorstGain:
-    """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step."""
+    """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step.
+
+    The gain is inf if a perturbation of norm 1 that makes the loop singular was met. Raises InputError for an M that is
+    not finite.
+    """
+    if not np.all(np.isfinite(M)):
+        raise InputError("expected finite entries", field="M")
     rng = np.random.default_rng(seed)
     batch = M.shape[0]
     delta = np.zeros((count * batch, structure.n_w, structure.n_z), complex)
@@ -86,11 +87,11 @@ def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iteration
         delta[k] = structure.random(rng)
     repeated = np.concatenate([M] * count)
     gain = _gain(repeated, delta)
-    climbing = np.arange(gain.size)
+    climbing = np.flatnonzero(np.isfinite(gain))
     for _ in range(iterations):
         gained = gain[climbing]
         _climb(repeated, delta, gain, climbing, structure)
-        climbing = climbing[gain[climbing] > gained * (1 + SETTINGS.accuracy)]
+        climbing = climbing[(gain[climbing] > gained * (1 + SETTINGS.accuracy)) & np.isfinite(gain[climbing])]
         if not climbing.size:
             break
     _take_dyads(repeated, delta, gain, structure)
@@ -112,10 +113,11 @@ def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockSt
 def _take_dyads(M: Array, delta: Array, gain: Array, structure: BlockStructure) -> None:
     """Replace full blocks by dyads of the gradient, which they are at a maximum: only dyads can be realised with
     constant norm. In place, if the gain decreases by at most `dyad_loss`."""
-    steepest, dyads = _steepest(M, delta, structure), delta.copy()
+    finite, dyads = np.isfinite(gain), delta.copy()
+    steepest = _steepest(M[finite], delta[finite], structure)
     for block, w, z in structure.slices():
         if block.kind == "full":
-            dyads[:, w, z] = steepest[:, w, z]
+            dyads[finite, w, z] = steepest[:, w, z]
     value = _gain(M, dyads)
-    take = value >= gain * (1 - SETTINGS.dyad_loss)
+    take = finite & (value >= gain * (1 - SETTINGS.dyad_loss))
     delta[take], gain[take] = dyads[take], value[take]

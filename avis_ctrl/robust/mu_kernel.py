@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+Array = np.ndarray
+
 
 class PathSettings(NamedTuple):
     """central : Newton decrement below which a point counts as the analytic centre.
@@ -38,7 +40,7 @@ class PathSettings(NamedTuple):
 SETTINGS = PathSettings()
 
 
-class Entries(NamedTuple):
+class FormEntries(NamedTuple):
     """Non-zero entries of the matrices K_k: indices, value, parameter k, and whether lambda multiplies the entry."""
 
     row: np.ndarray
@@ -50,7 +52,7 @@ class Entries(NamedTuple):
 
 
 @njit(cache=True)
-def _matrix(theta, entries, lam):
+def _matrix(theta: Array, entries: FormEntries, lam: float) -> Array:
     K = np.zeros((entries.size, entries.size), np.complex128)
     for e in range(entries.row.size):
         weight = lam if entries.on_level[e] else 1.0
@@ -59,30 +61,46 @@ def _matrix(theta, entries, lam):
 
 
 @njit(cache=True)
-def _inverse(A):
-    """Inverse of a Hermitian matrix by its Cholesky factor; NaN if it is not positive definite."""
-    n = A.shape[0]
-    L = np.zeros((n, n), np.complex128)
+def factor(F: Array, least: float) -> bool:
+    """Lower Cholesky factor in place of F; False if F is not positive definite: a squared pivot not above `least`."""
+    n = F.shape[0]
     for j in range(n):
-        for i in range(j, n):
-            total = A[i, j]
+        total = F[j, j].real
+        for k in range(j):
+            total -= F[j, k].real ** 2 + F[j, k].imag ** 2
+        if not total > least:
+            return False
+        root = np.sqrt(total)
+        F[j, j] = root
+        for i in range(j + 1, n):
+            s = F[i, j]
             for k in range(j):
-                total -= L[i, k] * np.conj(L[j, k])
-            if i > j:
-                L[i, j] = total / L[j, j].real
-            elif total.real > 0:
-                L[j, j] = np.sqrt(total.real)
-            else:
-                for k in range(n):
-                    L[k, k] = np.nan
-                return L
+                s -= F[i, k] * np.conj(F[j, k])
+            F[i, j] = s / root
+    return True
+
+
+@njit(cache=True)
+def invert(L: Array) -> None:
+    """Inverse of L in place of the lower factor L."""
+    n = L.shape[0]
     for j in range(n):
         L[j, j] = 1.0 / L[j, j].real
         for i in range(j + 1, n):
-            total = 0j
+            s = 0j
             for k in range(j, i):
-                total -= L[i, k] * L[k, j]
-            L[i, j] = total / L[i, i].real
+                s -= L[i, k] * L[k, j]
+            L[i, j] = s / L[i, i].real
+
+
+@njit(cache=True)
+def _inverse(A: Array) -> Array:
+    """Inverse of a Hermitian matrix by its Cholesky factor; NaN if it is not positive definite."""
+    n = A.shape[0]
+    L = A.copy()
+    if not factor(L, 0.0):
+        return np.full((n, n), np.nan + 0j)
+    invert(L)
     S = np.zeros((n, n), np.complex128)
     for i in range(n):
         for j in range(i + 1):
@@ -95,7 +113,7 @@ def _inverse(A):
 
 
 @njit(cache=True)
-def _residual(M, K):
+def _residual(M: Array, K: Array) -> Array:
     """F = V K V^H for M (n_z, n_w), as (K_ww + K_wz M) + M^H (K_zw + K_zz M)."""
     n_w = M.shape[1]
     lower = np.dot(K[n_w:, n_w:].copy(), M) + K[n_w:, :n_w]
@@ -106,7 +124,7 @@ def _residual(M, K):
 
 
 @njit(cache=True)
-def _add_derivatives(T, entries, lam, gradient, hessian):
+def _add_derivatives(T: Array, entries: FormEntries, lam: float, gradient: Array, hessian: Array) -> None:
     """Subtract tr(T K_k) from the gradient and add tr(T K_k T K_l), l <= k, to the Hessian's lower triangle.
 
     The entries are sorted by parameter. All matrices are Hermitian, so that only entries on and above the diagonal of
@@ -131,7 +149,7 @@ def _add_derivatives(T, entries, lam, gradient, hessian):
 
 
 @njit(cache=True)
-def _gram(M, S):
+def _gram(M: Array, S: Array) -> Array:
     """T = V^H inv(F) V = [S, S M^H; M S, M S M^H] for S = inv(F)."""
     n_z, n_w = M.shape
     T = np.empty((n_w + n_z, n_w + n_z), np.complex128)
@@ -142,7 +160,7 @@ def _gram(M, S):
 
 
 @njit(cache=True)
-def _add_slope(T, K, entries, lam, slope):
+def _add_slope(T: Array, K: Array, entries: FormEntries, lam: float, slope: Array) -> None:
     """Derivative of the gradient by lambda, from dT = -T Xp T with Xp = dK / d lambda, and from entries with lambda."""
     n = entries.size
     W = np.zeros((n, n), np.complex128)
@@ -163,7 +181,7 @@ def _add_slope(T, K, entries, lam, slope):
 
 
 @njit(cache=True)
-def _newton(hessian, right, is_g):
+def _newton(hessian: Array, right: Array, is_g: Array) -> Array:
     """-inv(hessian) right, with unit-diagonal scaling and ridges of round-off size for singular cases. Only the lower
     triangle of the Hessian is read. NaN if it is not finite or has no inverse.
 
@@ -189,7 +207,8 @@ def _newton(hessian, right, is_g):
 
 
 @njit(cache=True)
-def _to_centre(M, x, lam, form, core, trace, is_g, settings):
+def _to_centre(M: Array, x: Array, lam: float, form: FormEntries, core: FormEntries, trace: Array, is_g: Array,
+               settings: PathSettings) -> Array:
     """Move x (p,) to the analytic centre at lam and return d x / d lambda, the direction of the path of centres.
 
     The centre minimises trace x - log det F - log det X, with an F for every matrix of M (n_shared, n_z, n_w). NaN on
@@ -219,30 +238,16 @@ def _to_centre(M, x, lam, form, core, trace, is_g, settings):
 
 
 @njit(cache=True)
-def _positive(A):
+def _positive(A: Array) -> bool:
     """Whether a Hermitian matrix is positive definite, with a round-off margin; overwrites its lower triangle."""
-    n = A.shape[0]
     least = 0.0
-    for i in range(n):
+    for i in range(A.shape[0]):
         least = max(least, 1e-14 * A[i, i].real)
-    for j in range(n):
-        total = A[j, j].real
-        for k in range(j):
-            total -= A[j, k].real ** 2 + A[j, k].imag ** 2
-        if not total > least:
-            return False
-        root = np.sqrt(total)
-        A[j, j] = root
-        for i in range(j + 1, n):
-            value = A[i, j]
-            for k in range(j):
-                value -= A[i, k] * np.conj(A[j, k])
-            A[i, j] = value / root
-    return True
+    return factor(A, least)
 
 
 @njit(cache=True)
-def _inside(M, x, lam, form, core):
+def _inside(M: Array, x: Array, lam: float, form: FormEntries, core: FormEntries) -> bool:
     """Whether F > 0 and X > 0."""
     if not np.all(np.isfinite(x)) or not np.isfinite(_inverse(_matrix(x, core, 1.0))[0, 0].real):
         return False
@@ -253,7 +258,7 @@ def _inside(M, x, lam, form, core):
 
 
 @njit(cache=True)
-def _speed(M, x, lam, direction, form, core):
+def _speed(M: Array, x: Array, lam: float, direction: Array, form: FormEntries, core: FormEntries) -> float:
     """Frobenius norm of d (F, X) / d lambda along the path, in the metric of F and X. It is an upper bound of the
     largest eigenvalue, whose inverse is the distance to the boundary."""
     K, moved = _matrix(x, form, lam), _matrix(direction, form, lam)
@@ -269,7 +274,8 @@ def _speed(M, x, lam, direction, form, core):
 
 
 @njit(cache=True)
-def follow_path(M, theta, lam, floor, form, core, trace, is_g, tolerance, settings):
+def follow_path(M: Array, theta: Array, lam: Array, floor: Array, form: FormEntries, core: FormEntries, trace: Array,
+                is_g: Array, tolerance: float, settings: PathSettings) -> None:
     """Move scalings theta (B, p) and levels lam (B,) in place along the path of centres down to the minimum level or to
     `floor` (B,); each pair remains feasible.
 

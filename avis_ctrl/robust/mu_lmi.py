@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.robust.mu_kernel import SETTINGS, Entries, follow_path
+from avis_ctrl.robust.mu_kernel import SETTINGS, FormEntries, follow_path
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Array = np.ndarray
 
 
-class Scalings(NamedTuple):
+class LmiScalings(NamedTuple):
     """X_z (B, n_z, n_z), X_w (B, n_w, n_w), G (B, n_w, n_z): one set per problem of a batch."""
 
     X_z: Array
@@ -57,9 +57,9 @@ class LinearForm:
         flat = T.reshape(T.shape[0], -1)
         return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
 
-    def entries(self, on_level: Array) -> Entries:
+    def entries(self, on_level: Array) -> FormEntries:
         """The entries in the form of the compiled code; `on_level` marks the entries multiplied by lambda."""
-        return Entries(self.row, self.col, self.value, self.parameter, on_level, self.size)
+        return FormEntries(self.row, self.col, self.value, self.parameter, on_level, self.size)
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class ScalingSpace:
 
     @staticmethod
     def of(structure: BlockStructure, level: Array | None = None) -> ScalingSpace:
+        """Scalings of a structure; level (n_w,) : the columns that lambda multiplies, all by default."""
         n_w, n_z = structure.n_w, structure.n_z
         level = np.ones(n_w, bool) if level is None else np.asarray(level, bool)
         form: list[tuple[int, int, complex, int]] = []
@@ -109,12 +110,13 @@ class ScalingSpace:
         in_core = np.any(kcore.incidence > 0, axis=1)
         return ScalingSpace(structure, level, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0], ~in_core)
 
-    def scalings(self, theta: Array) -> Scalings:
+    def scalings(self, theta: Array) -> LmiScalings:
+        """Matrices of the parameters theta (B, p)."""
         n_w = self.structure.n_w
         K = self.form.matrix(theta)
-        return Scalings(-K[:, n_w:, n_w:], K[:, :n_w, :n_w], 1j * K[:, :n_w, n_w:])
+        return LmiScalings(-K[:, n_w:, n_w:], K[:, :n_w, :n_w], 1j * K[:, :n_w, n_w:])
 
-    def theta(self, scalings: Scalings) -> Array:
+    def theta(self, scalings: LmiScalings) -> Array:
         """Coordinates of scalings that have the structure (inverse of `scalings`)."""
         K = np.zeros((scalings.X_w.shape[0], self.form.size, self.form.size), complex)
         n_w = self.structure.n_w
@@ -126,7 +128,7 @@ class ScalingSpace:
     def identity(self, batch: int) -> Array:
         """theta of X = I, G = 0."""
         n_w, n_z = self.structure.n_w, self.structure.n_z
-        one = self.theta(Scalings(np.eye(n_z)[None], np.eye(n_w)[None], np.zeros((1, n_w, n_z))))
+        one = self.theta(LmiScalings(np.eye(n_z)[None], np.eye(n_w)[None], np.zeros((1, n_w, n_z))))
         return np.repeat(one, batch, axis=0)
 
 
@@ -139,10 +141,11 @@ def _hermitian_basis(n: int) -> list[list[tuple[int, int, complex]]]:
 
 
 def dagger(A: Array) -> Array:
+    """Conjugate transpose of each matrix."""
     return np.conj(np.swapaxes(A, -1, -2))
 
 
-def residual(M: Array, scalings: Scalings, lam: Array, level: Array) -> Array:
+def residual(M: Array, scalings: LmiScalings, lam: Array, level: Array) -> Array:
     """F (B, n_shared, n_w, n_w) for M (B, n_shared, n_z, n_w), lam (B,): positive definite if the bound is proved."""
     Mh = dagger(M)
     GM = scalings.G[:, None] @ M
@@ -151,7 +154,7 @@ def residual(M: Array, scalings: Scalings, lam: Array, level: Array) -> Array:
     return (F + dagger(F)) / 2
 
 
-def least_level(M: Array, scalings: Scalings, level: Array) -> Array:
+def least_level(M: Array, scalings: LmiScalings, level: Array) -> Array:
     """Minimum lambda (B,) for which the scalings make F >= 0, by an eigenvalue computation; inf if there is none."""
     F = residual(M, scalings, np.zeros(M.shape[0]), level)
     p, r = np.flatnonzero(level), np.flatnonzero(~level)

@@ -17,13 +17,14 @@ det(I - M Delta) = 0 with minimum ||Delta||. The initial Delta come from the nul
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from avis_ctrl.lti import StateSpace
-from avis_ctrl.robust.mu_lmi import Array, Scalings, dagger, residual
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual
 from avis_ctrl.robust.mu_power_kernel import FULL, search_complex
 from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -231,7 +232,7 @@ def _complex_part(structure: BlockStructure) -> Array:
     return mask
 
 
-def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
+def scaled_to_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
     """Delta with its complex blocks multiplied by a common complex factor so that I - M Delta is exactly singular.
 
     Without complex blocks, the real blocks are scaled (exact at frequencies where M Delta has a real eigenvalue).
@@ -256,14 +257,14 @@ def made_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
         return real + factor[:, None, None] * rest
 
 
-def starts(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
+def starts(M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int,
            rng: np.random.Generator) -> Array:
     """Initial perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
-    return np.stack([_aligned(w, (M @ w[..., None])[..., 0], structure) / beta[:, None, None]
+    return np.stack([aligned(w, (M @ w[..., None])[..., 0], structure, _least_squares) / beta[:, None, None]
                      for w in null_vectors(M, scalings, beta, structure, count, rng)])
 
 
-def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStructure, count: int,
+def null_vectors(M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int,
                  rng: np.random.Generator) -> Array:
     """Approximate null vectors w (count, B, n_w) of the upper bound's LMI: the best three, then random mixtures."""
     batch = M.shape[0]
@@ -280,8 +281,15 @@ def null_vectors(M: Array, scalings: Scalings, beta: Array, structure: BlockStru
     return np.stack(made)
 
 
-def _aligned(w: Array, z: Array, structure: BlockStructure) -> Array:
-    """Delta of norm 1 that best satisfies w = Delta z, block by block."""
+def _least_squares(product: Array, square: Array) -> Array:
+    return np.clip(product / np.maximum(square, 1e-300), -1, 1)
+
+
+def aligned(w: Array, z: Array, structure: BlockStructure, real: Callable[[Array, Array], Array]) -> Array:
+    """Delta of norm 1 that best satisfies w = Delta z, block by block.
+
+    real : value of a real block in -1..1, a function of Re(z^H w) and |z|^2.
+    """
     delta = np.zeros((w.shape[0], structure.n_w, structure.n_z), complex)
     for block, iw, iz in structure.slices():
         wk, zk = w[:, iw], z[:, iz]
@@ -291,22 +299,22 @@ def _aligned(w: Array, z: Array, structure: BlockStructure) -> Array:
             continue
         product = np.sum(np.conj(zk) * wk, axis=1)
         if block.kind == "real":
-            value = np.clip(product.real / np.maximum(np.sum(np.abs(zk) ** 2, axis=1), 1e-300), -1, 1).astype(complex)
+            value = real(product.real, np.sum(np.abs(zk) ** 2, axis=1))
         else:
             value = np.where(np.abs(product) > 0, product / np.maximum(np.abs(product), 1e-300), 1.0)
         delta[:, iw, iz] = value[:, None, None] * np.eye(block.rows)
     return delta
 
 
-class LowerBound(NamedTuple):
+class MuLowerBound(NamedTuple):
     """beta (B,) with delta (B, n_w, n_z): ||delta|| = 1/beta and I - M delta singular; beta = 0, delta = 0 if none."""
 
     beta: Array
     delta: Array
 
 
-def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, *, enough: float = 0.99,
-                stages: int = 3, seed: int = 0) -> LowerBound:
+def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: LmiScalings, *, enough: float = 0.99,
+                stages: int = 3, seed: int = 0) -> MuLowerBound:
     """Best verified perturbation for each M (B, n_z, n_w), starting from the null vectors of the upper bound's LMI.
 
     If the first three starts do not reach `enough` times the upper bound, further `stages` use more starts, the last
@@ -318,7 +326,7 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Sca
     d_z, d_w = expand(structure, block_balance(M[:, None], structure))
     M = M * d_z[:, :, None] / d_w[:, None, :]
     scalings = rescaled(scalings, 1 / d_z, 1 / d_w, np.ones(batch))
-    best = LowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
+    best = MuLowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
     # An upper bound at the level of the round-off of M means mu = 0: no search.
     above_noise = upper > 1e-10 * np.linalg.norm(M, ord=2, axis=(1, 2))
     if all(block.kind != "real" for block in structure.blocks):
@@ -335,12 +343,12 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Sca
     return best
 
 
-def _search_complex(best: LowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: Scalings,
+def _search_complex(best: MuLowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: LmiScalings,
                     live: Array, enough: float, count: int, rng: np.random.Generator) -> None:
     """The compiled search, for structures without real blocks."""
     size = upper[live]
     unit = M[live] / size[:, None, None]
-    part = Scalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live])
+    part = LmiScalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live])
     first = null_vectors(unit, part, np.ones(live.size), structure, count, rng)
     kinds = np.array([FULL if block.kind == "full" else 0 for block in structure.blocks])
     w, z = (np.cumsum([0, *sizes]) for sizes in zip(*((b.rows, b.cols) for b in structure.blocks), strict=True))
@@ -353,11 +361,11 @@ def _search_complex(best: LowerBound, M: Array, structure: BlockStructure, upper
     _keep(best, live, size, unit, np.where((further > value)[:, None, None], settled, found), structure)
 
 
-def _search(best: LowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: Scalings, live: Array,
+def _search(best: MuLowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: LmiScalings, live: Array,
             count: int, iterations: int, damping: float, rng: np.random.Generator) -> None:
     size = upper[live]
     unit = M[live] / size[:, None, None]
-    part = Scalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live] / size[:, None, None])
+    part = LmiScalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live] / size[:, None, None])
     near = np.ones(live.size, complex)
     for delta in starts(unit, part, np.ones(live.size), structure, count, rng):
         for sweep in range(iterations):
@@ -367,10 +375,10 @@ def _search(best: LowerBound, M: Array, structure: BlockStructure, upper: Array,
                 _keep(best, live, size, unit, new, structure)
 
 
-def _keep(best: LowerBound, live: Array, size: Array, unit: Array, delta: Array,
+def _keep(best: MuLowerBound, live: Array, size: Array, unit: Array, delta: Array,
           structure: BlockStructure) -> None:
     """Update `best` with perturbations that are verified and better."""
-    exact = made_singular(unit, delta, structure)
+    exact = scaled_to_singular(unit, delta, structure)
     for candidate in (exact, delta) if not np.any(_complex_part(structure)) else (exact,):
         finite = np.all(np.isfinite(candidate), axis=(1, 2))
         candidate = np.where(finite[:, None, None], candidate, 0.0)
@@ -405,7 +413,7 @@ def singular_frequency(N: StateSpace, structure: BlockStructure, near: Array, le
         if sweep % 5 != 4:
             continue
         M, _ = _response_and_slope(N, omega)
-        exact = made_singular(M, delta, structure) if np.any(_complex_part(structure)) else delta
+        exact = scaled_to_singular(M, delta, structure) if np.any(_complex_part(structure)) else delta
         usable = np.flatnonzero(np.all(np.isfinite(exact), axis=(1, 2)))
         usable = usable[block_norm(exact[usable], structure) > 0]
         usable = usable[is_singular(M[usable], exact[usable], structure)]

@@ -19,13 +19,14 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
+from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, cover
 from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
 from avis_ctrl.robust.mu_lmi import Array
-from avis_ctrl.robust.mu_lower import SETTINGS, LowerBound, lower_bound, singular_frequency
+from avis_ctrl.robust.mu_lower import SETTINGS, MuLowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
-from avis_ctrl.robust.mu_upper import UpperBound, highest, skewed_upper_bound, upper_bound
+from avis_ctrl.robust.mu_upper import UpperBound, bound_of_peak, skewed_upper_bound, upper_bound
 from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
@@ -76,15 +77,20 @@ class Stability(Protocol):
     """Bounds of mu of the blocks without performance: a `MuPeak`, or the part of it that a caller keeps."""
 
     @property
-    def upper(self) -> float: ...
+    def upper(self) -> float:
+        """Upper bound of mu."""
     @property
-    def lower(self) -> float: ...
+    def lower(self) -> float:
+        """Lower bound of mu."""
     @property
-    def omega(self) -> float: ...
+    def omega(self) -> float:
+        """Frequency [rad/s] of the lower bound."""
     @property
-    def guaranteed(self) -> bool: ...
+    def guaranteed(self) -> bool:
+        """Whether the upper bound holds at all frequencies."""
     @property
-    def delta(self) -> Array | None: ...
+    def delta(self) -> Array | None:
+        """Perturbation that attains the lower bound."""
 
 
 # Result of a search at some frequencies: bounds with their proofs.
@@ -189,7 +195,7 @@ def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
     """N as a stable system of this package, and its blocks."""
     if not 1e-5 <= slack <= 0.1:
         raise InputError("expected 1e-5 to 0.1", field="slack", value=slack)
-    N = N if isinstance(N, StateSpace) else StateSpace.from_control(N)
+    N = as_system(N, "N")
     if not N.is_stable():
         poles = N.poles()
         worst = poles[np.argmax(np.abs(poles) if N.dt else poles.real)]
@@ -232,7 +238,7 @@ class _Scan:
 
     @staticmethod
     def of(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> _Scan:
-        omega, found = _searched(N, band, slack, lambda M: highest(M[:, None], structure, accuracy_of(slack)))
+        omega, found = _searched(N, band, slack, lambda M: bound_of_peak(M[:, None], structure, accuracy_of(slack)))
         order = np.argsort(omega)
         return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
 
@@ -310,7 +316,7 @@ def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, band: Inte
                  lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
 
 
-def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: LowerBound,
+def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: MuLowerBound,
                    done: Cover, band: Interval) -> tuple[float, float, Array | None]:
     """Largest verified lower bound: thorough search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))

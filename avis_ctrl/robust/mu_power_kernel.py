@@ -10,11 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from avis_ctrl.robust.mu_kernel import Array
+
 FULL = 1
 
 
 @njit(cache=True)
-def _factor(A, pivot):
+def _factor(A: Array, pivot: Array) -> None:
     """LU factors in place of A with row pivoting; a vanishing pivot is replaced by 1e-15."""
     n = A.shape[0]
     for k in range(n):
@@ -37,7 +39,7 @@ def _factor(A, pivot):
 
 
 @njit(cache=True)
-def _solve(A, pivot, x):
+def _solve(A: Array, pivot: Array, x: Array) -> None:
     """x = inv(A) x from the LU factors, normalised to unit length."""
     n = x.size
     for k in range(n):
@@ -54,7 +56,7 @@ def _solve(A, pivot, x):
 
 
 @njit(cache=True)
-def _solve_adjoint(A, pivot, y):
+def _solve_adjoint(A: Array, pivot: Array, y: Array) -> None:
     """y = inv(A^H) y from the LU factors of A, normalised to unit length."""
     n = y.size
     for i in range(n):
@@ -71,14 +73,14 @@ def _solve_adjoint(A, pivot, y):
 
 
 @njit(cache=True)
-def _unit(x):
+def _unit(x: Array) -> None:
     size = np.sqrt(np.sum(x.real ** 2 + x.imag ** 2))
     if size > 0:
         x /= size
 
 
 @njit(cache=True)
-def _linearised(a, x, e, kinds, w, z, new):
+def _linearised(a: Array, x: Array, e: complex, kinds: Array, w: Array, z: Array, new: Array) -> float:
     """Fill `new` with the Delta of minimum norm k that makes the eigenvalue 1 to first order; return k, inf if none."""
     total = 0.0
     for b in range(kinds.size):
@@ -106,7 +108,7 @@ def _linearised(a, x, e, kinds, w, z, new):
 
 
 @njit(cache=True)
-def _aligned(v, u, kinds, w, z, delta):
+def _aligned(v: Array, u: Array, kinds: Array, w: Array, z: Array, delta: Array) -> None:
     """Fill `delta` with the Delta of norm 1 that best satisfies v = Delta u, block by block."""
     delta[:] = 0.0
     for b in range(kinds.size):
@@ -123,7 +125,8 @@ def _aligned(v, u, kinds, w, z, delta):
 
 
 @njit(cache=True)
-def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled):
+def search_complex(M: Array, starts: Array, kinds: Array, w: Array, z: Array, iterations: int, damping: float,
+                   enough: float, settled: float) -> tuple[Array, Array, Array]:
     """The largest 1/||Delta|| (B,) found, its Delta (B, n_w, n_z) and Delta x (B, n_w), from starts (count, B, n_w).
 
     M (B, n_z, n_w) in units of its upper bound; kinds (n_blocks,) FULL or not; w, z (n_blocks + 1,) first indices of
@@ -156,7 +159,7 @@ def search_complex(M, starts, kinds, w, z, iterations, damping, enough, settled)
                 if abs(e) < 1e-12:
                     e = 1e-12 + 0j
                 # The Rayleigh quotient: Delta divided by it makes I - M Delta singular to second order.
-                quotient = np.vdot(y, np.dot(A, x)) / e
+                quotient = complex(np.vdot(y, np.dot(A, x))) / e
                 if sweep > 0:
                     size = abs(quotient) / norm
                     if size > value[b] and size <= 1.0 + 1e-6 and abs(quotient - 1.0) < 0.1:

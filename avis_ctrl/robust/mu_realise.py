@@ -47,9 +47,7 @@ def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[
         value = complex(delta[w.start, z.start])
         one = gain(value.real) if block.kind == "real" else _all_pass(value, omega)
         parts.append(append(*[one] * block.rows))
-    anonymous = [part.renamed([f"z{k}_{i}" for i in range(part.ninputs)], [f"w{k}_{i}" for i in range(part.noutputs)])
-                 for k, part in enumerate(_unique(parts))]
-    whole = append(*anonymous)
+    whole = append(*_unique(parts, "z", "w"))
     return sampled_image(whole, dt) if dt else whole
 
 
@@ -85,7 +83,7 @@ def _rank_one(value: Array, omega: float) -> StateSpace:
     return (spread @ collect).scaled(left=float(sigma[0]))
 
 
-def _unique(parts: list[StateSpace]) -> list[StateSpace]:
+def _unique(parts: list[StateSpace], into: str = "u", out: str = "y") -> list[StateSpace]:
     """The same systems with distinct signal names."""
-    return [part.renamed([f"u{k}_{i}" for i in range(part.ninputs)], [f"y{k}_{i}" for i in range(part.noutputs)])
-            for k, part in enumerate(parts)]
+    return [part.renamed([f"{into}{k}_{i}" for i in range(part.ninputs)],
+                         [f"{out}{k}_{i}" for i in range(part.noutputs)]) for k, part in enumerate(parts)]

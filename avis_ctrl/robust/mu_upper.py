@@ -14,7 +14,7 @@ import numpy as np
 
 from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal, level_squares
 from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
-from avis_ctrl.robust.mu_lmi import Array, Scalings, ScalingSpace, dagger, follow, least_level, residual
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, ScalingSpace, dagger, follow, least_level, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -41,17 +41,17 @@ class UpperBound(NamedTuple):
     """beta (B,) and the scalings that prove it."""
 
     beta: Array
-    scalings: Scalings
+    scalings: LmiScalings
 
     def at(self, which: Array) -> UpperBound:
         """Part of the batch, by index."""
-        return UpperBound(self.beta[which], Scalings(*(one[which] for one in self.scalings)))
+        return UpperBound(self.beta[which], LmiScalings(*(one[which] for one in self.scalings)))
 
     @staticmethod
     def joined(parts: Sequence[UpperBound]) -> UpperBound:
         """Concatenate several batches."""
         return UpperBound(np.concatenate([part.beta for part in parts]),
-                          Scalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts),
+                          LmiScalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts),
                                                                         strict=True))))
 
 
@@ -80,9 +80,9 @@ def expand(structure: BlockStructure, d: Array) -> tuple[Array, Array]:
             np.repeat(d, [b.rows for b in structure.blocks], axis=1))
 
 
-def rescaled(scalings: Scalings, d_z: Array, d_w: Array, size: Array) -> Scalings:
+def rescaled(scalings: LmiScalings, d_z: Array, d_w: Array, size: Array) -> LmiScalings:
     """Convert scalings of diag(d_z) M / diag(d_w) / size to scalings of M."""
-    return Scalings(d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
+    return LmiScalings(d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
                     d_w[:, :, None] * scalings.X_w * d_w[:, None, :],
                     size[:, None, None] * d_w[:, :, None] * scalings.G * d_z[:, None, :])
 
@@ -104,7 +104,7 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, go
                                            None if start is None else start.at(part)) for part in parts])
 
 
-def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
+def bound_for_goal(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
     """`upper_bound` with a goal > 0; with many blocks, full scalings only if one number per block misses the goal."""
     if not structure.many:
         return upper_bound(M, structure, tolerance, goal)
@@ -114,7 +114,7 @@ def enough(M: Array, structure: BlockStructure, tolerance: float, goal: float) -
     return found
 
 
-def highest(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound:
+def bound_of_peak(M: Array, structure: BlockStructure, tolerance: float) -> UpperBound:
     """`upper_bound`; with many blocks, full scalings only for the matrices that can determine the largest bound."""
     if not structure.many:
         return upper_bound(M, structure, tolerance)
@@ -164,7 +164,7 @@ def _is_diagonal(structure: BlockStructure) -> bool:
     return all(block.kind == "full" or (block.kind == "complex" and block.rows == 1) for block in structure.blocks)
 
 
-def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, tolerance: float) -> Scalings:
+def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, tolerance: float) -> LmiScalings:
     """Scalings of one number per block, by the compiled path; 1 where M is zero (not live)."""
     of_z, of_w = (np.repeat(np.arange(len(structure.blocks)), sizes)
                   for sizes in zip(*((b.cols, b.rows) for b in structure.blocks), strict=True))
@@ -173,7 +173,7 @@ def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, to
         p[live], _ = follow_diagonal(np.ascontiguousarray(M[live]), of_z, of_w, p[0], np.full(live.sum(), 2.0),
                                      floor[live], tolerance / 5, PATH)
     X_z, X_w = (p[:, of, None] * np.eye(of.size, dtype=complex) for of in (of_z, of_w))
-    return Scalings(X_z, X_w, np.zeros((M.shape[0], of_w.size, of_z.size), complex))
+    return LmiScalings(X_z, X_w, np.zeros((M.shape[0], of_w.size, of_z.size), complex))
 
 
 def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5) -> UpperBound:
@@ -194,14 +194,14 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
     beta, (X_z, X_w, G) = _skewed(M * scale[:, None, :, None], structure, robust, tolerance)
     X_z[:, r_z:, r_z:] /= unit[:, None, None] ** 2
     X_w[:, r_w:, r_w:] /= unit[:, None, None] ** 2
-    return UpperBound(unit * beta, Scalings(X_z, X_w, G))
+    return UpperBound(unit * beta, LmiScalings(X_z, X_w, G))
 
 
 def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, tolerance: float) -> UpperBound:
     """`skewed_upper_bound` for a normalised performance channel."""
     batch, r_w, r_z = M.shape[0], robust.n_w, robust.n_z
     beta = np.full(batch, np.inf)
-    found = Scalings(*(np.zeros((batch, *shape), complex) for shape in
+    found = LmiScalings(*(np.zeros((batch, *shape), complex) for shape in
                        ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))))
     inner = upper_bound(M[:, :, :r_z, :r_w], robust, tolerance)
     safe = np.flatnonzero(inner.beta < 1.0 - 1e-9)
@@ -215,7 +215,8 @@ def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, toleran
     return UpperBound(beta, found)
 
 
-def _skewed_from(M: Array, structure: BlockStructure, start: Scalings, tolerance: float) -> tuple[Array, Scalings]:
+def _skewed_from(M: Array, structure: BlockStructure, start: LmiScalings, tolerance: float
+                 ) -> tuple[Array, LmiScalings]:
     """Skewed bound, starting from scalings of the robust blocks that are feasible with a margin at level 1."""
     batch, r_w, r_z = M.shape[0], start.X_w.shape[1], start.X_z.shape[1]
     space = ScalingSpace.of(structure, np.arange(structure.n_w) >= r_w)
@@ -234,7 +235,7 @@ def _skewed_from(M: Array, structure: BlockStructure, start: Scalings, tolerance
                   for _, w, _ in structure.slices()], axis=1)
     d_z, d_w = expand(structure, d)
     unit = M * d_z[:, None, :, None] / d_w[:, None, None, :]
-    theta = space.theta(rescaled(Scalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))
+    theta = space.theta(rescaled(LmiScalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))
     first = np.maximum(least_level(unit, space.scalings(theta), space.level), 1e-300)
     size = np.sqrt(first)
     scaled = unit / np.where(space.level, size[:, None], 1.0)[:, None, None, :]

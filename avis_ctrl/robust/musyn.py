@@ -167,11 +167,13 @@ class DKIteration:
 
     @property
     def best(self) -> Loop:
+        """The loop with the smallest peak of mu."""
         assert self.state.best is not None
         return self.state.best
 
     @property
     def history(self) -> tuple[Iteration, ...]:
+        """The iterations in order."""
         return self.state.history
 
     @cached_property
@@ -258,7 +260,7 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
     return min(candidates, key=lambda pair: pair[1])
 
 
-def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, said: tuple[str, ...]) -> MuSynthesis:
+def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, given_notes: tuple[str, ...]) -> MuSynthesis:
     """The controller in the time domain of P, with mu recomputed on its loop with P as given."""
     P, problem, uncertainty, state = made.P, made.problem, made.uncertainty, made.state
     K = sampled_image(best.K, P.dt) if P.dt else best.K
@@ -270,7 +272,7 @@ def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, said: t
     mu_upper = min(peak.upper, gamma)
     complex_upper = gamma if has_real else mu_upper
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
-    notes = [*said]
+    notes = [*given_notes]
     if has_real:
         notes.append(f"the synthesis treats real blocks as complex: peak mu {complex_upper:.4g} with complex "
                      f"blocks, {mu_upper:.4g} with real ones")

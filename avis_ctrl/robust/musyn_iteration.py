@@ -25,7 +25,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
 from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_steps, equal_order_fits
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
-from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, grown
+from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, with_added_pairs
 from avis_ctrl.robust.hinfsyn import Synthesis, hinf_controller
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn_state import DONE, GIVEN, HINF, NOMINAL, Iteration, Loop, State, analysed
@@ -266,7 +266,7 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
     band = band_of(state.points.omega)
     start = min(state.last, state.path, key=lambda loop: loop.gamma).scalings
     if state.phase == "growth":
-        larger = grown(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
+        larger = with_added_pairs(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
         if larger is None:
             return
         start = larger

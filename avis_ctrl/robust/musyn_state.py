@@ -57,6 +57,7 @@ class Loop:
     mu: float
 
     def as_dict(self) -> dict[str, Any]:
+        """Content for a JSON file."""
         return {"K": {key: getattr(self.K, key).tolist() for key in "ABCD"}, "scalings": self.scalings.as_dicts(),
                 "gamma": self.gamma, "mu": self.mu}
 

@@ -88,7 +88,7 @@ def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], flo
     full = float(figure(K))
     allowed = (1 + growth) * full if limit is None else limit
     stable, unstable = split_stable(K)
-    choices = [k for k in sorted(orders or range(K.nstates)) if unstable.nstates <= k < K.nstates]
+    choices = [k for k in sorted(range(K.nstates) if orders is None else orders) if unstable.nstates <= k < K.nstates]
     tried: list[tuple[int, float]] = [(K.nstates, full)]
     best, value, failed, passed = K, full, -1, len(choices)
     while passed - failed > 1:

@@ -59,6 +59,7 @@ class ScalarScaling:
 
     @property
     def order(self) -> int:
+        """Number of poles, and of zeros."""
         return (self.theta.size - 1) // 2
 
     @property
@@ -72,10 +73,12 @@ class ScalarScaling:
 
     @property
     def zeros(self) -> np.ndarray:
+        """Zeros [rad/s]."""
         return _roots(self.theta[1:1 + self.order])
 
     @property
     def poles(self) -> np.ndarray:
+        """Poles [rad/s]."""
         return _roots(self.theta[1 + self.order:])
 
     def inverse(self) -> ScalarScaling:
@@ -137,6 +140,7 @@ class ScalarScaling:
         return StateSpace(*self.matrices)
 
     def as_dict(self) -> dict[str, Any]:
+        """Content for a JSON file."""
         return {"theta": self.theta.tolist()}
 
 
@@ -226,9 +230,11 @@ class MatrixScaling:
 
     @property
     def scalar(self) -> ScalarScaling:
+        """The scalar factor d(s), which has the free parameters."""
         return self.factor
 
     def with_scalar(self, d: ScalarScaling) -> MatrixScaling:
+        """The scaling with its scalar factor replaced."""
         return replace(self, factor=d)
 
     def inverse(self) -> MatrixScaling:
@@ -241,12 +247,14 @@ class MatrixScaling:
 
     @property
     def matrices(self) -> Matrices:
+        """A, B, C, D of D(s)."""
         F, copies = self.system, np.eye(self.system.ninputs)
         a, b, c, d = (np.kron(one, copies) for one in self.factor.matrices)
         A = np.block([[a, b @ F.C], [np.zeros((F.nstates, a.shape[0])), F.A]])
         return A, np.vstack([b @ F.D, F.B]), np.hstack([c, d @ F.C]), d @ F.D
 
     def as_dict(self) -> dict[str, Any]:
+        """Content for a JSON file."""
         return {**{key: getattr(self.system, key).tolist() for key in "ABCD"}, "factor": self.factor.theta.tolist()}
 
 
@@ -272,6 +280,7 @@ class Scalings:
 
     @staticmethod
     def identity(structure: BlockStructure) -> Scalings:
+        """All scalings equal to one."""
         return Scalings(structure, tuple(MatrixScaling(gain(np.eye(b.rows))) if b.repeated else
                                          ScalarScaling.constant(1.0) for b in structure.blocks))
 

@@ -38,6 +38,7 @@ class Block:
 
     @property
     def is_scalar_delta(self) -> bool:
+        """Whether Delta of the block is a number times the identity."""
         return self.kind != "full"
 
     def as_dict(self) -> dict[str, Any]:

@@ -67,10 +67,12 @@ class GeneralizedPlant:
 
     @property
     def nmeas(self) -> int:
+        """Number of measurements y."""
         return len(self.y)
 
     @property
     def ncon(self) -> int:
+        """Number of controls u."""
         return len(self.u)
 
     @property

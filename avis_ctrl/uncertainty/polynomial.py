@@ -96,7 +96,7 @@ def _check(function: MatrixFunction, found: dict[Exponents, np.ndarray], samples
         error = np.max(np.abs(function(delta) - evaluate(found, delta)) / (np.abs(found[(0,) * len(delta)]) + size
                                                                            + np.finfo(float).tiny))
         if error > 1e-10:
-            raise ComputationError("the rig's matrices are not polynomials of degree 2 in these parameters",
+            raise ComputationError("the rig's matrices are not polynomials of degree 3 in these parameters",
                                    measured=f"relative error {error:.1e} at a random sample",
                                    cause="a parameter that enters through a division or a trigonometric function",
                                    next_step="choose parameters such as mass, inertia, stiffness, damping or position")

@@ -14,11 +14,11 @@ from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealP
 from avis_ctrl.uncertainty.uncertain_system import (
     STATES,
     UncertainSystem,
-    above,
     as_uncertain,
-    beside,
-    gathered,
+    hstacked,
+    ordered,
     reduced,
+    vstacked,
 )
 
 
@@ -38,18 +38,18 @@ def real(name: str, nominal: float, *, percent: float | tuple[float, float] | No
     >>> (1 / k + k**2).substitute(k=2.5)
     array([[6.65]])
     """
-    size = percent if percent is not None else plus_minus
-    if isinstance(size, (int, float)) and size < 0:
-        raise InputError("expected half a range, not negative", field=name, value=size)
     if sum(one is not None for one in (percent, plus_minus, range)) != 1:
         raise InputError("expected exactly one of percent, plus_minus and range", field=name)
     try:
         if range is not None:
             low, high = (float(v) for v in range)
         else:
-            down, up = np.broadcast_to(np.asarray(percent if percent is not None else plus_minus, float), 2).tolist()
+            size = percent if percent is not None else plus_minus
+            down, up = np.broadcast_to(np.asarray(size, float), 2).tolist()
+            if min(down, up) < 0:
+                raise InputError("expected half a range, not negative", field=name, value=size)
             unit = abs(nominal) / 100 if percent is not None else 1.0
-            low, high = nominal - abs(down) * unit, nominal + abs(up) * unit
+            low, high = nominal - down * unit, nominal + up * unit
         element = RealParameter(name, 1, 1, float(nominal), low, high)
     except (TypeError, ValueError) as error:
         raise error if isinstance(error, InputError) else InputError("expected numbers", field=name) from None
@@ -114,8 +114,8 @@ def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
     table = [list(row) if isinstance(row, (list, tuple, np.ndarray)) else [row] for row in rows]
     if not table or len({len(row) for row in table}) != 1:
         raise InputError("expected rows of one length", field="matrix", value=[len(row) for row in table])
-    stacked = [beside([as_uncertain(one) for one in row]) for row in table]
-    return reduced(above(stacked))
+    stacked = [hstacked([as_uncertain(one) for one in row]) for row in table]
+    return reduced(vstacked(stacked))
 
 
 def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequence[str] = (),
@@ -145,7 +145,7 @@ def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequen
     n = a.shape[0]
     if a.shape != (n, n) or b.shape[0] != n or c.shape[1] != n or d.shape != (c.shape[0], b.shape[1]):
         raise InputError(f"shapes do not fit: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}")
-    M = reduced(above([beside([a, b]), beside([c, d])]))
+    M = reduced(vstacked([hstacked([a, b]), hstacked([c, d])]))
     inner = np.block([[M.d[:n, :n], M.c[:n]], [M.b[:, :n], M.a]])
     system = UncertainSystem(inner, np.vstack([M.d[:n, n:], M.b[:, n:]]), np.hstack([M.d[n:, :n], M.c[n:]]),
                              M.d[n:, n:], (STATES, *M.elements), (n, *M.copies), float(dt), tuple(inputs),
@@ -194,10 +194,11 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
     parts_ = (np.block([[P.A, P.B[:, :nw]], [P.C[:nz], P.D[:nz, :nw]]]), np.vstack([P.B[:, nw:], P.D[:nz, nw:]]),
               np.hstack([P.C[nz:], P.D[nz:, :nw]]), P.D[nz:, nw:])
     kinds = [(STATES, n), *elements] if n else elements
-    return reduced(gathered(parts_, kinds, P.dt, tuple(inputs), tuple(outputs)))
+    return reduced(ordered(parts_, kinds, P.dt, tuple(inputs), tuple(outputs)))
 
 
 def of_element(element: Element, lft: np.ndarray) -> UncertainSystem:
+    """The uncertain number of an element; lft (2, 2): its dependence on delta."""
     return UncertainSystem(lft[:1, :1], lft[:1, 1:], lft[1:, :1], lft[1:, 1:], (element,), (1,))
 
 

@@ -33,10 +33,14 @@ class Rig(Protocol):
     """Interface of a rig that this module requires."""
 
     @property
-    def edge_m(self) -> float: ...
-    def parameters(self) -> dict[str, Any]: ...
-    def with_parameters(self, values: dict[str, float]) -> Any: ...
-    def equations_of_motion(self) -> Any: ...
+    def edge_m(self) -> float:
+        """As in `Rig`."""
+    def parameters(self) -> dict[str, Any]:
+        """As in `Rig`."""
+    def with_parameters(self, values: dict[str, float]) -> Any:
+        """As in `Rig`."""
+    def equations_of_motion(self) -> Any:
+        """As in `Rig`."""
 
 
 @dataclass(frozen=True)
@@ -106,16 +110,16 @@ class UncertainDirection:
         """Such as "identified direction 1 at +0.8: isolator1.k_z +0.3 %, and 5 parameters by less"."""
         sizes = {name: change / abs(nominal[name]) if nominal[name] else np.inf for name, change in self.changes}
         most = sorted(self.changes, key=lambda one: -abs(sizes[one[0]]))
-        told = [f"{name} {100 * delta * sizes[name]:+.2g} %" if nominal[name] else
+        words = [f"{name} {100 * delta * sizes[name]:+.2g} %" if nominal[name] else
                 f"{name} {delta * change:+.2g} {units[name]}" for name, change in most[:WORDS]]
         if len(most) > WORDS:
-            told.append(f"and {len(most) - WORDS} parameters by less")
-        return f"{self.name} at {delta:+.2g}: {', '.join(told)}"
+            words.append(f"and {len(most) - WORDS} parameters by less")
+        return f"{self.name} at {delta:+.2g}: {', '.join(words)}"
 
-    def stretch(self, nominal: Mapping[str, float], share: float) -> float:
-        """Factor >= 1 that raises the largest relative change to `share`, since tiny changes would lose digits."""
+    def stretch(self, nominal: Mapping[str, float], change: float) -> float:
+        """Factor >= 1 that raises the largest relative change to `change`, since tiny changes would lose digits."""
         largest = max(abs(change) / (abs(nominal[name]) or 0.1) for name, change in self.changes)
-        return max(1.0, share / largest)
+        return max(1.0, change / largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +255,8 @@ def _names(parameter: Uncertain) -> list[str]:
 
 def _stretches(parameters: Sequence[Uncertain], nominal: Mapping[str, float]) -> np.ndarray:
     """Factors that enlarge each delta while the polynomial is computed; their relative changes add up to 0.4."""
-    share = 0.4 / max(sum(isinstance(p, UncertainDirection) for p in parameters), 1)
-    return np.array([p.stretch(nominal, share) if isinstance(p, UncertainDirection) else 1.0 for p in parameters])
+    change = 0.4 / max(sum(isinstance(p, UncertainDirection) for p in parameters), 1)
+    return np.array([p.stretch(nominal, change) if isinstance(p, UncertainDirection) else 1.0 for p in parameters])
 
 
 def _stacked(equations: Any, kept: list[int], scale: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@
 
 States and uncertain elements are treated alike, as blocks from i_out to i_in (Zhou, Doyle and Glover, Robust and
 Optimal Control, 1996, chapter 10). Sums, products, inverses and connections have the same form. Copies of one element
-are gathered into one block; copies that no input can reach or no output can observe are removed.
+are ordered into one block; copies that no input can reach or no output can observe are removed.
 """
 
 from __future__ import annotations
@@ -89,6 +89,7 @@ class UncertainSystem:
 
     @property
     def nstates(self) -> int:
+        """Number of states."""
         return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
 
     @property
@@ -338,7 +339,7 @@ def as_uncertain(given: Any) -> UncertainSystem:
 
 def _diagonal(X: UncertainSystem, Y: UncertainSystem) -> UncertainSystem:
     parts = tuple(la.block_diag(p, q) for p, q in ((X.a, Y.a), (X.b, Y.b), (X.c, Y.c), (X.d, Y.d)))
-    return gathered(parts, _kinds(X, Y), _clock(X, Y), (), ())
+    return ordered(parts, _kinds(X, Y), _clock(X, Y), (), ())
 
 
 def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
@@ -349,7 +350,7 @@ def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
     return result
 
 
-def beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
+def hstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
     """[X Y ...]: outputs added, separate inputs."""
     result = systems[0]
     for X in systems[1:]:
@@ -357,11 +358,11 @@ def beside(systems: Sequence[UncertainSystem]) -> UncertainSystem:
             raise InputError("expected blocks of as many rows", field="matrix", value=[one.shape for one in systems])
         parts = (la.block_diag(result.a, X.a), la.block_diag(result.b, X.b), np.hstack([result.c, X.c]),
                  np.hstack([result.d, X.d]))
-        result = gathered(parts, _kinds(result, X), _clock(result, X), (), ())
+        result = ordered(parts, _kinds(result, X), _clock(result, X), (), ())
     return result
 
 
-def above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
+def vstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
     """[X; Y; ...]: outputs stacked, common inputs."""
     result = systems[0]
     for X in systems[1:]:
@@ -369,7 +370,7 @@ def above(systems: Sequence[UncertainSystem]) -> UncertainSystem:
             raise InputError("expected blocks of as many columns", field="matrix", value=[one.shape for one in systems])
         parts = (la.block_diag(result.a, X.a), np.vstack([result.b, X.b]), la.block_diag(result.c, X.c),
                  np.vstack([result.d, X.d]))
-        result = gathered(parts, _kinds(result, X), _clock(result, X), (), ())
+        result = ordered(parts, _kinds(result, X), _clock(result, X), (), ())
     return result
 
 
@@ -386,10 +387,10 @@ def _clock(*systems: UncertainSystem) -> float:
 
 def _of_both(parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
               outputs: Sequence[str]) -> UncertainSystem:
-    return reduced(gathered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
+    return reduced(ordered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
 
 
-def gathered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
+def ordered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
             outputs: tuple[str, ...]) -> UncertainSystem:
     """System with the states first, then one block per element, in order of first occurrence."""
     places: dict[str, tuple[Element, list[int], list[int]]] = {}
@@ -430,7 +431,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
                      np.hstack([np.zeros((m, n)), inner.a, np.zeros((m, b.shape[1]))]) + inner.b @ seen])
     y = np.hstack([c[:, rest_w], np.zeros((c.shape[0], m)), d]) + c[:, w] @ fed
     kinds = [pair for k, pair in enumerate(_kinds(system)) if k != place] + _kinds(inner)
-    return gathered((out[:, :n + m], out[:, n + m:], y[:, :n + m], y[:, n + m:]), kinds, _clock(system, inner),
+    return ordered((out[:, :n + m], out[:, n + m:], y[:, :n + m], y[:, n + m:]), kinds, _clock(system, inner),
                    system.inputs, system.outputs)
 
 
@@ -463,7 +464,7 @@ def reduced(system: UncertainSystem) -> UncertainSystem:
              np.hstack([D[q:, :p], c[q:]]), D[q:, p:])
     kinds = [(one, n_one) for k, (one, n_one, _, _) in enumerate(slices) if k not in scalar]
     kinds += [(slices[k][0], n_one) for k, n_one in zip(scalar, kept, strict=True) if n_one]
-    return gathered(parts, kinds, system.dt, system.inputs, system.outputs)
+    return ordered(parts, kinds, system.dt, system.inputs, system.outputs)
 
 
 def _power_of_two(size: np.ndarray) -> np.ndarray:

@@ -58,6 +58,7 @@ class UncertaintyWeight(Shown, Weight):
 
     @property
     def order(self) -> int:
+        """Number of poles of the weight."""
         return self.shape.order
 
     def __repr__(self) -> str:

@@ -100,3 +100,9 @@ def test_wrong_sample_time(rng):
         discretise(random_stable(rng, 2), 0.0)
     with pytest.raises(InputError, match="already sampled"):
         discretise(discretise(random_stable(rng, 2), 0.1), 0.1)
+
+
+def test_the_message_of_an_unstable_system_is_in_its_own_plane():
+    for dt, words in ((0.0, "largest real part 2 rad/s"), (0.1, "largest magnitude of a pole 2$")):
+        with pytest.raises(ComputationError, match=words):
+            balanced_truncation(StateSpace([[2.0]], [[1.0]], [[1.0]], [[0.0]], dt), 0)

@@ -160,3 +160,18 @@ def test_arithmetic_with_numbers_matrices_and_python_control():
             P.feedback(*wrong)
     with pytest.raises(InputError, match="not well posed"):
         gain([[1.0]]).feedback(-1.0)
+
+
+def test_names_may_come_from_a_generator():
+    G = StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs=(name for name in ["u"]), states=iter(["x"]))
+    assert G.inputs == ("u",) and G.states == ("x",)
+
+
+def test_a_wrong_number_of_state_names_is_refused():
+    with pytest.raises(InputError, match="expected 1 state names, got 2"):
+        StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], states=("a", "b"))
+
+
+def test_gain_at_a_pole_is_infinite_as_in_python_control():
+    G = tf([1.0], [1.0, 0.0])
+    assert G.dcgain() == control.dcgain(G.to_control()) == np.inf and np.isinf(G(0.0))

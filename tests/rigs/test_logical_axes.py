@@ -1,5 +1,6 @@
 """Actuator and sensor matrices against forces and motions at the places, and least norm against an optimiser."""
 
+import tomllib
 from pathlib import Path
 
 import cvxpy as cp
@@ -9,7 +10,9 @@ import pytest
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import COORDINATES, load_rig
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
+from avis_ctrl.rigs.rig_file import rig_from
 
+TABLES = Path(__file__).parents[2] / "designs" / "rigs"
 RIGS = ["avis", "halcyonics", "halcyonics_loaded"]
 
 
@@ -66,6 +69,9 @@ def test_axes_out_of_reach_are_named():
         sensor_axes(rig, COORDINATES, ["Sz1", "Sz2", "Sz3", "Sx2", "Sy1"])
     with pytest.raises(InputError, match="out of"):
         sensor_axes(rig, ("z",), ["Sz9"])
+    for axes, words in ((actuator_axes, "cannot be pushed"), (sensor_axes, "cannot be distinguished")):
+        with pytest.raises(InputError, match=f"x and z {words}"):
+            axes(rig, ("x", "z"), [])
 
 
 def test_two_motors_on_a_line_cannot_tell_z_from_the_roll():
@@ -84,7 +90,7 @@ def test_two_sensors_on_a_line_read_z_with_the_roll():
 
 def test_five_drives_push_what_is_asked_and_as_little_else_as_they_can():
     """Leftover of the tripod without one tangential drive, rotations at the edge, against an optimiser."""
-    rig = load_rig(Path(__file__).parents[2] / "designs" / "rigs" / "tripod.toml")
+    rig = load_rig(TABLES / "tripod.toml")
     five = ["V1", "V2", "H2", "V3", "H3"]
     found = actuator_axes(rig, ("x", "z"), five)
     T = found.matrix / np.array([1, 1, 1, *[rig.edge_m] * 3])[:, None]
@@ -97,7 +103,7 @@ def test_five_drives_push_what_is_asked_and_as_little_else_as_they_can():
 
 def test_noisy_sensors_count_less():
     """Decoding of twelve sensors against generalised least squares with each sensor's noise as velocity, 1 to 30 Hz."""
-    rig = load_rig(Path(__file__).parents[2] / "designs" / "rigs" / "twelve_sensors.toml")
+    rig = load_rig(TABLES / "twelve_sensors.toml")
     omega = 2 * np.pi * np.geomspace(1.0, 30.0, 20)
     lsb = 20.0 / 2 ** 16
     sigma = np.array([np.hypot(one.noise_rms_V, lsb / np.sqrt(12)) / one.gain
@@ -105,3 +111,17 @@ def test_noisy_sensors_count_less():
     found = sensor_axes(rig)
     H = found.matrix / sigma[:, None]
     assert np.allclose(found.decoding, np.linalg.solve(H.T @ H, H.T) / sigma, atol=1e-9)
+
+
+def test_position_sensors_alone_measure_all_axes_relative_to_the_chassis():
+    """Three along z at the corners of a triangle, one along x, two along y."""
+    content = tomllib.loads((TABLES / "granite.toml").read_text(encoding="utf-8"))
+    del content["geophone"]
+    where = [([1.0, 0.0, 0.0], [0.0, 0.0, 0.3])]
+    where += [([0.0, 1.0, 0.0], [x, 0.0, 0.0]) for x in (-0.3, 0.3)]
+    where += [([0.0, 0.0, 1.0], place) for place in ([0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.3, 0.0])]
+    content["position_sensor"] = [{**content["position_sensor"][0], "name": f"P{k}", "direction": direction,
+                                   "position_m": place} for k, (direction, place) in enumerate(where)]
+    found = sensor_axes(rig_from(content))
+    assert found.relative == COORDINATES and not np.any(found.inertial)
+    assert np.allclose(found.decoding @ found.matrix, np.eye(6), atol=1e-12)

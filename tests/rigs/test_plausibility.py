@@ -18,8 +18,9 @@ from scipy.linalg import eigh
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import rig_file
-from avis_ctrl.rigs.plausibility import UnusualRig, judged, plausible
+from avis_ctrl.rigs.plausibility import UnusualRig, judge_modes, judged, plausible
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion
 
 DATA = Path(rig_file.__file__).parent / "data"
 CONTENT = {name: tomllib.loads((DATA / f"{name}.toml").read_text(encoding="utf-8")) for name in ("avis", "halcyonics")}
@@ -200,3 +201,12 @@ def test_words_quote_the_rigs_own_numbers():
     f = np.sqrt(np.sort(eigh(equations.K, equations.M, eigvals_only=True))) / (2 * np.pi)
     words = next(one.words for one in judged(CONTENT["avis"], rig) if one.kind == "spread")
     assert words == f"natural frequencies {f[0]:.3g} to {f[-1]:.3g} Hz, ratio {f[-1] / f[0]:.3g}"
+
+
+def test_an_undamped_mode_does_not_hide_the_smallest_damping_of_the_others():
+    """Unit mass, modes at 1 to 6 Hz; the first has no damping, the second a damping ratio of 1e-5."""
+    f, zeta, compared = np.arange(1.0, 7.0), np.array([0.0, 1e-5, 0.1, 0.1, 0.1, 0.2]), []
+    eom = EquationsOfMotion(np.eye(6), np.diag(4 * np.pi * f * zeta), np.diag((2 * np.pi * f) ** 2), np.zeros((6, 6)),
+                            np.zeros((6, 6)), np.zeros((6, 1)), ("A",))
+    judge_modes(eom, eom.natural_frequencies(), lambda kind, value, words: compared.append((kind, value)))
+    assert [value for kind, value in compared if kind == "damping"] == pytest.approx([1e-5, 0.2])

@@ -7,7 +7,7 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, balanced_truncation, discretise, lft_lower
-from avis_ctrl.robust.controller_entries import Entries
+from avis_ctrl.robust.controller_entries import ControllerEntries
 from avis_ctrl.robust.fixed_order import fixed_order, with_mode
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.mu_descent import SETTINGS, GainLimit, Objective, Task
@@ -45,7 +45,7 @@ def test_slope_is_that_of_differences(full, states, most):
     P, _, made = full
     stable, unstable = split_stable(made.K)
     K = balanced_truncation(stable, states - unstable.nstates) + unstable
-    form = Entries.of(K)
+    form = ControllerEntries.of(K)
     omega = frequency_grid(lft_lower(P, K))
     assert np.allclose(form.controller(form.start).frequency_response(omega), K.frequency_response(omega), rtol=1e-6)
     limit = GainLimit(np.array([200.0, 1000.0]), np.array(most)) if most else None
@@ -88,7 +88,7 @@ def test_a_gain_above_its_limit_is_lowered(full):
 
 def test_no_frequency_is_bounded_twice_in_a_step(full, monkeypatch):
     P, _, made = full
-    form, seen = Entries.of(made.K), []
+    form, seen = ControllerEntries.of(made.K), []
 
     def counted(M, *arguments):
         seen.append(M)
@@ -137,7 +137,7 @@ def test_a_start_of_fewer_states_gets_all_states_that_are_asked_for(full):
 def test_a_slightly_different_start_ends_at_the_same_peak(full):
     """Rounding must not decide between local minima: entries of the start are changed by a thousandth."""
     P, _, made = full
-    rng, form, peaks = np.random.default_rng(0), Entries.of(made.K), []
+    rng, form, peaks = np.random.default_rng(0), ControllerEntries.of(made.K), []
     for _ in range(4):
         K = form.controller(form.start * (1 + 1e-3 * rng.standard_normal(form.start.size)))
         *_, step = fixed_order(Task(P, ONE_DRIVE), K, 2)
@@ -208,3 +208,21 @@ def test_decentralised_loops_see_their_own_signal_alone():
         musyn(P.select(slice(0, 7), slice(0, 8)), blocks, 1, 2, structure="decentralised")
     with pytest.raises(InputError, match="'full' or 'decentralised'"):
         musyn(P, blocks, 2, 2, structure="diagonal")
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_entries_of_a_controller_with_repeated_poles(order):
+    """A chain of equal lags has one eigenvector; the entries represent a controller with nearly the same response."""
+    A = 100.0 * np.kron(np.eye(order, k=-1) - np.eye(order), np.eye(2))
+    K = StateSpace(A, np.eye(2 * order, 2), np.eye(2, 2 * order, 2 * order - 2), np.zeros((2, 2)))
+    form = ControllerEntries.of(K)
+    omega = np.geomspace(1.0, 1e4, 30)
+    expected = K.frequency_response(omega)
+    error = np.linalg.norm(form.controller(form.start).frequency_response(omega) - expected, axis=(1, 2))
+    assert np.max(error / np.linalg.norm(expected, axis=(1, 2))) < 1e-3
+
+
+def test_the_grid_does_not_depend_on_the_unit_of_time():
+    system = StateSpace(-np.diag([1.0, 30.0]), np.ones((2, 1)), np.ones((1, 2)), [[0.0]])
+    slow = replace(system, A=1e-12 * system.A, B=1e-12 * system.B)
+    assert np.allclose(frequency_grid(slow), 1e-12 * frequency_grid(system), rtol=1e-9)

@@ -22,7 +22,7 @@ from avis_ctrl.lti import (
 )
 from avis_ctrl.lti.realisation import hankel_singular_values
 from avis_ctrl.robust.hinf_bounds import hinf_lower_bound
-from avis_ctrl.robust.hinf_lmi import lmi_gamma
+from avis_ctrl.robust.hinf_lmi import UNCERTIFIED, certified, lmi_gamma
 from avis_ctrl.robust.hinf_plant import Plant
 from avis_ctrl.robust.hinf_riccati import gamma_test
 from avis_ctrl.robust.hinfsyn import Status, hinf_suboptimal, hinfsyn
@@ -380,3 +380,32 @@ class TestUse:
         both = both.select(["z1", "z2", "z3", "z4", "y1", "y2"], ["w1", "w2", "w3", "w4", "u1", "u2"])
         larger = max(hinfsyn(one, 1, 1).gamma_optimal_bounds[1] for one in (a, b))
         assert hinfsyn(both, 2, 2).gamma_optimal_bounds[1] == pytest.approx(larger, rel=2e-3)
+
+
+def scalar_plant(sensor=1.0, pole=0.0):
+    """x' = pole x + w + u, z = (x, u), y = sensor x + n; the optimum is sqrt(2) for sensor 1 and pole 0."""
+    return StateSpace([[pole]], [[1, 0, 1]], [[1], [0], [sensor]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+
+
+@pytest.mark.parametrize("hint", [1e-6, 0.0014, 0.7, 1e6])
+def test_a_wrong_hint_changes_no_optimum(hint):
+    low, high = hinfsyn(scalar_plant(), 1, 1, gamma_hint=hint).gamma_optimal_bounds
+    assert low <= np.sqrt(2) <= high < 1.002 * np.sqrt(2)
+
+
+def test_an_optimum_far_above_the_open_loop_gain_is_found():
+    """A sensor of gain 1e-6 on an unstable mode: u must be about 2e6 n."""
+    result = hinfsyn(scalar_plant(1e-6, 1.0), 1, 1)
+    assert result.status is Status.OPTIMAL and 1e6 < result.gamma < 4e6
+
+
+def test_matrices_of_the_matrix_inequalities_are_their_certificate():
+    """[R I; I S] >= 0 for the matrices returned; an optimum that is not certified is reported."""
+    optimum = lmi_gamma(scalar_plant(), 1, 1)
+    coupling = np.block([[optimum.R, np.eye(1)], [np.eye(1), optimum.S]])
+    assert la.eigvalsh(coupling)[0] >= -1e-12 * la.norm(coupling)
+    assert (UNCERTIFIED in optimum.status) == (optimum.violation > 0)
+    plant = Plant.of(scalar_plant(), 1, 1)
+    upper, violation, R, S = certified(plant, np.eye(1), 0.5 * np.eye(1), 100.0)
+    assert la.eigvalsh(np.block([[R, np.eye(1)], [np.eye(1), S]]))[0] >= 0
+    assert upper == 100.0 and violation <= 0

@@ -19,6 +19,7 @@ from avis_ctrl.lti import (
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_cover import cover
+from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import residual
 from avis_ctrl.robust.mu_peak import mu_peak, stability_bound, worst_case_gain
 from avis_ctrl.robust.mu_realise import realise_delta
@@ -468,3 +469,19 @@ def test_the_worst_case_gain_does_not_depend_on_the_units_of_its_output(units):
     level = np.arange(7) >= 4
     least = np.linalg.eigvalsh(residual(scaled, scalings, (beta * (1 + 1e-6)) ** 2, level)[:, 0])[:, 0]
     assert np.all(least > -1e-9 * np.linalg.norm(scalings.X_w, axis=(1, 2)))
+
+
+def test_worst_gain_of_a_matrix_that_a_perturbation_makes_singular():
+    """1 + delta/(1 - delta): infinite at delta = 1; the other matrix of the stack has 1 + 1/(1 - 0.5) = 3."""
+    M = np.array([[[1.0, 1.0], [1.0, 1.0]], [[0.5, 1.0], [1.0, 1.0]]], complex)
+    assert np.allclose(worst_gain(M, BlockStructure.of([C()])).gain, [np.inf, 3.0])
+    M[1] = np.nan
+    with pytest.raises(InputError, match="finite"):
+        worst_gain(M, BlockStructure.of([C()]))
+
+
+def test_worst_case_gain_where_mu_is_exactly_one():
+    """1/(s + 1 - delta) has its pole at zero for delta = 1."""
+    loop = StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
+    found = worst_case_gain(loop, [R()])
+    assert found.upper == found.lower == np.inf

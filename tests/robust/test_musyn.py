@@ -17,8 +17,8 @@ from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
     descend,
     gamma_and_gradient,
-    grown,
     parameters,
+    with_added_pairs,
     with_parameters,
 )
 from avis_ctrl.robust.hinf_riccati import find_gamma
@@ -331,7 +331,7 @@ def test_a_root_pair_is_added_where_gamma_falls_most(d, orders):
     def optimum(scalings):
         return find_gamma(problem.normal(scalings).plant, 1e-9).upper.gamma
 
-    larger = grown(P, 2, 2, start, (1e-2, 1e2), 60)
+    larger = with_added_pairs(P, 2, 2, start, (1e-2, 1e2), 60)
     assert larger.orders == orders
     tried = []
     for place in np.geomspace(1e-2, 1e2, 8)[1:-1]:

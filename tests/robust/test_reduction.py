@@ -124,3 +124,9 @@ def test_lags_of_several_channels_and_a_controller_without_fast_poles(rng):
     assert np.max(error / gain) < 0.02
     with pytest.raises(InputError, match="continuous"):
         replace_fast_by_lags(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1), 1.0)
+
+
+def test_no_candidate_order_returns_the_controller(process):
+    K = hinfsyn(process, 1, 1).K
+    kept = reduce_controller(process, K, measure=lambda candidate: 1.0, orders=range(0))
+    assert kept.K is K and kept.figures == ((K.nstates, 1.0),)

@@ -256,6 +256,8 @@ def test_two_parameters_of_one_name_are_refused():
 @pytest.mark.parametrize("call, error, words", [
     (lambda: real("k", 1.0), InputError, "exactly one of"),
     (lambda: real("k", 1.0, percent=5, plus_minus=1), InputError, "exactly one of"),
+    (lambda: real("k", 1.0, plus_minus=(-0.5, 0.5)), InputError, "not negative"),
+    (lambda: real("k", 1.0, percent=np.int64(-10)), InputError, "not negative"),
     (lambda: real("k", 0.0, percent=5), InputError, "low < nominal < high"),
     (lambda: real("k", 1.0, range=(2, 3)), InputError, "low < nominal < high"),
     (lambda: real("k", 1.0, range=3), InputError, "expected numbers"),
