@@ -49,7 +49,7 @@ def gap_axis(
     from avis_ctrl.report import rendered
     from avis_ctrl.report.gap.axis import document
     from avis_ctrl.study.files import output_folder
-    from avis_ctrl.study.gap_axis import MODEL_FILE, write_axis_gap
+    from avis_ctrl.study.gap_axis import FILES, write_axis_gap
 
     roles = dict(_pair(part, "--columns") for part in columns.split(",")) if columns else None
     factors = {role: _number(text) for role, text in (_pair(part, "--scale") for part in scale.split(","))} \
@@ -59,7 +59,7 @@ def gap_axis(
     reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
     console = Console(highlight=False)
     files: list[str] = []
-    with output_folder(out, ("gap.json", "gap.html", "gap.pdf", MODEL_FILE)) if out else nullcontext() as folder:
+    with output_folder(out, FILES) if out else nullcontext() as folder:
         with Progress(console) as progress:
             found = find_axis_gap_in(kind, [path, *(also or ())] if also else path, roles, scale=factors,
                                      sample_rate_Hz=sample_rate_Hz, progress=progress, **reading, **options)

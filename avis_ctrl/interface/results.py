@@ -22,7 +22,7 @@ from avis_ctrl.study.design_result import DesignResult, Requirement
 from avis_ctrl.study.files import open_folder
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_files import write_gap
-from avis_ctrl.study.gap_names import GAP_FILES
+from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identification_design import default_design, default_keep, design_start
 from avis_ctrl.study.identification_files import FILES as IDENTIFICATION_FILES
@@ -254,8 +254,9 @@ class GapStudy:
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write the files of `avis gap`, all or none. Raises InputError for a folder that cannot be written."""
-        out = open_folder(folder, GAP_FILES)
-        return write_gap(out, self.gap, *rendered(gap_content.document(self.found)), self.found.to_json())
+        design = self.found.design.files if self.found.design else None
+        out = open_folder(folder, GAP_FILES, (DESIGN_FOLDER,) if design else ())
+        return write_gap(out, self.gap, *rendered(gap_content.document(self.found)), self.found.to_json(), design)
 
     def __repr__(self) -> str:
         named = ", ".join(one.name for one in self.effects) or "no effect named"
