@@ -125,8 +125,8 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
     with threadpool_limits(1):
         # The second-order terms of large rotations vanish at rest.
         before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
-        signals = [f"{one.name}@{one.location}" for one in getattr(gap, "effects", ()) if not one.label]
-        asked, covariance = design_for(gap.baseline.rig, design), getattr(gap, "covariance", None)
+        signals = [f"{one.name}@{one.location}" for one in gap.effects if not one.label]
+        asked, covariance = design_for(gap.baseline.rig, design), gap.covariance
         uncertainty = None
         if covariance is not None:
             progress("uncertainty: the fit's covariance as a few blocks")

@@ -132,9 +132,11 @@ def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
 def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
     """The model with the geophone suspensions of an identification. Raises InputError as `read_identified`."""
     known = _result(folder).get("suspensions", {})
+    if not model.sensors.suspensions:  # ideal sensors
+        return model
     try:
         own = tuple((float(known[name][0]), float(known[name][1])) if name in known else old
-                    for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=False))
+                    for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=True))
     except (KeyError, IndexError, TypeError, ValueError):
         raise InputError("expected corner and damping ratio by name", file=folder / RESULT_FILE, field="suspensions",
                          value=known) from None

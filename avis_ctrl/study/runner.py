@@ -130,12 +130,15 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
     with threadpool_limits(1):
         def shown(row: Any) -> bool:
             """Called after each iteration; False stops it."""
+            # Numbered as in the report, where the initial controllers are rows of the same table.
             if row.kind in INITIAL:
-                progress(f"initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, order {row.order}")
+                progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, "
+                         f"order {row.order}")
                 return True
             ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
-            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
-                     f"{row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
+            kind = "" if row.kind == "D-K" else f" ({row.kind})"
+            progress(f"step {row.iteration}, D-K iteration{kind}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
+                     f"order {row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
             return not ends
         with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, others)

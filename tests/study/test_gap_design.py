@@ -213,6 +213,10 @@ class SensorLowpass(Effect):
         ops.sense[:, ops.sensor(place)] /= 1 + ops.s * values["time_constant_s"]
 
 
+def gap_of(baseline, updated, *effects):
+    return SimpleNamespace(baseline=baseline, updated=updated, effects=effects, covariance=None)
+
+
 def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, baseline, design):
     """A low-pass of 2 Hz in one sensor would matter to any loop; the linear plant does not hold it."""
     monkeypatch.setattr("avis_ctrl.study.gap_design.mu_optimal", lambda asked, plant, rig: (
@@ -225,7 +229,7 @@ def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, ba
                 active(library()["cubic_stiffness"], baseline, "isolators z", (1e9, 0.0, 0.0, 0.0)))
     updated = replace(baseline, effects=left_out)
     hum = SimpleNamespace(name="mains_hum", location="geophones", label="")
-    found = design_effect(SimpleNamespace(baseline=baseline, updated=updated, effects=(hum,)), design)
+    found = design_effect(gap_of(baseline, updated, hum), design)
     assert set(found.not_checked) == {"sensor_lowpass@Sz1", "cubic_stiffness@isolators z", "mains_hum@geophones"}
     assert "contains none of the named effects" in found.sentences[0]
     assert "the effect does not matter" not in " ".join(found.sentences)
@@ -267,19 +271,19 @@ def test_refusals(baseline, design, tmp_path):
     path = tmp_path / "design.toml"
     path.write_text("title = 1\n", encoding="utf-8")
     with pytest.raises(InputError):
-        design_effect(SimpleNamespace(baseline=baseline, updated=baseline), path)
+        design_effect(gap_of(baseline, baseline), path)
     by_name = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
         update={"identified": "uncertainty.json"})})
     with pytest.raises(InputError, match="set by hand"):
-        design_effect(SimpleNamespace(baseline=baseline, updated=baseline), by_name)
+        design_effect(gap_of(baseline, baseline), by_name)
     halcyonics = TableModel(ResponseModel.of(load_rig("halcyonics"), ("mass",), unit="m/s"))
     with pytest.raises(InputError, match="give a design file"):
-        design_effect(SimpleNamespace(baseline=halcyonics, updated=halcyonics))
+        design_effect(gap_of(halcyonics, halcyonics))
 
 
 @pytest.mark.slow
 def test_an_amplifier_lag_costs_the_controller_and_a_new_one_wins_it_back(baseline):
-    found = design_effect(SimpleNamespace(baseline=baseline, updated=with_one(baseline, *LAG_40_HZ)))
+    found = design_effect(gap_of(baseline, with_one(baseline, *LAG_40_HZ)))
     assert found.before.stable and found.before.mu_upper < 1
     assert found.after.mu_upper > 1.1 * found.before.mu_upper
     assert found.new.mu_upper < 0.95 * found.after.mu_upper
