@@ -69,7 +69,8 @@ class Skyhook:
         return append(*(self.loop(axis).renamed([f"seen_{axis}_dot"], [f"command_{axis}"]) for axis in self.axes))
 
 
-def critical_damping(mass: Sequence[float], stiffness: Sequence[float], damping: Sequence[float]) -> np.ndarray:
+def critical_damping(mass: np.typing.ArrayLike, stiffness: np.typing.ArrayLike, damping: np.typing.ArrayLike
+                     ) -> np.ndarray:
     """The classical rule: g = 2 sqrt(k m) - c damps each axis critically if the axes are decoupled."""
     m, k, c = (np.asarray(values, float) for values in (mass, stiffness, damping))
     return np.maximum(2.0 * np.sqrt(k * m) - c, 0.0)

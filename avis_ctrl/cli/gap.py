@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from avis_ctrl.cli.console import Progress
-from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
+from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints, read_campaign
 from avis_ctrl.errors import InputError
 
 
@@ -45,13 +45,11 @@ def gap(
     """
     from rich.console import Console
 
-    from avis_ctrl.measurement.campaign import Campaign, in_short
-    from avis_ctrl.measurement.formats import parse_columns, read_measurements
+    from avis_ctrl.measurement.campaign import in_short
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.gap import GapOptions, find_gap
     from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES
-    from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
     options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
@@ -67,14 +65,7 @@ def gap(
         from avis_ctrl.study.gap_design import design_for
 
         design_for(start, design_file)  # raises at once, not after the search, if it is invalid
-    mapping = parse_columns(columns) if columns else None
-    measured = read_measurements(campaign, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
-    if not isinstance(measured, Campaign):
-        raise InputError("expected records, found frequency responses", file=campaign)
-    try:
-        named = in_words_of(start, measured, mapping)
-    except InputError as error:
-        raise error.in_file(campaign) from None
+    measured = read_campaign(campaign, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     for note in in_short(measured.notes):
         console.print(f"[dim]{note}[/]")
     folders = (DESIGN_FOLDER,) if options.design else ()
@@ -84,7 +75,7 @@ def gap(
         from avis_ctrl.study.gap_files import write_gap
 
         try:
-            found = find_gap(named, start, options, progress)
+            found = find_gap(measured, start, options, progress)
         except InputError as error:
             raise error if error.file else error.in_file(campaign) from None
         progress("report")

@@ -29,7 +29,7 @@ from avis_ctrl.study.identification_files import FILES as IDENTIFICATION_FILES
 from avis_ctrl.study.identification_files import RIG_FILE
 from avis_ctrl.study.identification_output import identified_toml, require_readable, write_identification
 from avis_ctrl.study.output import FILES, FOLDERS, write_study
-from avis_ctrl.study.verdict import all_axes, first_sentence
+from avis_ctrl.study.verdict import all_axes, first_sentence, requirement_rows
 from avis_ctrl.summary import html_table, wrapped
 
 
@@ -74,14 +74,8 @@ class DesignStudy:
                   for name, limit, value, met in rows]
         return "\n".join([*lines, *map(wrapped, self.result.notes)])
 
-    def _rows(self) -> list[tuple[str, str, str, str]]:
-        rows = []
-        for r in self.requirements:
-            unit = f" {r.unit}" if r.unit else ""
-            asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
-            rows.append((r.name, asked, f"{r.value:.4g}{unit}" if np.isfinite(r.value) else "-",
-                         "met" if r.met else "not met"))
-        return rows
+    def _rows(self) -> list[tuple[str, ...]]:
+        return [(*row, "met" if met else "not met") for *row, met in requirement_rows(self.result)]
 
     def plot_transmissibility(self, ax: Any = None, controllers: Any = None) -> Any:
         """Transmissibility from floor to payload of every controller; see `plot.transmissibility`."""

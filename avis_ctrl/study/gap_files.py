@@ -17,7 +17,6 @@ from avis_ctrl.files import write_together
 from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters
@@ -235,8 +234,8 @@ def converter_limits(model: TableModel, campaign: Campaign, effects: Sequence[Ma
     effects : named effects and traces (very small effects), as in gap.json.
     """
     n = len(campaign.y_names)
-    known = campaign.y_unit == "V" and model.rig.acquisition is not None
-    low, high = (np.full(n, one) for one in (nominal_converter(model.rig).limits_V if known else (-np.inf, np.inf)))
+    converter = model.rig.converter if campaign.y_unit == "V" else None
+    low, high = (np.full(n, one) for one in (converter.limits_V if converter else (-np.inf, np.inf)))
     for one in effects:
         if one["name"] != "sensor_quantisation" or one.get("location") not in campaign.y_names:
             continue

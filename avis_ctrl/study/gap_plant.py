@@ -27,7 +27,7 @@ from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
+from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant, edge_levers
 from avis_ctrl.uncertainty.generalized_plant import Part
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
@@ -126,7 +126,7 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     """The rig's motion, and the decoded deviations of the sensors and decoded effect of gravity."""
     old = next(part.system for part in plant.full.parts if part.name == "rig")
     sensors, n = list(model.sensors.names), len(plant.axes)
-    lever = np.array([1 / model.rig.edge_m if axis.endswith("_edge") else 1.0 for axis in plant.axes])
+    keep = [axis.removesuffix("_edge") for axis in plant.axes]
     known = [k for k, name in enumerate(plant.sensors) if name in sensors]
     decoding = plant.decoding[:, known]
     names = [plant.sensors[k] for k in known]
@@ -134,8 +134,7 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     dot = wrapped.select([f"{a}_dot" for a in plant.axes] + [f"{kind}_{k}" for kind in ("deviation", "tilt")
                                                              for k in names], list(old.inputs))
     _, rows = model.effective.rig.sensor_rows()
-    kept = [COORDINATES.index(axis.removesuffix("_edge")) for axis in plant.axes]
-    own = plant.decoding @ (rows[:, kept] * lever)
+    own = plant.decoding @ (rows[:, [COORDINATES.index(name) for name in keep]] * (1 / edge_levers(model.rig, keep)))
     left = np.block([[own, decoding, np.zeros_like(decoding)],
                      [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
     C, D = np.vstack([plain.C, left @ dot.C]), np.vstack([plain.D, left @ dot.D])

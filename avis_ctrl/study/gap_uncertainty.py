@@ -33,9 +33,8 @@ from avis_ctrl.identification.directions import (
 )
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.plant import Wiring
+from avis_ctrl.study.plant import Wiring, neglected_dynamics
 from avis_ctrl.uncertainty.uncertain_rig import UncertainEquation
-from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 
 @dataclass(frozen=True)
@@ -251,8 +250,7 @@ def _allowed(design: Design, omega: np.ndarray, settings: FitUncertaintySettings
     chains = design.uncertainty.actuator_chains
     if chains is None:
         return np.ones(len(omega)), np.full(len(omega), settings.without_dynamics)
-    dynamics = NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100
-                                 ).magnitude(omega)
+    dynamics = neglected_dynamics(chains).magnitude(omega)
     return dynamics, settings.left_out * dynamics
 
 

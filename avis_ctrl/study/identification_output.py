@@ -162,7 +162,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
     model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),
                     turning=turning)
     model = _suspended(model, folder)
-    limits = _converter_limits(rig) if campaign.y_unit == "V" else None
+    limits = rig.converter.limits_V if campaign.y_unit == "V" and rig.converter else None
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "rig": rig.name})
         for record in campaign.records:
@@ -181,9 +181,3 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
                 u, floor = model_inputs(model, record.load(start, min(stop + 1, h.samples)))
                 y = predictor.read(u[:stop - start], floor)
                 data[start:stop] = y if limits is None else np.clip(y, *limits)
-
-
-def _converter_limits(rig: Rig) -> tuple[float, float] | None:
-    if rig.acquisition is None:
-        return None
-    return -rig.acquisition.adc_range_V, rig.acquisition.adc_range_V * (1 - 2.0 ** (1 - rig.acquisition.adc_bits))

@@ -14,13 +14,14 @@ import numpy as np
 from avis_ctrl.classical.skyhook import Skyhook, critical_damping
 from avis_ctrl.classical.tuning import Merit, Scenarios, Search, TuningRange
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
 from avis_ctrl.study.analysis import SETTINGS, SLACK
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
-from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.plant import DesignPlant, edge_levers
 
 # Tilt corner well below the table's modes, roll-off well above the bandwidth of its loops.
 CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
@@ -103,9 +104,9 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
         notes.append("this is critical damping with the usual corners: no better tuning was found for the whole "
                      "uncertainty set")
     if not best.meets:
-        reached = (f"this one has the lowest, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
+        reached = (f"this one has the lowest, {decibels(best.peak):+.2f} dB" if np.isfinite(best.peak)
                    else "none is proved stable for the whole uncertainty set")
-        notes.append(f"no skyhook tuning found has a worst-case peak below {_decibel(peak_limit):+.2f} dB: {reached}")
+        notes.append(f"no skyhook tuning found has a worst-case peak below {decibels(peak_limit):+.2f} dB: {reached}")
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
 
 
@@ -194,7 +195,7 @@ def critical_gains(rig: Rig, axes: Sequence[str]) -> tuple[float, ...]:
     """Classical gains [N s/m] of some axes, rotations at the edge."""
     equations = rig.equations_of_motion()
     kept = [equations.coordinates.index(name) for name in axes]
-    scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in axes])
+    scale = 1 / edge_levers(rig, axes) ** 2
     return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
 
 
@@ -219,7 +220,3 @@ def at_limits(loops: Skyhook, search: TuningRange) -> list[str]:
 
 def _pair(limits: list[float]) -> tuple[float, float]:
     return limits[0], limits[1]
-
-
-def _decibel(value: float) -> float:
-    return 20.0 * float(np.log10(value))

@@ -48,6 +48,16 @@ def all_axes(result: DesignResult) -> str:
     return f"{locked}. {reached}."
 
 
+def requirement_rows(result: DesignResult) -> list[tuple[str, str, str, bool]]:
+    """Name, limit and value of each requirement as text, and whether it is met."""
+    rows = []
+    for one in result.requirements:
+        unit = f" {one.unit}" if one.unit else ""
+        limit = "yes" if one.comparison == "is" else f"{one.comparison} {one.limit:.4g}{unit}"
+        rows.append((one.name, limit, f"{one.value:.4g}{unit}" if np.isfinite(one.value) else "-", one.met))
+    return rows
+
+
 def refuse_unstable(result: DesignResult) -> None:
     """Raise ComputationError (exit code 3) if the delivered loop is unstable for any plant."""
     if not (text := unstable(result)):

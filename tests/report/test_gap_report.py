@@ -341,7 +341,7 @@ def test_controller_only_where_there_is_one(found):
     lost = replace(found.design.before, stable=False, **dict.fromkeys(
         ("mu_upper", "mu_lower", "peak_dB", "band_dB", "worst_peak_dB", "worst_band_dB"), float("inf")))
     part = section(replace(found, design=replace(found.design, before=lost, after=None, new=None)), "controller")
-    assert tables(part)[0].rows == (("previous", "re-identified", Mark("NO", False), Mark("yes", True),
+    assert tables(part)[0].rows == (("previous", "re-identified", Mark("no", False), Mark("yes", True),
                                      Mark("unstable", False), *["unstable"] * 4),)
     drawn = figures(part)["gap_mu"]
     assert "not stable" in drawn.caption and svg(drawn).startswith("<?xml")

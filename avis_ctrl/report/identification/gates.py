@@ -86,7 +86,6 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
                       2, 0.75) for k, group in enumerate(groups)]
 
 
-
 def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:
     """Pictures as panels of one figure; a name has the same style in all of them."""
     names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
