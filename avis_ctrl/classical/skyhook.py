@@ -8,7 +8,6 @@ above its band. The gains follow from the classical rule or from the tuning in `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from avis_ctrl.cli.console import Progress, StopRequest
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.study.design_result import DesignResult
 
 
 def design(
@@ -45,7 +50,7 @@ def design(
     refuse_unstable(result)
 
 
-def _verdict(console, result) -> None:
+def _verdict(console: Console, result: DesignResult) -> None:
     from rich.table import Table
 
     from avis_ctrl.study.verdict import all_axes, first_sentence, requirement_rows

@@ -35,12 +35,12 @@ def known_hints(period_s: float | None, excitation: str | None, sample_rate_Hz: 
 def read_measured(path: Path, rig: Rig, columns: str | None = None, **hints: Any) -> Campaign | FrequencyResponse:
     """The measurement in a file, with the channel names of the rig. columns : value of --columns."""
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
-    from avis_ctrl.study.rig_channels import in_words_of
+    from avis_ctrl.study.rig_channels import with_rig_names
 
     mapping = parse_columns(columns) if columns else None
     measured = read_measurements(path, mapping, **hints)
     try:
-        return in_words_of(rig, measured, mapping)
+        return with_rig_names(rig, measured, mapping)
     except InputError as error:
         raise error.in_file(path) from None
 

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from avis_ctrl.cli.console import Progress
 from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints, read_campaign
 from avis_ctrl.errors import InputError
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.study.gap import GapFinding
 
 
 def gap(
@@ -85,7 +90,7 @@ def gap(
     console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 
 
-def _summary(console, found) -> None:
+def _summary(console: Console, found: GapFinding) -> None:
     from rich.table import Table
 
     gap = found.gap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,6 +20,11 @@ from avis_ctrl.cli.file_options import (
     roles,
 )
 from avis_ctrl.errors import AvisError, InputError
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.study.identification import Identification
 
 
 def identify(
@@ -171,7 +176,7 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
         raise InputError("expected NAME=MEAN+-STD such as mass=500+-5", field="--prior", value=text) from None
 
 
-def _summary(console, found) -> None:
+def _summary(console: Console, found: Identification) -> None:
     from rich.table import Table
 
     from avis_ctrl.uncertain_value import rounded, text

@@ -36,9 +36,7 @@ from avis_ctrl.summary import html_table, wrapped
 class DesignStudy:
     """Result of `design`, as `avis design` computes it: controllers, bounds, simulation, verdict.
 
-    result : the complete `DesignResult`. controller : the delivered controller u = K y of the axes in `keep`.
-        sampled_controller : the controller for the processor, sensor volts to drive volts, all axes (None without a
-        simulation). requirements : rows of the verdict table.
+    result : the complete `DesignResult`.
     """
 
     def __init__(self, result: DesignResult) -> None:
@@ -46,16 +44,19 @@ class DesignStudy:
 
     @property
     def controller(self) -> StateSpace:
+        """The delivered controller u = K y of the axes in `keep`."""
         K = self.result.controller("mu").K
         assert K is not None  # only the passive table has no controller
         return K
 
     @property
     def sampled_controller(self) -> StateSpace | None:
+        """The controller for the processor, sensor volts to drive volts, all axes; None without a simulation."""
         return self.result.loop.digital if self.result.loop is not None else None
 
     @property
     def requirements(self) -> tuple[Requirement, ...]:
+        """Rows of the verdict table."""
         return self.result.requirements
 
     @property
@@ -119,7 +120,7 @@ class DesignStudy:
 class IdentificationStudy:
     """Result of `identify`, as `avis identify` computes it: identified table, uncertainty, verdict on held-out records.
 
-    found : the complete `Identification`. rig : the table with the identified values.
+    found : the complete `Identification`.
     """
 
     def __init__(self, found: Identification) -> None:
@@ -127,6 +128,7 @@ class IdentificationStudy:
 
     @property
     def rig(self) -> Rig:
+        """The table with the identified values."""
         return self.found.rig
 
     @property
@@ -208,7 +210,7 @@ class IdentificationStudy:
 class GapStudy:
     """Result of `gap`, as `avis gap` computes it: the verdict, the named effects, both models.
 
-    found : the complete `GapFinding`. gap : its `Gap`. effects : the named effects.
+    found : the complete `GapFinding`.
     """
 
     def __init__(self, found: GapFinding) -> None:
@@ -216,10 +218,12 @@ class GapStudy:
 
     @property
     def gap(self) -> Gap:
+        """The gap, its effects and both models."""
         return self.found.gap
 
     @property
     def effects(self) -> tuple[Any, ...]:
+        """The named effects."""
         return tuple(self.gap.effects)
 
     @property

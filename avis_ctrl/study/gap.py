@@ -32,7 +32,7 @@ from avis_ctrl.study.gap_files import converter_limits
 from avis_ctrl.study.identification import amplifier_corner, amplifier_words
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.record_checks import check_campaign
-from avis_ctrl.study.rig_channels import in_words_of
+from avis_ctrl.study.rig_channels import with_rig_names
 from avis_ctrl.study.workers import each
 
 Progress = Callable[[str], None]
@@ -40,7 +40,7 @@ Progress = Callable[[str], None]
 NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
               "spikes", "missing samples")
 # Minimum number of samples of a record; with fewer, neither the gates nor a held-out third give any information.
-FEWEST = 300
+MIN_SAMPLES = 300
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     if not isinstance(measured, Campaign):
         raise InputError("expected records in time: frequency responses do not distinguish faults of a signal from "
                          "those of the table", field="measurement")
-    named = in_words_of(rig, measured)
-    assert isinstance(named, Campaign)  # in_words_of keeps the type
+    named = with_rig_names(rig, measured)
+    assert isinstance(named, Campaign)  # with_rig_names keeps the type
     measured = named
     _require_records(measured, rig)
     if options.band_Hz is not None:
@@ -136,8 +136,8 @@ def _require_records(measured: Campaign, rig: Rig) -> None:
         raise InputError(f"expected the rig's own {rig.sample_rate_Hz:g} Hz", field="sample_rate_Hz",
                          value=measured.sample_rate_Hz)
     for record in measured.records:
-        if record.header.samples < FEWEST:
-            raise InputError(f"expected at least {FEWEST} samples", field=f"record {record.header.name}: samples",
+        if record.header.samples < MIN_SAMPLES:
+            raise InputError(f"expected at least {MIN_SAMPLES} samples", field=f"record {record.header.name}: samples",
                              value=record.header.samples)
 
 

@@ -46,7 +46,7 @@ class FitUncertaintySettings:
     without_dynamics : the same as a fraction of the response, for a design without neglected dynamics.
     band_Hz, points : frequency grid of the comparison: the range of transmissibility, fine compared with the modes'
         width.
-    alike : relative cut-off below which combinations of drives are not used to represent changes of sensors. Adjacent
+    rcond : relative cut-off below which combinations of drives are not used to represent changes of sensors. Adjacent
         drives would otherwise oppose each other with many times their force to represent a tilt.
     draws : number of tables drawn from the covariance to estimate products of changes.
     """
@@ -55,7 +55,7 @@ class FitUncertaintySettings:
     without_dynamics: float = NEGLIGIBLE
     band_Hz: tuple[float, float] = (0.1, 100.0)
     points: int = 200
-    alike: float = 0.02
+    rcond: float = 0.02
     draws: int = 64
 
     @property
@@ -152,7 +152,7 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
     # product.
     drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
     alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
-                     settings.alike)
+                     settings.rcond)
     inside[others] = np.tensordot(alike, inside[drives], 1)
     elsewhere = _box(_turned(np.tensordot(S.T, seen - inside, 1)), confidence)
     root = S.copy()

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from avis_ctrl.study.identification import Identification
 
 # Minimum uncertainty of the drives: changes between a campaign and the use of its model are not in the measurement.
-LEAST_PERCENT = 1.0
+MIN_PERCENT = 1.0
 # Designs for z and phi_x by kind of rig, as in designs/*.toml; rig and uncertainty are filled in.
 _COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
 _AVIS: dict[str, Any] = _COMMON | {
@@ -194,5 +194,5 @@ def _chains(asked: ChainUncertainty, content: UncertaintyFile, template: Design)
     spread = next(one for one in content.spread if sorted(one.keep) == keep).values()
     median = 100 * float(np.median(spread.bound(template.uncertainty.confidence_percent / 100)))
     digit = 10 ** np.floor(np.log10(max(median, 1e-9)))
-    low = float(max(np.ceil(median / digit - 1e-9) * digit, LEAST_PERCENT))
+    low = float(max(np.ceil(median / digit - 1e-9) * digit, MIN_PERCENT))
     return asked.model_copy(update={"low_percent": round(min(low, asked.low_percent), 12)})

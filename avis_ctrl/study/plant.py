@@ -90,10 +90,12 @@ class DesignPlant:
 
     @property
     def floor_velocities(self) -> list[str]:
+        """Inputs of the floor motion, one per axis."""
         return [f"floor_{axis}_dot" for axis in self.axes]
 
     @property
     def velocities(self) -> list[str]:
+        """Outputs of the payload's velocity, one per axis."""
         return [f"{axis}_dot" for axis in self.axes]
 
     def effort_weight(self, axis: str) -> Weight:
@@ -102,6 +104,7 @@ class DesignPlant:
 
     @property
     def volts(self) -> list[str]:
+        """Outputs of the drive voltages."""
         return [f"{name}_command" for name in self.actuators]
 
 

@@ -25,7 +25,7 @@ def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
     return decibels(skyhook.worst_band.lower) - decibels(mu.worst_band.upper)
 
 
-def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percent: float = 100.0
+def check_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percent: float = 100.0
                ) -> tuple[Requirement, ...]:
     """Requirements that every design must meet, in addition to those of its file.
 
@@ -48,8 +48,8 @@ def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percen
             rest.percent <= offset_percent, "at most", rest.words()),)))
 
 
-def judge(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequence[AxisGain] = ()
-          ) -> tuple[Requirement, ...]:
+def check_requirements(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequence[AxisGain] = ()
+                       ) -> tuple[Requirement, ...]:
     """One row per requirement of the design file, in the order of the file."""
     by_name = {c.name: c for c in controllers}
     mu, skyhook, passive = (by_name.get(name) for name in ("mu", "skyhook", "passive"))

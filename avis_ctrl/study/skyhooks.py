@@ -76,21 +76,21 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     ------
     ComputationError : no tuning tried, including the classical ones, is stable on the nominal plant.
     """
-    contest = _Contest(plant, design, peak_limit, settings)
+    evaluation = WorstCaseTuning(plant, design, peak_limit, settings)
     classical = classical_loops(plant, rig, design)
-    ranked = [(contest.certified(classical)[0], classical)]
-    task, target = contest.search(rig), settings.room * peak_limit
+    ranked = [(evaluation.certified(classical)[0], classical)]
+    task, target = evaluation.search(rig), settings.room * peak_limit
     points = [task.search.point(1.0, CUSTOMARY_CORNERS_HZ)]
     for _ in range(settings.certified):
-        found, points, task = contest.tuned(task, points, target)
+        found, points, task = evaluation.tuned(task, points, target)
         loops = task.search.skyhook(plant.axes, found)
-        bound, worst = contest.certified(loops)
+        bound, worst = evaluation.certified(loops)
         ranked.append((bound, loops))
         if bound.meets or worst is None:
             break
-        task = contest.learned(task, worst)
+        task = evaluation.with_worst_case(task, worst)
         # The bound lies above the worst case found: the search has to stay below the limit by the same ratio.
-        missed = contest.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
+        missed = evaluation.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
         target = settings.room * peak_limit * min(1.0, missed)
     best, loops = min(ranked, key=lambda one: one[0].key())
     if best.unstable:
@@ -111,8 +111,8 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
 
 
 @dataclass(frozen=True, eq=False)
-class _Contest:
-    """Evaluation of all tunings of a plant."""
+class WorstCaseTuning:
+    """Search for a tuning of skyhook loops on a plant, and the bounds that rank the tunings."""
 
     plant: DesignPlant
     design: Design
@@ -121,6 +121,7 @@ class _Contest:
 
     @property
     def band_Hz(self) -> tuple[float, float]:
+        """Band of the design's limit on transmissibility."""
         low, high = self.design.transmissibility.band_Hz
         return low, high
 
@@ -162,14 +163,14 @@ class _Contest:
                            iterations=self.settings.ascent_steps)
         return Merit(float(np.max(found.gain)), float(np.max(found.gain[task.inside])), self.peak_limit), found.delta
 
-    def learned(self, task: Search, worst: MuPeak) -> Search:
+    def with_worst_case(self, task: Search, worst: MuPeak) -> Search:
         """The search with the worst case of a bound added to its samples, and its frequency to the grid."""
         scenarios = task.scenarios
         if np.isfinite(worst.omega) and worst.omega > 0:
             scenarios = scenarios.with_frequencies(worst.omega * np.array(self.settings.beside))
         if worst.delta is not None:
             n_w, n_z = scenarios.deltas.shape[2:]
-            scenarios = scenarios.with_worst(np.broadcast_to(worst.delta[:n_w, :n_z], scenarios.deltas.shape[1:]))
+            scenarios = scenarios.with_delta(worst.delta[:n_w, :n_z])  # a plant: its stability counts
         return replace(task, scenarios=scenarios)
 
     def certified(self, loops: Skyhook) -> tuple[Merit, MuPeak | None]:

@@ -29,7 +29,7 @@ from avis_ctrl.study.gap_design import (
     figures,
     start_files,
 )
-from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable, wiring_of
+from avis_ctrl.study.gap_plant import design_files, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.skyhooks import classical_skyhook
@@ -183,7 +183,7 @@ def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, v
 
 def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
     model = with_one(with_one(baseline, "sensor_gain", "Sz1", (1.2,)), "actuator_gain", "Az1", (0.8,))
-    found = carried(design, model)
+    found = design_files(design, model)
     old = baseline.rig
     assert found.rig.geophones.sensitivity_Vs_per_m[found.rig.geophones.names.index("Sz1")] == pytest.approx(
         1.2 * old.geophones.sensitivity_Vs_per_m[old.geophones.names.index("Sz1")])
@@ -191,13 +191,13 @@ def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
 
 
 def test_drift_is_carried_at_the_moment_asked(baseline, design):
-    found = carried(design, with_one(baseline, "stiffness_drift", "isolators", (0.2,)), -0.5)
+    found = design_files(design, with_one(baseline, "stiffness_drift", "isolators", (0.2,)), -0.5)
     old = baseline.rig.parameters()["isolator2.k_z"].value
     assert found.rig.parameters()["isolator2.k_z"].value == pytest.approx(0.9 * old)
 
 
 def test_files_say_what_they_do_not_hold(baseline, design):
-    found = carried(design, with_one(baseline, "mount_relaxation", "isolators z", (0.4, 3.0)))
+    found = design_files(design, with_one(baseline, "mount_relaxation", "isolators z", (0.4, 3.0)))
     assert found.inside == () and found.outside == ("mount_relaxation@isolators z",)
 
 
@@ -299,7 +299,7 @@ def test_an_iteration_that_stalls_above_its_target_goes_on(baseline, design):
     """D-K iteration alone stalls at 1.24 on the plant of these files and reaches 0.88 on the model's own."""
     model = with_one(with_one(baseline, "contact_friction", "actuators", (1.5e4, 5e-6, *(0.0,) * 7)),
                      "stiffness_drift", "isolators/linear", (-0.037,))
-    found = carried(design, model, -0.5)
+    found = design_files(design, model, -0.5)
     plant = build_plant(found.design, found.rig)
     candidate, made = mu_optimal(found.design, plant, found.rig)
     assert made.status == "target 0.9 reached"

@@ -165,7 +165,7 @@ def test_a_grid_beyond_the_limit_is_refused_before_it_is_made():
         points(vary=axes)
     file = PointsFile.model_validate({"base": "x", "vary": [{"key": "a", "values": [1, 2, 3]}]})
     with pytest.raises(InputError, match="points = 3: expected at most 2;"):
-        points_of(file, same, SweepSettings(most_points=2))
+        points_of(file, same, SweepSettings(max_points=2))
 
 
 def test_a_point_that_cannot_be_made_is_a_task_less(tmp_path):

@@ -68,7 +68,7 @@ def by_record(gap: Gap) -> Figure:
 
 
 def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:
-    sides = [("re-identified", BEFORE, lambda one: one.before)]
+    sides: list[tuple[str, Style, Callable[[RecordGap], float]]] = [("re-identified", BEFORE, lambda one: one.before)]
     if gap.effects:
         sides.append(("updated", AFTER, lambda one: one.after))
     curves = []

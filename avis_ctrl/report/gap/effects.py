@@ -21,7 +21,7 @@ def parameters(found: GapFinding) -> Section:
     gap = found.gap
     pieces: list[Piece] = []
     if gap.effects or gap.traces:
-        pieces += [_sizes(gap), Bullets(tuple(_told(one) for one in (*gap.effects, *gap.traces)))]
+        pieces += [_sizes(gap), Bullets(tuple(_as_text(one) for one in (*gap.effects, *gap.traces)))]
     else:
         pieces.append(Paragraph("No effect is named: the updated model is the rig within its tolerances."))
     if len(gap.baseline.values):
@@ -46,7 +46,7 @@ def _sizes(gap: Gap) -> Table:
                  ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
 
 
-def _told(one: NamedEffect) -> str:
+def _as_text(one: NamedEffect) -> str:
     """Description of an effect: what it is, its influence on the responses, and its confirmation."""
     effect = wording.known(one.name)
     text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."

@@ -32,15 +32,15 @@ def provenance(result: DesignResult) -> Section:
 
 def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
     """Table of the provenance of a result."""
-    rows = [(NAMES.get(key, key), _said(value))
+    rows = [(NAMES.get(key, key), _as_text(value))
             for key, value in made.items() if value is not None]
     return Section("Provenance", "provenance", (table(caption, ("what", "value"), rows, "ll"),))
 
 
-def _said(value: Any) -> str:
+def _as_text(value: Any) -> str:
     if isinstance(value, Mapping) and len(value) > SETTINGS.most_values:
         return "listed in the JSON file of results"
     if isinstance(value, Mapping):
-        return "; ".join(f"{key} ({_said(one)})" if isinstance(one, Mapping) else f"{key} {_said(one)}"
+        return "; ".join(f"{key} ({_as_text(one)})" if isinstance(one, Mapping) else f"{key} {_as_text(one)}"
                          for key, one in value.items() if one is not None)
     return words.number(value) if isinstance(value, float) else str(value)
