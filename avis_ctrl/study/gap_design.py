@@ -27,6 +27,7 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.gap_plant import DESCRIBED_IN, delay_order, design_files, plant_of, six_dof_is_stable, wiring_of
@@ -37,7 +38,6 @@ from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 Progress = Callable[[str], None]
-SLACK = 5e-3
 # As in designs/avis_z_phix.toml.
 PARAMETERS_PERCENT = {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.c_z": 30.0}
 

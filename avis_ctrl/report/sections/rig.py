@@ -140,7 +140,6 @@ def _electronics(result: DesignResult) -> Table:
 
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
-    n = len(error.keep)
     if not error.left_out.size:
         return [Heading("Design model"), Paragraph("The controller is designed on a model with all six degrees of "
                                                    "freedom; no coordinate is locked.")]
@@ -154,7 +153,7 @@ def _reduction(result: DesignResult) -> list[Piece]:
             f"{words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. " + _largest(error))
     return [Heading("Error of the design model"), Paragraph(text),
             table("Difference between the design model and six degrees of freedom, relative to the largest gain, over "
-                  "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(result, n)]
+                  "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(error)]
 
 
 def _largest(error: ReductionError) -> str:
@@ -166,8 +165,7 @@ def _largest(error: ReductionError) -> str:
             f"{words.number(100 * float(error.relative[place, k, j]))} % of the largest gain there.")
 
 
-def _compared(result: DesignResult, n: int) -> Figure:
-    error = result.reduction
+def _compared(error: ReductionError) -> Figure:
     f = error.omega / (2 * np.pi)
     curves = []
     for k, name in enumerate(error.keep):
