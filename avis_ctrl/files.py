@@ -112,6 +112,7 @@ def _incomplete(folder: Path, asked: list[Path], removed: list[Path], placed: li
 
 
 def not_written(path: Path, error: OSError) -> ComputationError:
+    """The error of a disk that is full or fails."""
     return ComputationError(f"{path} was not written; what was there before is untouched",
                             cause=str(error.strerror or error),
                             next_step="free some space or choose another place with --out")

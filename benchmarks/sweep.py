@@ -17,8 +17,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from avis_ctrl.study.workers import available
 from avis_ctrl.sweep.cluster import on_cluster
-from avis_ctrl.sweep.local import available, on_this_machine
+from avis_ctrl.sweep.local import on_this_machine
 from avis_ctrl.sweep.run import POINTS, Backend, plan_sweep, run_sweep
 
 SKYHOOKS = """

@@ -8,7 +8,6 @@ above its band. The gains follow from the classical rule or from the tuning in `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +68,8 @@ class Skyhook:
         return append(*(self.loop(axis).renamed([f"seen_{axis}_dot"], [f"command_{axis}"]) for axis in self.axes))
 
 
-def critical_damping(mass: Sequence[float], stiffness: Sequence[float], damping: Sequence[float]) -> np.ndarray:
+def critical_damping(mass: np.typing.ArrayLike, stiffness: np.typing.ArrayLike, damping: np.typing.ArrayLike
+                     ) -> np.ndarray:
     """The classical rule: g = 2 sqrt(k m) - c damps each axis critically if the axes are decoupled."""
     m, k, c = (np.asarray(values, float) for values in (mass, stiffness, damping))
     return np.maximum(2.0 * np.sqrt(k * m) - c, 0.0)

@@ -170,9 +170,11 @@ class Merit:
 
     @property
     def meets(self) -> bool:
+        """Whether the tuning is stable and its peak within the limit."""
         return self.unstable == 0 and self.peak <= self.limit
 
     def key(self) -> tuple[float, float, float]:
+        """Sort key: the smaller, the better."""
         return (self.unstable, 0.0, self.band) if self.meets else (self.unstable, 1.0, self.peak)
 
 
@@ -188,6 +190,7 @@ class Search:
 
     @cached_property
     def channels(self) -> Channels:
+        """Responses of the sampled plants."""
         return self.scenarios.channels()
 
     @cached_property

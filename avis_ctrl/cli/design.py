@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from avis_ctrl.cli.console import Progress, StopRequest
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.study.design_result import DesignResult
 
 
 def design(
@@ -46,20 +50,17 @@ def design(
     refuse_unstable(result)
 
 
-def _verdict(console, result) -> None:
+def _verdict(console: Console, result: DesignResult) -> None:
     from rich.table import Table
 
-    from avis_ctrl.study.verdict import all_axes, first_sentence
+    from avis_ctrl.study.verdict import all_axes, first_sentence, requirement_rows
 
     console.print(first_sentence(result))
     if result.stable:
         console.print(all_axes(result))
     table = Table("requirement", "limit", "result", "", title=result.design.title)
-    for r in result.requirements:
-        unit = f" {r.unit}" if r.unit else ""
-        asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
-        table.add_row(r.name, asked, f"{r.value:.4g}{unit}" if isfinite(r.value) else "-",
-                      "[green]met[/]" if r.met else "[red]not met[/]")
+    for *row, met in requirement_rows(result):
+        table.add_row(*row, "[green]met[/]" if met else "[red]not met[/]")
     console.print(table)
     for note in result.notes:
         console.print(note)

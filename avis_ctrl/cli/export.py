@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from avis_ctrl.cli.console import Progress
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.export.anti_windup import Choice
+    from avis_ctrl.export.package import Package
 
 ORDERS = "orders.png"  # with --order: the orders tried and their mu
 
@@ -83,7 +90,7 @@ def export(
     console.print(f"{len(files)} files in {path}")
 
 
-def _picture(orders) -> bytes:
+def _picture(orders: Sequence[tuple[int, float]]) -> bytes:
     """Plot of mu against controller order (PNG)."""
     import io
 
@@ -97,7 +104,7 @@ def _picture(orders) -> bytes:
     return file.getvalue()
 
 
-def _orders(console, orders) -> None:
+def _orders(console: Console, orders: Sequence[tuple[int, float]]) -> None:
     from rich.table import Table
 
     table = Table("states", "mu at most, design's model", "", title="order against mu")
@@ -107,7 +114,7 @@ def _orders(console, orders) -> None:
     console.print(table)
 
 
-def _anti_windup(choice) -> str:
+def _anti_windup(choice: Choice) -> str:
     """The chosen anti-windup, and the recovery at the highest level with and without it."""
     with_it, without = (1e3 * one[-1, 0] for one in (choice.chosen, choice.without))
     after = f"after floor motion that demands {choice.levels[-1]:g} times the drives' range"
@@ -118,7 +125,7 @@ def _anti_windup(choice) -> str:
             f"{with_it:.3g} mm/s r.m.s., {without:.3g} mm/s without it.")
 
 
-def _summary(console, made) -> None:
+def _summary(console: Console, made: Package) -> None:
     from math import log10
 
     from rich.table import Table

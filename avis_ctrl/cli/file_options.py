@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from avis_ctrl.errors import InputError
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from avis_ctrl.measurement.campaign import Campaign
+    from avis_ctrl.measurement.frequency_response import FrequencyResponse
+    from avis_ctrl.rigs.rig import Rig
 
 # Options of `convert`, `identify` and `gap` for information that a file may lack.
 PERIOD = Annotated[float | None, typer.Option("--period", metavar="SECONDS", help="period of a multisine, if the file "
@@ -22,3 +30,48 @@ def known_hints(period_s: float | None, excitation: str | None, sample_rate_Hz: 
     """The hints that were given, by name."""
     given = {"period_s": period_s, "excitation": excitation, "sample_rate_Hz": sample_rate_Hz, "y_unit": y_unit}
     return {name: value for name, value in given.items() if value is not None}
+
+
+def read_measured(path: Path, rig: Rig, columns: str | None = None, **hints: Any) -> Campaign | FrequencyResponse:
+    """The measurement in a file, with the channel names of the rig. columns : value of --columns."""
+    from avis_ctrl.measurement.formats import parse_columns, read_measurements
+    from avis_ctrl.study.rig_channels import with_rig_names
+
+    mapping = parse_columns(columns) if columns else None
+    measured = read_measurements(path, mapping, **hints)
+    try:
+        return with_rig_names(rig, measured, mapping)
+    except InputError as error:
+        raise error.in_file(path) from None
+
+
+def read_campaign(path: Path, rig: Rig, columns: str | None = None, **hints: Any) -> Campaign:
+    """`read_measured`; raises InputError for frequency responses."""
+    from avis_ctrl.measurement.campaign import Campaign
+
+    measured = read_measured(path, rig, columns, **hints)
+    if not isinstance(measured, Campaign):
+        raise InputError("expected records, found frequency responses", file=path)
+    return measured
+
+
+def roles(text: str | None, option: str = "--columns") -> dict[str, str]:
+    """ROLE=NAME,.. by role; empty without a text."""
+    found = {}
+    for part in text.split(",") if text else ():
+        role, equals, name = (word.strip() for word in part.partition("="))
+        if not (role and equals and name):
+            raise InputError("expected ROLE=NAME", field=option, value=part)
+        found[role] = name
+    return found
+
+
+def factors(text: str | None) -> dict[str, float]:
+    """ROLE=FACTOR,.. of --scale by role; empty without a text."""
+    found = {}
+    for role, number in roles(text, "--scale").items():
+        try:
+            found[role] = float(number)
+        except ValueError:
+            raise InputError("expected ROLE=NUMBER", field="--scale", value=f"{role}={number}") from None
+    return found

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from avis_ctrl.cli.console import Progress
-from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
+from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints, read_campaign
 from avis_ctrl.errors import InputError
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.study.gap import GapFinding
 
 
 def gap(
@@ -44,59 +50,47 @@ def gap(
     """
     from rich.console import Console
 
-    from avis_ctrl.files import write_together
-    from avis_ctrl.measurement.campaign import Campaign, in_short
-    from avis_ctrl.measurement.formats import parse_columns, read_measurements
+    from avis_ctrl.measurement.campaign import in_short
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import open_folder, output_folder
+    from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.gap import GapOptions, find_gap
-    from avis_ctrl.study.gap_names import GAP_FILES
-    from avis_ctrl.study.rig_channels import in_words_of
+    from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES
 
     console = Console(highlight=False)
-    GapOptions(seed, band_Hz, amplifier_corner_Hz=amplifier_Hz)  # raises at once if they are invalid
-    own = None
+    options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
+                         design_file)  # raises at once if they are invalid
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
 
         own = load_effects(effects)
+        options = replace(options, own_effects=own)
         console.print(f"[dim]effects of your own: {', '.join(own.names)}[/]")
     start = load_rig(rig)
-    if design or design_file is not None:
+    if options.design:
         from avis_ctrl.study.gap_design import design_for
 
         design_for(start, design_file)  # raises at once, not after the search, if it is invalid
-    mapping = parse_columns(columns) if columns else None
-    measured = read_measurements(campaign, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
-    if not isinstance(measured, Campaign):
-        raise InputError("expected records, found frequency responses", file=campaign)
-    try:
-        named = in_words_of(start, measured, mapping)
-    except InputError as error:
-        raise error.in_file(campaign) from None
+    measured = read_campaign(campaign, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     for note in in_short(measured.notes):
         console.print(f"[dim]{note}[/]")
-    with output_folder(out, GAP_FILES) as folder, Progress(console) as progress:
+    folders = (DESIGN_FOLDER,) if options.design else ()
+    with output_folder(out, GAP_FILES, folders) as folder, Progress(console) as progress:
         from avis_ctrl.report import rendered
         from avis_ctrl.report.gap.content import document
         from avis_ctrl.study.gap_files import write_gap
 
-        options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
-                             design_file, own)
         try:
-            found = find_gap(named, start, options, progress)
+            found = find_gap(measured, start, options, progress)
         except InputError as error:
             raise error if error.file else error.in_file(campaign) from None
         progress("report")
-        files = write_gap(folder, found.gap, *rendered(document(found)), found.to_json())
-        if found.design is not None and found.design.files:
-            onward = open_folder(folder / "design", tuple(found.design.files))
-            write_together(onward, {name: text.encode() for name, text in found.design.files.items()})
+        files = write_gap(folder, found.gap, *rendered(document(found)), found.to_json(),
+                          found.design.files if found.design else None)
     _summary(console, found)
     console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 
 
-def _summary(console, found) -> None:
+def _summary(console: Console, found: GapFinding) -> None:
     from rich.table import Table
 
     gap = found.gap

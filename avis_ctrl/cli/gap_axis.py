@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from avis_ctrl.cli.file_options import SAMPLE_RATE
-from avis_ctrl.errors import InputError
+from avis_ctrl.cli.file_options import SAMPLE_RATE, factors, roles
 
 
 def gap_axis(
@@ -49,22 +48,20 @@ def gap_axis(
     from avis_ctrl.report import rendered
     from avis_ctrl.report.gap.axis import document
     from avis_ctrl.study.files import output_folder
-    from avis_ctrl.study.gap_axis import MODEL_FILE, write_axis_gap
+    from avis_ctrl.study.gap_axis import FILES, write_axis_gap
 
-    roles = dict(_pair(part, "--columns") for part in columns.split(",")) if columns else None
-    factors = {role: _number(text) for role, text in (_pair(part, "--scale") for part in scale.split(","))} \
-        if scale else None
+    names, scales = roles(columns) or None, factors(scale) or None
     options: dict[str, Any] = {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}
     options = {name: value for name, value in options.items() if value is not None}
     reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
     console = Console(highlight=False)
     files: list[str] = []
-    with output_folder(out, ("gap.json", "gap.html", "gap.pdf", MODEL_FILE)) if out else nullcontext() as folder:
+    with output_folder(out, FILES) if out else nullcontext() as folder:
         with Progress(console) as progress:
-            found = find_axis_gap_in(kind, [path, *(also or ())] if also else path, roles, scale=factors,
+            found = find_axis_gap_in(kind, [path, *(also or ())] if also else path, names, scale=scales,
                                      sample_rate_Hz=sample_rate_Hz, progress=progress, **reading, **options)
         if folder:
-            given = {"kind": kind, "columns": roles, "scale": factors, "sample_rate_Hz": sample_rate_Hz}
+            given = {"kind": kind, "columns": names, "scale": scales, "sample_rate_Hz": sample_rate_Hz}
             files = write_axis_gap(folder, found, path.name, {**given, **reading, **options},
                                    lambda *told: rendered(document(*told)))
     console.print(f"verdict: {found.verdict}")
@@ -78,17 +75,3 @@ def gap_axis(
                       markup=False)
     if folder:
         console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
-
-
-def _pair(text: str, option: str) -> tuple[str, str]:
-    role, equals, name = (part.strip() for part in text.partition("="))
-    if not (role and equals and name):
-        raise InputError("expected ROLE=NAME", field=option, value=text)
-    return role, name
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError("expected ROLE=NUMBER", field="--scale", value=text) from None

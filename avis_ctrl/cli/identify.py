@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from avis_ctrl.cli.console import Progress
-from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
+from avis_ctrl.cli.file_options import (
+    EXCITATION,
+    PERIOD,
+    SAMPLE_RATE,
+    UNIT_Y,
+    factors,
+    known_hints,
+    read_campaign,
+    read_measured,
+    roles,
+)
 from avis_ctrl.errors import AvisError, InputError
+
+if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
+    from rich.console import Console
+
+    from avis_ctrl.study.identification import Identification
 
 
 def identify(
@@ -56,20 +71,13 @@ def identify(
     from rich.console import Console
 
     from avis_ctrl.measurement.campaign import Campaign, in_short
-    from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.identification_files import FILES
-    from avis_ctrl.study.rig_channels import in_words_of
 
     console = Console(highlight=False)
     start = load_rig(rig)
-    mapping = parse_columns(columns) if columns else None
-    measured = read_measurements(measurement, mapping, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
-    try:
-        measured = in_words_of(start, measured, mapping)
-    except InputError as error:
-        raise error.in_file(measurement) from None
+    measured = read_measured(measurement, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
         console.print(f"[dim]{note}[/]")
     with output_folder(out, FILES) as folder, Progress(console) as progress:
@@ -113,13 +121,10 @@ def predict(
     from rich.console import Console
     from rich.table import Table
 
-    from avis_ctrl.measurement.campaign import Campaign
-    from avis_ctrl.measurement.formats import read_measurements
     from avis_ctrl.study.files import require_other
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.prediction_file import compared, prediction_errors
-    from avis_ctrl.study.rig_channels import in_words_of
 
     require_other(out, campaign)
     console = Console(highlight=False)
@@ -131,9 +136,6 @@ def predict(
         console.print(rows)
         console.print(f"{out}: {len(several)} records")
         return
-    measured = read_measurements(campaign)
-    if not isinstance(measured, Campaign):
-        raise InputError("expected records, found frequency responses", file=campaign)
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
 
@@ -146,11 +148,7 @@ def predict(
         from avis_ctrl.study.identification_output import read_identified, write_predictions
 
         rig, write = read_identified(folder)[0], write_predictions
-    try:
-        measured = in_words_of(rig, measured)
-    except InputError as error:
-        raise error if error.file else error.in_file(campaign) from None
-    assert isinstance(measured, Campaign)  # in_words_of keeps the type
+    measured = read_campaign(campaign, rig)
     with Progress(console) as progress:
         write(folder, measured, out, progress)
         progress("prediction errors")
@@ -178,7 +176,7 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
         raise InputError("expected NAME=MEAN+-STD such as mass=500+-5", field="--prior", value=text) from None
 
 
-def _summary(console, found) -> None:
+def _summary(console: Console, found: Identification) -> None:
     from rich.table import Table
 
     from avis_ctrl.uncertain_value import rounded, text
@@ -219,17 +217,10 @@ def single_axis(
 
     from avis_ctrl.identification.single_axis.identify import identify_single_axis
 
-    roles = dict(_pair(part, "--columns") for part in columns.split(","))
-    factors = {}
-    for part in (scale or "").split(",") if scale else []:
-        role, number = _pair(part, "--scale")
-        try:
-            factors[role] = float(number)
-        except ValueError:
-            raise InputError("expected ROLE=NUMBER", field="--scale", value=part) from None
-    found = identify_single_axis(kind, path, roles, scale=factors or None, sample_rate_Hz=sample_rate_Hz)
+    names, scales = roles(columns), factors(scale)
+    found = identify_single_axis(kind, path, names, scale=scales or None, sample_rate_Hz=sample_rate_Hz)
     console = Console(highlight=False)
-    console.print(_assumed_units(kind, roles, factors), soft_wrap=True)
+    console.print(_assumed_units(kind, names, scales), soft_wrap=True)
     for line in found.lines():
         console.print(line)
 
@@ -251,10 +242,3 @@ def _assumed_units(kind: str, roles: dict[str, str], factors: dict[str, float]) 
                 and UNITS[kind][role] != "any unit"]
     change = f" (not scaled; if the file has another unit: --scale {unscaled[0]}=FACTOR)" if unscaled else ""
     return f"assumed units: {', '.join(said)}, t in s{change}"
-
-
-def _pair(text: str, option: str) -> tuple[str, str]:
-    role, equals, name = (part.strip() for part in text.partition("="))
-    if not (role and equals and name):
-        raise InputError("expected ROLE=NAME", field=option, value=text)
-    return role, name

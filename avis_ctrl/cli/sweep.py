@@ -31,8 +31,9 @@ def sweep(
 
     from avis_ctrl.errors import ComputationError, InputError, UserInterruptError
     from avis_ctrl.study.files import open_folder, output_folder
+    from avis_ctrl.study.workers import available
     from avis_ctrl.sweep.cluster import on_cluster, require_distributed
-    from avis_ctrl.sweep.local import available, on_this_machine
+    from avis_ctrl.sweep.local import on_this_machine
     from avis_ctrl.sweep.output import FILES, front_of, write_sweep
     from avis_ctrl.sweep.run import POINTS, plan_sweep, run_sweep
 

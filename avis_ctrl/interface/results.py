@@ -22,23 +22,21 @@ from avis_ctrl.study.design_result import DesignResult, Requirement
 from avis_ctrl.study.files import open_folder
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_files import write_gap
-from avis_ctrl.study.gap_names import GAP_FILES
+from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identification_design import default_design, default_keep, design_start
 from avis_ctrl.study.identification_files import FILES as IDENTIFICATION_FILES
 from avis_ctrl.study.identification_files import RIG_FILE
 from avis_ctrl.study.identification_output import identified_toml, require_readable, write_identification
 from avis_ctrl.study.output import FILES, FOLDERS, write_study
-from avis_ctrl.study.verdict import all_axes, first_sentence
+from avis_ctrl.study.verdict import all_axes, first_sentence, requirement_rows
 from avis_ctrl.summary import html_table, wrapped
 
 
 class DesignStudy:
     """Result of `design`, as `avis design` computes it: controllers, bounds, simulation, verdict.
 
-    result : the complete `DesignResult`. controller : the delivered controller u = K y of the axes in `keep`.
-        sampled_controller : the controller for the processor, sensor volts to drive volts, all axes (None without a
-        simulation). requirements : rows of the verdict table.
+    result : the complete `DesignResult`.
     """
 
     def __init__(self, result: DesignResult) -> None:
@@ -46,16 +44,19 @@ class DesignStudy:
 
     @property
     def controller(self) -> StateSpace:
+        """The delivered controller u = K y of the axes in `keep`."""
         K = self.result.controller("mu").K
         assert K is not None  # only the passive table has no controller
         return K
 
     @property
     def sampled_controller(self) -> StateSpace | None:
+        """The controller for the processor, sensor volts to drive volts, all axes; None without a simulation."""
         return self.result.loop.digital if self.result.loop is not None else None
 
     @property
     def requirements(self) -> tuple[Requirement, ...]:
+        """Rows of the verdict table."""
         return self.result.requirements
 
     @property
@@ -74,14 +75,8 @@ class DesignStudy:
                   for name, limit, value, met in rows]
         return "\n".join([*lines, *map(wrapped, self.result.notes)])
 
-    def _rows(self) -> list[tuple[str, str, str, str]]:
-        rows = []
-        for r in self.requirements:
-            unit = f" {r.unit}" if r.unit else ""
-            asked = "yes" if r.comparison == "is" else f"{r.comparison} {r.limit:.4g}{unit}"
-            rows.append((r.name, asked, f"{r.value:.4g}{unit}" if np.isfinite(r.value) else "-",
-                         "met" if r.met else "not met"))
-        return rows
+    def _rows(self) -> list[tuple[str, ...]]:
+        return [(*row, "met" if met else "not met") for *row, met in requirement_rows(self.result)]
 
     def plot_transmissibility(self, ax: Any = None, controllers: Any = None) -> Any:
         """Transmissibility from floor to payload of every controller; see `plot.transmissibility`."""
@@ -125,7 +120,7 @@ class DesignStudy:
 class IdentificationStudy:
     """Result of `identify`, as `avis identify` computes it: identified table, uncertainty, verdict on held-out records.
 
-    found : the complete `Identification`. rig : the table with the identified values.
+    found : the complete `Identification`.
     """
 
     def __init__(self, found: Identification) -> None:
@@ -133,6 +128,7 @@ class IdentificationStudy:
 
     @property
     def rig(self) -> Rig:
+        """The table with the identified values."""
         return self.found.rig
 
     @property
@@ -214,7 +210,7 @@ class IdentificationStudy:
 class GapStudy:
     """Result of `gap`, as `avis gap` computes it: the verdict, the named effects, both models.
 
-    found : the complete `GapFinding`. gap : its `Gap`. effects : the named effects.
+    found : the complete `GapFinding`.
     """
 
     def __init__(self, found: GapFinding) -> None:
@@ -222,10 +218,12 @@ class GapStudy:
 
     @property
     def gap(self) -> Gap:
+        """The gap, its effects and both models."""
         return self.found.gap
 
     @property
     def effects(self) -> tuple[Any, ...]:
+        """The named effects."""
         return tuple(self.gap.effects)
 
     @property
@@ -254,8 +252,9 @@ class GapStudy:
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write the files of `avis gap`, all or none. Raises InputError for a folder that cannot be written."""
-        out = open_folder(folder, GAP_FILES)
-        return write_gap(out, self.gap, *rendered(gap_content.document(self.found)), self.found.to_json())
+        design = self.found.design.files if self.found.design else None
+        out = open_folder(folder, GAP_FILES, (DESIGN_FOLDER,) if design else ())
+        return write_gap(out, self.gap, *rendered(gap_content.document(self.found)), self.found.to_json(), design)
 
     def __repr__(self) -> str:
         named = ", ".join(one.name for one in self.effects) or "no effect named"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.pieces import Document, document_of
 from avis_ctrl.report.sections.bounds import bounds
 from avis_ctrl.report.sections.controllers import controllers
 from avis_ctrl.report.sections.method import method
 from avis_ctrl.report.sections.plant import generalized_plant
-from avis_ctrl.report.sections.provenance import document_of, provenance
+from avis_ctrl.report.sections.provenance import provenance
 from avis_ctrl.report.sections.rig import rig
 from avis_ctrl.report.sections.simulation import simulation
 from avis_ctrl.report.sections.site import site

@@ -210,6 +210,16 @@ def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:
     return shown, [f"{p:g}" if 1e-3 <= p <= 1e4 else f"{p:.0e}".replace("e-0", "e-").replace("e+0", "e") for p in shown]
 
 
+def log_limits(values: np.ndarray, below: float, above: float, default: tuple[float, float] = (0.1, 10.0),
+               quantile: float = 0.0) -> tuple[float, float]:
+    """Range of a logarithmic axis for the positive values; `default` without any.
+
+    below : factor on the smallest value, or on a quantile of the values. above : factor on the largest value.
+    """
+    kept = values[np.isfinite(values) & (values > 0)]
+    return (below * float(np.quantile(kept, quantile)), above * float(kept.max())) if kept.size else default
+
+
 def log_range(panel: Panel) -> tuple[float, float]:
     """Range of the y axis of a logarithmic panel, from the data if none is given."""
     if panel.y.range is not None:
@@ -217,7 +227,4 @@ def log_range(panel: Panel) -> tuple[float, float]:
     values = [np.asarray(v, float) for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands),
                                              *(b.high for b in panel.bands))]
     values += [c.y + sign * c.error for c in panel.curves if c.error is not None and c.along == "y" for sign in (1, -1)]
-    kept = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values] or [np.array([])])
-    if not kept.size:
-        return 0.1, 10.0
-    return float(kept.min()) / 1.3, float(kept.max()) * 1.3
+    return log_limits(np.concatenate(values or [np.array([])]), 1 / 1.3, 1.3)

@@ -5,9 +5,9 @@ All texts are plain; the renderer escapes them. Only `Formula.typst` is markup, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from avis_ctrl.report.figures import Figure
 
@@ -127,6 +127,18 @@ class Document:
     def figures(self) -> list[Figure | Drawing]:
         """All figures and drawings in order."""
         return [p for s in self.sections for p in s.flat() if isinstance(p, (Figure, Drawing))]
+
+
+def document_of(title: str, subtitle: str, provenance: Mapping[str, Any], sections: Iterable[Section]) -> Document:
+    """A report with the date under its title, and version and hash of the inputs in its page header."""
+    date = str(provenance.get("date", ""))[:10]
+    return Document(title, subtitle + (f", {date}" if date else ""), f"avis_ctrl {provenance.get('avis_ctrl', '')}, "
+                    f"inputs {str(provenance.get('inputs_sha256', ''))[:12]}", tuple(sections))
+
+
+def yes_or_no(good: bool) -> Mark:
+    """A verdict as "yes" or "no"."""
+    return Mark("yes" if good else "no", good)
 
 
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]], align: str = "") -> Table:

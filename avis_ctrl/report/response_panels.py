@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.identification.overlays import MeasuredOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz
+from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz, log_limits
 
 FLOOR = ("vx", "vy", "vz")
 MEASURED, SCATTER, TWO_SIGMA = Style("#222222"), Style("#7a7a7a"), Style("#222222", "dot", 1.4)
@@ -63,9 +63,7 @@ def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -
     """Magnitude of the complex difference measured - model; by noise alone 86 % lie below the dotted line."""
     f, two = seen.frequency_Hz, 2 * seen.measured_std[:, i, j]
     lines = [(label, np.abs(seen.measured[:, i, j] - G[:, i, j]), style) for label, G, style in models]
-    values = np.concatenate([two, *(line for _, line, _ in lines)])
-    values = values[values > 0]
-    limits = (0.5 * float(np.quantile(values, 0.01)), 2 * float(values.max())) if values.size else (1e-3, 1.0)
+    limits = log_limits(np.concatenate([two, *(line for _, line, _ in lines)]), 0.5, 2, (1e-3, 1.0), 0.01)
     curves = (*(Curve(f, line, f"measured less {label}", style) for label, line, style in lines),
               Curve(f, two, "two standard deviations of the measured", TWO_SIGMA))
     return Panel(frequencies(seen), Axis(f"difference [{unit(seen, j)}]", "log", limits), curves, (), title(seen, i, j))

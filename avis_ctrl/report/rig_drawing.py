@@ -140,11 +140,11 @@ def _lever(canvas: Canvas, rig: Rig, at: View) -> None:
 
 
 def _key(canvas: Canvas) -> None:
-    y, x = TOP_HEIGHT + SIDE_HEIGHT - 12, 70.0
+    y, x = TOP_HEIGHT + SIDE_HEIGHT - 12, 30.0
     for colour, word in ((ACTUATOR, "actuator"), (SENSOR, "sensor"), (ISOLATOR, "isolator"), (MASS, "centre of mass")):
         canvas.rectangle((x, y - 4), 12, 12, colour, colour)
         canvas.text((x + 12, y), word, 12, anchor="start")
-        x += 40 + 7.6 * len(word) + 16
+        x += 52 + 7.6 * len(word)
     canvas.circle((x, y - 4), 5.5, "#ffffff", "#333333")
     canvas.circle((x, y - 4), 1.8, "#333333", "#333333")
-    canvas.text((x + 12, y), "points at the eye", 12, anchor="start")
+    canvas.text((x + 12, y), "points towards the viewer", 12, anchor="start")

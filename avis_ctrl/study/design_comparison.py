@@ -51,12 +51,12 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
     results = [read_json(folder / RESULT, "avis-design") for folder in folders]
     asked = [dict(_leaves(study.get("design"), "")) for study in studies]
     keys = list(dict.fromkeys([*asked[0], *asked[1]]))
-    requested = [(key, _said(asked[0].get(key)), _said(asked[1].get(key))) for key in keys
+    requested = [(key, _as_text(asked[0].get(key)), _as_text(asked[1].get(key))) for key in keys
                  if key != "title" and asked[0].get(key) != asked[1].get(key)]
     if studies[0].get("rig") != studies[1].get("rig"):
         requested.insert(0, ("rig file", _first_line(studies[0].get("rig")), _first_line(studies[1].get("rig"))))
     rows = [_figures(result, folder) for result, folder in zip(results, folders, strict=True)]
-    found = [(name, _said(rows[0].get(name)), _said(rows[1].get(name)))
+    found = [(name, _as_text(rows[0].get(name)), _as_text(rows[1].get(name)))
              for name in dict.fromkeys([*rows[0], *rows[1]])]
     other = sorted({key.partition(".")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
     note = (f"mu of the two cannot be compared: it refers to different {', '.join(other)}; transmissibilities can"
@@ -100,7 +100,7 @@ def _figures(result: dict[str, Any], folder: Path) -> dict[str, Any]:
     return figures
 
 
-def _said(value: Any) -> str:
+def _as_text(value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, bool):

@@ -60,6 +60,8 @@ class ChainUncertainty(Section):
 
 
 class UncertaintySection(Section):
+    """Ranges of parameters, neglected dynamics of the channels, and the uncertainty file of an identification."""
+
     parameters_percent: dict[str, Percent] = {}
     parameters_absolute: dict[str, Positive] = {}
     actuator_chains: ChainUncertainty | None = None
@@ -170,6 +172,8 @@ class SynthesisSection(Section):
 
 
 class SkyhookSection(Section):
+    """Ranges of the corners of the tuned skyhook."""
+
     tilt_corner_Hz: Band = [0.005, 1.0]
     roll_off_Hz: Annotated[Band, Field(validate_default=True)] = [5.0, 400.0]
 
@@ -183,6 +187,8 @@ class SkyhookSection(Section):
 
 
 class SimulationSection(Section):
+    """Check on the nonlinear table: length of each run, and number of random plants of the uncertainty set."""
+
     duration_s: Annotated[float, Field(ge=15, le=3600)] = 60.0
     random_plants: Annotated[int, Field(ge=0, le=500)] = 20
     seed: Annotated[int, Field(ge=0)] = 1
@@ -210,6 +216,7 @@ class RequirementSection(Section):
 
     @property
     def unit(self) -> str:
+        """Unit of the limit."""
         return UNITS.get(self.quantity, "dB")
 
 
@@ -263,7 +270,7 @@ def read_design(path: str | Path) -> Design:
     return design_from_table(read_toml(path, "a design file such as designs/avis_z_phix.toml"), path)
 
 
-def design_from_table(table: dict, file: object = None) -> Design:
+def design_from_table(table: dict[str, Any], file: object = None) -> Design:
     """Check a design given as nested dictionaries."""
     design = validated(Design, table, file)
     try:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,8 @@ def _clarabel() -> str:
 
     A = np.array([[2.0, 1.0], [1.0, 3.0]])
     t = cp.Variable()
-    cp.Problem(cp.Minimize(t), [t * np.eye(2) - A >> 0]).solve(solver=cp.CLARABEL)
+    problem: Any = cp.Problem(cp.Minimize(t), [t * np.eye(2) - A >> 0])
+    problem.solve(solver=cp.CLARABEL)
     return _near(float(np.asarray(t.value)), float(np.max(np.linalg.eigvalsh(A))), 1e-6)
 
 

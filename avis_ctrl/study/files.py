@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.files import FULL, not_written, write_whole
+from avis_ctrl.files import FULL, not_written
 
 
 def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
@@ -58,11 +58,6 @@ def require_other(out: Path, *inputs: Path | str | None) -> None:
         with contextlib.suppress(OSError):
             if one is not None and out.samefile(one):
                 raise InputError("expected a file other than the input file", field="--out", value=str(out))
-
-
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Write `as_json` to a file atomically."""
-    write_whole(path, as_json(value))
 
 
 def as_json(value: dict[str, Any]) -> bytes:

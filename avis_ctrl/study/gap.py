@@ -32,7 +32,7 @@ from avis_ctrl.study.gap_files import converter_limits
 from avis_ctrl.study.identification import amplifier_corner, amplifier_words
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.record_checks import check_campaign
-from avis_ctrl.study.rig_channels import in_words_of
+from avis_ctrl.study.rig_channels import with_rig_names
 from avis_ctrl.study.workers import each
 
 Progress = Callable[[str], None]
@@ -40,7 +40,7 @@ Progress = Callable[[str], None]
 NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
               "spikes", "missing samples")
 # Minimum number of samples of a record; with fewer, neither the gates nor a held-out third give any information.
-FEWEST = 300
+MIN_SAMPLES = 300
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     if not isinstance(measured, Campaign):
         raise InputError("expected records in time: frequency responses do not distinguish faults of a signal from "
                          "those of the table", field="measurement")
-    named = in_words_of(rig, measured)
-    assert isinstance(named, Campaign)  # in_words_of keeps the type
+    named = with_rig_names(rig, measured)
+    assert isinstance(named, Campaign)  # with_rig_names keeps the type
     measured = named
     _require_records(measured, rig)
     if options.band_Hz is not None:
@@ -123,8 +123,9 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         seconds = time.monotonic() - began
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
         gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *known, *stops))
-        design, note = _design(gap, options, progress)
-    return GapFinding(gap, measured, findings, gap_provenance(measured, rig, options, seconds), design, note)
+        design, note, design_sha256 = _design(gap, options, progress)
+    return GapFinding(gap, measured, findings, gap_provenance(measured, rig, options, seconds, design_sha256), design,
+                      note)
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
@@ -135,8 +136,8 @@ def _require_records(measured: Campaign, rig: Rig) -> None:
         raise InputError(f"expected the rig's own {rig.sample_rate_Hz:g} Hz", field="sample_rate_Hz",
                          value=measured.sample_rate_Hz)
     for record in measured.records:
-        if record.header.samples < FEWEST:
-            raise InputError(f"expected at least {FEWEST} samples", field=f"record {record.header.name}: samples",
+        if record.header.samples < MIN_SAMPLES:
+            raise InputError(f"expected at least {MIN_SAMPLES} samples", field=f"record {record.header.name}: samples",
                              value=record.header.samples)
 
 
@@ -146,15 +147,20 @@ def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress
     return check_campaign(measured, model, options.despite_gates, progress, NAMED_HERE)
 
 
-def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEffect | None, str]:
+def _design(gap: Gap, options: GapOptions, progress: Progress) -> tuple[DesignEffect | None, str, str | None]:
+    """The comparison of controllers, or the reason why there is none; and the SHA-256 of the design file."""
+    path, sha256 = options.design_file, None
     if not options.design:
-        return None, ""
-    if options.design_file is None:
+        return None, "", None
+    if path is None:
         progress("no design file given: controllers with the weights of the shipped AVIS design")
+    else:
+        with contextlib.suppress(OSError):  # the same error of `design_effect` names the file
+            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()  # before the synthesis, which takes minutes
     try:
-        return design_effect(gap, options.design_file, progress), ""
+        return design_effect(gap, path, progress), "", sha256
     except AvisError as error:
-        return None, f"no comparison of controllers: {error}"
+        return None, f"no comparison of controllers: {error}", sha256
 
 
 def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -171,12 +177,13 @@ def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.
     return [(both[0][record.header.name], both[1][record.header.name]) for record in campaign.records]
 
 
-def gap_provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float) -> dict[str, Any]:
+def gap_provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float,
+                   design_sha256: str | None = None) -> dict[str, Any]:
+    """Provenance of a gap search; design_sha256 : of the design file, None if none was used."""
     data, own = digest(measured), options.own_effects
     further = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
                                       "own_effects_sha256": own.sha256}
-    if options.design_file is not None:
-        with contextlib.suppress(OSError):  # the file was not used then; design_note has the reason
-            further["design_sha256"] = hashlib.sha256(options.design_file.read_bytes()).hexdigest()
+    if design_sha256 is not None:
+        further["design_sha256"] = design_sha256
     return provenance(rig, repr(options) + data, options.seed, seconds, ("numpy", "scipy", "numba", "h5py"),
                       measurement=measured.source, **further, measurement_sha256=data, settings=tuning_values())

@@ -22,6 +22,7 @@ from avis_ctrl.gap.axis.simulation import predicted
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 
 MODEL_FILE = "axis_model.json"
+FILES = "gap.json", "gap.html", "gap.pdf", MODEL_FILE
 
 
 def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, Any],
@@ -35,10 +36,11 @@ def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, A
                                                                               ).encode()).hexdigest(),
             "options": options, "settings": asdict(SETTINGS)}
     files = {"gap.json": _json({**gap.to_json(), "provenance": made}),
-             **dict(zip(("gap.html", "gap.pdf"), reports(gap, source, made), strict=True))}
+             **dict(zip(FILES[1:3], reports(gap, source, made), strict=True))}
     if "reading" in gap.model:
         files[MODEL_FILE] = _json({"format": "avis-axis-model", "version": 1, **gap.model})
-    write_together(folder, files)
+    # A model of an earlier run of another kind is removed: `avis predict` would use it.
+    write_together(folder, files, [folder / name for name in FILES])
     return list(files)
 
 
@@ -79,7 +81,7 @@ def write_axis_predictions(folder: Path, paths: Sequence[Path], out: Path) -> li
     records, rate = signals_in(kind, paths, reading)
     if abs(rate / model["rate_Hz"] - 1) > 1e-3:
         raise InputError(f"expected records of {model['rate_Hz']:g} Hz, as the model's", field="sample_rate_Hz",
-        value=rate)
+                         value=rate)
     errors = []
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "kind": kind})

@@ -27,9 +27,10 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
-from avis_ctrl.study.gap_plant import CARRIED, carried, delay_order, plant_of, six_dof_is_stable, wiring_of
+from avis_ctrl.study.gap_plant import DESCRIBED_IN, delay_order, design_files, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.gap_uncertainty import FitUncertainty, fit_uncertainty
 from avis_ctrl.study.identification_design import default_design, default_keep, design_toml
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
@@ -37,7 +38,6 @@ from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 Progress = Callable[[str], None]
-SLACK = 5e-3
 # As in designs/avis_z_phix.toml.
 PARAMETERS_PERCENT = {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.c_z": 30.0}
 
@@ -125,8 +125,8 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
     with threadpool_limits(1):
         # The second-order terms of large rotations vanish at rest.
         before, after = (model.without(f"{LargeMotion.name}@payload") for model in (gap.baseline, gap.updated))
-        signals = [f"{one.name}@{one.location}" for one in getattr(gap, "effects", ()) if not one.label]
-        asked, covariance = design_for(gap.baseline.rig, design), getattr(gap, "covariance", None)
+        signals = [f"{one.name}@{one.location}" for one in gap.effects if not one.label]
+        asked, covariance = design_for(gap.baseline.rig, design), gap.covariance
         uncertainty = None
         if covariance is not None:
             progress("uncertainty: the fit's covariance as a few blocks")
@@ -186,7 +186,7 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
     held = "all" if not left_out else "none" if len(left_out) == len(updated.effects) else "some"
     words = (*_outcome(before, after, new, design.synthesis.target_mu, held), *_unchecked(not_checked), *notes,
              *(uncertainty.sentences() if uncertainty else ()), *_other_ranges(in_files_design, uncertainty),
-             *_told(realised, design, new_rig, updated, when, in_files, not_in_files))
+             *_remarks(realised, design, new_rig, updated, when, in_files, not_in_files))
     return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
                         time.monotonic() - began, not_checked, uncertainty)
 
@@ -241,7 +241,7 @@ def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace
 def start_files(design: Design, model: TableModel, when: float = 0.0
                 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
     """rig.toml and design.toml of a model by name, labels of the effects that they contain, and of the others."""
-    found = carried(design, model, when)
+    found = design_files(design, model, when)
     held = ", ".join(found.inside) or "none"
     header = f"{found.rig.name}, updated by avis gap\neffects in this folder's rig.toml and design.toml: {held}"
     if found.outside:
@@ -321,8 +321,8 @@ def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[st
             f"{ranges or 'none'}, so that `avis design` finds another mu."]
 
 
-def _told(realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, inside: Sequence[str],
-          outside: Sequence[str]) -> list[str]:
+def _remarks(realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, inside: Sequence[str],
+             outside: Sequence[str]) -> list[str]:
     """Sentences on the accuracy of the figures and on where the effects are described."""
     if not model.effects:
         return []
@@ -340,7 +340,8 @@ def _told(realised: Realised, design: Design, plant_rig: Rig, model: TableModel,
         said.append(f"Stiffness is taken at the {'begin' if when < 0 else 'end'} of the campaign, where mu is larger.")
     by_label = {one.label: one.effect.name for one in model.effects}
     if inside:
-        where = [f"{label} ({CARRIED[by_label[label]]})" if by_label[label] in CARRIED else label for label in inside]
+        places = {label: DESCRIBED_IN.get(by_label[label]) for label in inside}
+        where = [f"{label} ({place})" if place else label for label, place in places.items()]
         said.append(f"rig.toml and design.toml hold {', '.join(where)}: `avis design` runs on the updated model.")
     if outside:
         said.append(f"No rig or design file holds {', '.join(outside)}: only the figures here have it in them, and "

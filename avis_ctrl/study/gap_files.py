@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +17,6 @@ from avis_ctrl.files import write_together
 from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters
@@ -31,12 +31,14 @@ from avis_ctrl.study.files import as_json
 from avis_ctrl.study.gap_names import (
     BASELINE_FILE,
     BASELINE_RIG,
+    DESIGN_FOLDER,
     GAP_FILE,
     GAP_FILES,
     GAP_REPORTS,
     UPDATED_FILE,
     UPDATED_RIG,
 )
+from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification_output import identified_rig
 
 # Named effects that act on the signals only and cannot be predicted from u and floor.
@@ -45,10 +47,11 @@ UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known"
 
 
 def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | None = None,
-              told: Mapping[str, Any] | None = None) -> list[Path]:
+              content: Mapping[str, Any] | None = None, design: Mapping[str, str] | None = None) -> list[Path]:
     """Write all files or none; gap.json is last, so its presence shows that the others are complete.
 
-    told : content of gap.json; by default the gap's own without provenance.
+    content : of gap.json; by default the gap's own without provenance.
+    design : contents of the files in the folder design, by name; those of an earlier `avis gap` are removed.
 
     Raises ComputationError if the disk cannot store the files.
     """
@@ -57,10 +60,19 @@ def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | No
         UPDATED_RIG: _toml(gap.updated, "the rig with the named effects, all parameters refitted", gap.covariance),
         BASELINE_FILE: json.dumps(model_to_dict(gap.baseline), indent=1, allow_nan=False),
         UPDATED_FILE: json.dumps(model_to_dict(gap.updated), indent=1, allow_nan=False),
-        GAP_REPORTS[0]: html, GAP_REPORTS[1]: pdf, GAP_FILE: as_json(dict(told or gap.to_json()))}
-    contents = {name: content.encode() if isinstance(content, str) else content for name, content in texts.items()
-                if content is not None}
-    return write_together(folder, contents, [folder / name for name in GAP_FILES])
+        **{f"{DESIGN_FOLDER}/{name}": text for name, text in (design or {}).items()},
+        GAP_REPORTS[0]: html, GAP_REPORTS[1]: pdf, GAP_FILE: as_json(dict(content or gap.to_json()))}
+    contents = {name: text.encode() if isinstance(text, str) else text for name, text in texts.items()
+                if text is not None}
+    return write_together(folder, contents, [*(folder / name for name in GAP_FILES), *_earlier_design(folder)])
+
+
+def _earlier_design(folder: Path) -> list[Path]:
+    """Design files that an earlier `avis gap` wrote, by its gap.json: those of the user remain."""
+    with contextlib.suppress(InputError):
+        if read_gap(folder).get("design"):
+            return [folder / DESIGN_FOLDER / name for name in (RIG_FILE, DESIGN_FILE)]
+    return []
 
 
 def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
@@ -222,8 +234,8 @@ def converter_limits(model: TableModel, campaign: Campaign, effects: Sequence[Ma
     effects : named effects and traces (very small effects), as in gap.json.
     """
     n = len(campaign.y_names)
-    known = campaign.y_unit == "V" and model.rig.acquisition is not None
-    low, high = (np.full(n, one) for one in (nominal_converter(model.rig).limits_V if known else (-np.inf, np.inf)))
+    converter = model.rig.converter if campaign.y_unit == "V" else None
+    low, high = (np.full(n, one) for one in (converter.limits_V if converter else (-np.inf, np.inf)))
     for one in effects:
         if one["name"] != "sensor_quantisation" or one.get("location") not in campaign.y_names:
             continue

@@ -27,12 +27,12 @@ from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
+from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant, edge_levers
 from avis_ctrl.uncertainty.generalized_plant import Part
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 # Effects whose linear part a rig or design file can describe, and where.
-CARRIED: Mapping[str, str] = {
+DESCRIBED_IN: Mapping[str, str] = {
     "com_offset": "the rig's centre of mass", "product_of_inertia": "the rig's inertia",
     "actuator_gain": "the motor's force constant in the rig file",
     "sensor_gain": "the sensor's sensitivity in the rig file", "loop_delay": "the rig's loop delay",
@@ -46,7 +46,7 @@ DELAY_ERROR = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class DesignFiles:
     """A model as files of `avis design`: rig, design, and labels of the effects inside and outside these files."""
 
     rig: Rig
@@ -126,7 +126,7 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     """The rig's motion, and the decoded deviations of the sensors and decoded effect of gravity."""
     old = next(part.system for part in plant.full.parts if part.name == "rig")
     sensors, n = list(model.sensors.names), len(plant.axes)
-    lever = np.array([1 / model.rig.edge_m if axis.endswith("_edge") else 1.0 for axis in plant.axes])
+    keep = [axis.removesuffix("_edge") for axis in plant.axes]
     known = [k for k, name in enumerate(plant.sensors) if name in sensors]
     decoding = plant.decoding[:, known]
     names = [plant.sensors[k] for k in known]
@@ -134,8 +134,7 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     dot = wrapped.select([f"{a}_dot" for a in plant.axes] + [f"{kind}_{k}" for kind in ("deviation", "tilt")
                                                              for k in names], list(old.inputs))
     _, rows = model.effective.rig.sensor_rows()
-    kept = [COORDINATES.index(axis.removesuffix("_edge")) for axis in plant.axes]
-    own = plant.decoding @ (rows[:, kept] * lever)
+    own = plant.decoding @ (rows[:, [COORDINATES.index(name) for name in keep]] * (1 / edge_levers(model.rig, keep)))
     left = np.block([[own, decoding, np.zeros_like(decoding)],
                      [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
     C, D = np.vstack([plain.C, left @ dot.C]), np.vstack([plain.D, left @ dot.D])
@@ -182,7 +181,7 @@ def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: 
     return lft_lower(open_loop, K).is_stable()
 
 
-def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
+def design_files(design: Design, model: TableModel, when: float = 0.0) -> DesignFiles:
     """Rig and design for `avis design` on a model, as far as the files can describe its effects.
 
     The controller knows the sensitivities and force constants of the file: `avis design` calibrates them away.
@@ -200,7 +199,7 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
     for one in model.effects:
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
-        fits = name in CARRIED and not (name == "actuator_lag" and lag_known) and not (
+        fits = name in DESCRIBED_IN and not (name == "actuator_lag" and lag_known) and not (
             name == "sensor_gain" and isinstance(rig, Halcyonics))
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_lag":
@@ -220,8 +219,8 @@ def carried(design: Design, model: TableModel, when: float = 0.0) -> Carried:
             for name, stiffness in each.items():
                 mount, axis = model.rig.mount_of(name)[0].split(".")  # type: ignore[attr-defined]
                 add(f"{mount}.k_{axis}", float(stiffness))
-    return Carried(_with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside),
-                   tuple(outside))
+    return DesignFiles(_with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside),
+                       tuple(outside))
 
 
 def _with_sensitivity(rig: Any, model: TableModel, factors: Mapping[str, float]) -> Any:

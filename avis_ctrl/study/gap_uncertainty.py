@@ -33,9 +33,8 @@ from avis_ctrl.identification.directions import (
 )
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.plant import Wiring
+from avis_ctrl.study.plant import Wiring, neglected_dynamics
 from avis_ctrl.uncertainty.uncertain_rig import UncertainEquation
-from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class FitUncertaintySettings:
     without_dynamics : the same as a fraction of the response, for a design without neglected dynamics.
     band_Hz, points : frequency grid of the comparison: the range of transmissibility, fine compared with the modes'
         width.
-    alike : relative cut-off below which combinations of drives are not used to represent changes of sensors. Adjacent
+    rcond : relative cut-off below which combinations of drives are not used to represent changes of sensors. Adjacent
         drives would otherwise oppose each other with many times their force to represent a tilt.
     draws : number of tables drawn from the covariance to estimate products of changes.
     """
@@ -56,7 +55,7 @@ class FitUncertaintySettings:
     without_dynamics: float = NEGLIGIBLE
     band_Hz: tuple[float, float] = (0.1, 100.0)
     points: int = 200
-    alike: float = 0.02
+    rcond: float = 0.02
     draws: int = 64
 
     @property
@@ -153,7 +152,7 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
     # product.
     drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
     alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
-                     settings.alike)
+                     settings.rcond)
     inside[others] = np.tensordot(alike, inside[drives], 1)
     elsewhere = _box(_turned(np.tensordot(S.T, seen - inside, 1)), confidence)
     root = S.copy()
@@ -251,8 +250,7 @@ def _allowed(design: Design, omega: np.ndarray, settings: FitUncertaintySettings
     chains = design.uncertainty.actuator_chains
     if chains is None:
         return np.ones(len(omega)), np.full(len(omega), settings.without_dynamics)
-    dynamics = NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100
-                                 ).magnitude(omega)
+    dynamics = neglected_dynamics(chains).magnitude(omega)
     return dynamics, settings.left_out * dynamics
 
 

@@ -41,7 +41,7 @@ from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
 from avis_ctrl.study.plausible_fit import far_from_file
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.record_checks import check_campaign
-from avis_ctrl.study.rig_channels import in_words_of
+from avis_ctrl.study.rig_channels import with_rig_names
 
 Progress = Callable[[str], None]
 CAUTION = ("the standard deviations include only the noise of these records; values that were not fitted (such as "
@@ -124,7 +124,7 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
     ComputationError : a fit that does not converge.
     """
     options, began = options or IdentifyOptions(), time.monotonic()
-    measured = in_words_of(rig, measured)
+    measured = with_rig_names(rig, measured)
     _check(measured, options)
     with threadpool_limits(1):
         model = start_model(measured, rig, options)
@@ -220,7 +220,8 @@ def _gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options
     return check_campaign(measured, model, options.despite_gates, progress)
 
 
-def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions):
+def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> tuple[
+        Split | None, Campaign | FrequencyResponse, Campaign | FrequencyResponse, tuple[float, float]]:
     """Split, data to fit, held-out data, and the band."""
     if isinstance(measured, FrequencyResponse):
         band = options.band_Hz or (float(measured.frequency_Hz[0]), float(measured.frequency_Hz[-1]))
@@ -280,7 +281,8 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
 
 
 def identification_provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
-                ) -> dict[str, Any]:
+                              ) -> dict[str, Any]:
+    """Provenance of an identification, with the hash of the measurement."""
     if isinstance(measured, Campaign):
         data, source = digest(measured), measured.source
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -26,6 +25,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
 from avis_ctrl.study.identified_uncertainty import InDesign, in_design
+from avis_ctrl.study.toml_text import toml_text, toml_value
 from avis_ctrl.study.uncertainty_file import UncertaintyFile
 from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from avis_ctrl.study.identification import Identification
 
 # Minimum uncertainty of the drives: changes between a campaign and the use of its model are not in the measurement.
-LEAST_PERCENT = 1.0
+MIN_PERCENT = 1.0
 # Designs for z and phi_x by kind of rig, as in designs/*.toml; rig and uncertainty are filled in.
 _COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
 _AVIS: dict[str, Any] = _COMMON | {
@@ -58,8 +58,11 @@ _HALCYONICS: dict[str, Any] = _COMMON | {
     "requirement": _AVIS["requirement"]}
 
 
-def design_files(found: Identification, template: Path | Design | None = None) -> dict[str, str]:
-    """Contents of uncertainty.json and design.toml by name; with rig.toml in the same folder, `avis design` reads them.
+def design_start(found: Identification, template: Path | Design | None = None) -> tuple[dict[str, str], InDesign]:
+    """Contents of uncertainty.json and design.toml by name, and the uncertainty of the design, for the report.
+
+    `avis design` reads the files with rig.toml in the same folder. The filter of the uncertainty covers what was
+    measured; a design adds its declared uncertainty of the drives where nothing was measured.
 
     Parameters
     ----------
@@ -70,15 +73,6 @@ def design_files(found: Identification, template: Path | Design | None = None) -
     ------
     InputError : an invalid template; coordinates that the measured channels cannot drive or distinguish.
     ComputationError : records in which the actuators cannot be separated, so that no spread can be measured.
-    """
-    return design_start(found, template)[0]
-
-
-def design_start(found: Identification, template: Path | Design | None = None) -> tuple[dict[str, str], InDesign]:
-    """`design_files`, and the uncertainty of the design that follows from the measurement, for the report.
-
-    The filter covers what was measured; a design adds its declared uncertainty of the drives where nothing was
-    measured.
     """
     design = _template(found, template)
     spread = measured_spread(found, tuple(design.keep))
@@ -135,32 +129,7 @@ def identification_design(content: UncertaintyFile, template: Design, rig: Rig) 
 
 def design_toml(design: Design) -> str:
     """A design as a file that `read_design` reads back."""
-    table = design.model_dump(exclude_none=True)
-    return "\n".join("\n".join(lines) + "\n" for lines in _sections("", table))
-
-
-def _sections(title: str, table: dict[str, Any]) -> list[list[str]]:
-    """Lines of a section and of its subsections; a section without keys is omitted."""
-    inner = {key: value for key, value in table.items() if isinstance(value, dict)}
-    many = {key: value for key, value in table.items() if value and isinstance(value, list)
-            and isinstance(value[0], dict)}
-    plain = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if key not in inner and key not in many]
-    found = [[f"[{title}]", *plain] if title else plain] if plain else []
-    before = f"{title}." if title else ""
-    for key, value in inner.items():
-        found += _sections(before + _key(key), value)
-    return found + [[f"[[{before}{_key(key)}]]", *(f"{_key(k)} = {_value(v)}" for k, v in one.items())]
-                    for key, value in many.items() for one in value]
-
-
-def _key(key: str) -> str:
-    return key if key.replace("_", "").isalnum() and key.isascii() else _value(key)
-
-
-def _value(value: Any) -> str:
-    # JSON and TOML write numbers, booleans, strings and lists alike, except for one character that TOML requires
-    # escaped.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return toml_text(design.model_dump(exclude_none=True))
 
 
 def _template(found: Identification, template: Path | Design | None) -> Design:
@@ -207,7 +176,7 @@ def assumed_weights(rig: Rig) -> str:
     for what, one in (("shipped", shipped), ("this table", rig)):
         eom = one.equations_of_motion()
         modes = eom.natural_frequencies().frequencies_Hz
-        lines.append(f"  {what}: {_value(one.name)}, {eom.M[0, 0]:.4g} kg, modes from {modes.min():.3g} to "
+        lines.append(f"  {what}: {toml_value(one.name)}, {eom.M[0, 0]:.4g} kg, modes from {modes.min():.3g} to "
                      f"{modes.max():.3g} Hz")
     lines.append("Before you design, change them, and add [floor] if needed, to suit this table.")
     return "".join(f"# {line}\n" for line in lines)
@@ -225,5 +194,5 @@ def _chains(asked: ChainUncertainty, content: UncertaintyFile, template: Design)
     spread = next(one for one in content.spread if sorted(one.keep) == keep).values()
     median = 100 * float(np.median(spread.bound(template.uncertainty.confidence_percent / 100)))
     digit = 10 ** np.floor(np.log10(max(median, 1e-9)))
-    low = float(max(np.ceil(median / digit - 1e-9) * digit, LEAST_PERCENT))
+    low = float(max(np.ceil(median / digit - 1e-9) * digit, MIN_PERCENT))
     return asked.model_copy(update={"low_percent": round(min(low, asked.low_percent), 12)})

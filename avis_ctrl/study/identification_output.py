@@ -132,9 +132,11 @@ def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
 def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
     """The model with the geophone suspensions of an identification. Raises InputError as `read_identified`."""
     known = _result(folder).get("suspensions", {})
+    if not model.sensors.suspensions:  # ideal sensors
+        return model
     try:
         own = tuple((float(known[name][0]), float(known[name][1])) if name in known else old
-                    for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=False))
+                    for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=True))
     except (KeyError, IndexError, TypeError, ValueError):
         raise InputError("expected corner and damping ratio by name", file=folder / RESULT_FILE, field="suspensions",
                          value=known) from None
@@ -160,7 +162,7 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
     model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),
                     turning=turning)
     model = _suspended(model, folder)
-    limits = _converter_limits(rig) if campaign.y_unit == "V" else None
+    limits = rig.converter.limits_V if campaign.y_unit == "V" and rig.converter else None
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "rig": rig.name})
         for record in campaign.records:
@@ -179,9 +181,3 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
                 u, floor = model_inputs(model, record.load(start, min(stop + 1, h.samples)))
                 y = predictor.read(u[:stop - start], floor)
                 data[start:stop] = y if limits is None else np.clip(y, *limits)
-
-
-def _converter_limits(rig: Rig) -> tuple[float, float] | None:
-    if rig.acquisition is None:
-        return None
-    return -rig.acquisition.adc_range_V, rig.acquisition.adc_range_V * (1 - 2.0 ** (1 - rig.acquisition.adc_bits))

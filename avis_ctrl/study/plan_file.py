@@ -5,13 +5,13 @@ Every key has its unit in its name. Errors are one line that names file, field, 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Literal
 
 from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
+from avis_ctrl.study.toml_text import toml_text
 
 __all__ = ["CampaignPlan", "default_plan", "plan_from_table", "plan_toml", "read_plan"]
 
@@ -31,7 +31,7 @@ def read_plan(path: str | Path) -> CampaignPlan:
     return plan_from_table(read_toml(path, "a campaign plan with [[record]] sections"), path)
 
 
-def plan_from_table(table: dict, file: object = None) -> CampaignPlan:
+def plan_from_table(table: dict[str, Any], file: object = None) -> CampaignPlan:
     """Check a plan given as nested dictionaries."""
     return validated(CampaignPlan, table, file)
 
@@ -47,7 +47,7 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
     """
     ambient = {} if rig.ambient is not None else {"velocity_rms_m_per_s": AMBIENT_M_PER_S}
     most = 2 if scheme == "zippered" else 1
-    records: list[dict] = [{"excitation": "multisine", "level_percent": level, "records": count}
+    records: list[dict[str, Any]] = [{"excitation": "multisine", "level_percent": level, "records": count}
                            for level, count in ((12.5, 1), (25.0, 1), (50.0, most))]
     records += [{"excitation": "noise", "level_percent": 50.0}, {"excitation": "rest"},
                 {"excitation": "floor", "floor_rms_m_per_s": SHAKEN_M_PER_S, "band_Hz": [0.5, 60.0]}]
@@ -58,19 +58,4 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
 
 def plan_toml(plan: CampaignPlan) -> str:
     """The plan as a file that `read_plan` reads back; keys that are absent by default remain absent."""
-    content = plan.model_dump(exclude_none=True)
-    records, effects = content.pop("record"), content.pop("effect")
-    sections = [("", {key: value for key, value in content.items() if not isinstance(value, dict)})]
-    sections += [(f"[{key}]", value) for key, value in content.items() if isinstance(value, dict)]
-    sections += [("[[effect]]", effect) for effect in effects]
-    sections += [("[[record]]", record) for record in records]
-    return "\n".join("\n".join([title] * bool(title) + [f"{key} = {_toml(value)}" for key, value in lines.items()])
-                     + "\n" for title, lines in sections)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_toml(key)} = {_toml(one)}" for key, one in value.items()) + " }"
-    # JSON and TOML write numbers, booleans, strings and lists alike, except for one character that TOML requires
-    # escaped.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return toml_text({key: value for key, value in plan.model_dump(exclude_none=True).items() if value != []})

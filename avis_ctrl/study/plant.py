@@ -26,6 +26,7 @@ from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.rigs.sensing import NoiseGroup, Sensing, sensing
+from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_file import ChainUncertainty, Design, EffortSection
 from avis_ctrl.study.identified_uncertainty import RESPONSE, InDesign, in_design
 from avis_ctrl.uncertainty.blocks import ComplexFull
@@ -89,10 +90,12 @@ class DesignPlant:
 
     @property
     def floor_velocities(self) -> list[str]:
+        """Inputs of the floor motion, one per axis."""
         return [f"floor_{axis}_dot" for axis in self.axes]
 
     @property
     def velocities(self) -> list[str]:
+        """Outputs of the payload's velocity, one per axis."""
         return [f"{axis}_dot" for axis in self.axes]
 
     def effort_weight(self, axis: str) -> Weight:
@@ -101,6 +104,7 @@ class DesignPlant:
 
     @property
     def volts(self) -> list[str]:
+        """Outputs of the drive voltages."""
         return [f"{name}_command" for name in self.actuators]
 
 
@@ -134,7 +138,7 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     directions = identified.directions if identified else ()
     uncertain = uncertain_rig(rig, [*design.uncertainty.of(rig), *directions, *fit], design.keep)
     axes = uncertain.coordinates
-    lever = np.array([rig.edge_m if name != axis else 1.0 for name, axis in zip(axes, design.keep, strict=True)])
+    lever = edge_levers(rig, design.keep)
     allocation = actuator_axes(rig, design.keep)
     # An edge force F at lever e is a moment F e.
     matrix = allocation.allocation * lever
@@ -190,9 +194,14 @@ def _identified(design: Design, rig: Rig) -> InDesign | None:
         return None
     declared, factor = None, 1.0
     if (chains := design.uncertainty.actuator_chains) is not None:
-        declared = _neglected(chains)
+        declared = neglected_dynamics(chains)
         factor = channels_gain(rig, design.keep)
     return in_design(content, rig, design.keep, design.uncertainty.confidence_percent / 100, declared, factor)
+
+
+def edge_levers(rig: Rig, keep: Sequence[str]) -> np.ndarray:
+    """(n,) displacement of the edge per unit of each coordinate: the edge lever for rotations, otherwise 1."""
+    return lever_arms(rig)[[COORDINATES.index(name) for name in keep]]
 
 
 def channels_gain(rig: Rig, keep: Sequence[str]) -> float:
@@ -201,7 +210,7 @@ def channels_gain(rig: Rig, keep: Sequence[str]) -> float:
     With T A = I, any errors E = diag(e_k), |e_k| <= 1, give |T E A| <= |T| |A|; this is 1 if every channel serves the
     axes alike.
     """
-    lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    lever = edge_levers(rig, keep)
     found = actuator_axes(rig, keep)
     used = np.any(np.abs(found.allocation) > 1e-9 * np.abs(found.allocation).max(), axis=1)
     T = found.matrix[[COORDINATES.index(name) for name in keep]][:, used] / lever[:, None]
@@ -283,7 +292,8 @@ def _response_error(diagram: Diagram, identified: InDesign, axes: tuple[str, ...
                       [f"z:{tag}" for tag in tags])
 
 
-def _neglected(chains: ChainUncertainty) -> NeglectedDynamics:
+def neglected_dynamics(chains: ChainUncertainty) -> NeglectedDynamics:
+    """The filter of the neglected dynamics of channels."""
     return NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100)
 
 
@@ -295,7 +305,7 @@ def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple
         if uncertainty is None:
             diagram.add(label, gain([[1.0]], [read], [made]), "actuator")
             continue
-        weight = _neglected(uncertainty)
+        weight = neglected_dynamics(uncertainty)
         weights.setdefault(title.format("*"), weight)
         diagram.add(f"W {label}", weight.system(read, f"z:{label}"), "weight")
         diagram.add(label, gain([[1.0, 1.0]], [read, f"w:{label}"], [made]), "actuator")
@@ -414,7 +424,7 @@ def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[
                    rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
     """Errors of the decoded velocities by the neglected dynamics of each sensor chain: decoding (W Delta) rows."""
     used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
-    weight = _neglected(uncertainty)
+    weight = neglected_dynamics(uncertainty)
     weights["sensor chain *"] = weight
     labels = [f"sensor chain {sensors[k]}" for k in used]
     for k, label in zip(used, labels, strict=True):

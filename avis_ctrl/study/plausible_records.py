@@ -21,7 +21,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
-from avis_ctrl.rigs.plausible_ranges import RANGES
+from avis_ctrl.rigs.plausible_ranges import RANGES, Range
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ UNITS = ("kg", "kg m^2", "N/m", "N s/m", "N m/rad", "N m s/rad")
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RecordSpectra:
     """The recorded data, at some lines of some records.
 
     peak_u : (n_u,) largest voltage of each drive. peak_y : largest value of all sensors. omega : (n,) rad/s.
@@ -147,7 +147,7 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
                          f"the rig file has {model.rig.sample_rate_Hz:g} Hz; is the rig file's value in kHz, or that "
                          "of the records in mHz?", field="sample_rate_Hz of the records",
                          value=measured.sample_rate_Hz)
-    seen = look(measured, settings)
+    seen = record_spectra(measured, settings)
     if seen is None:
         return ()
 
@@ -165,11 +165,11 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     left = [one for one in found if one[0] <= settings.fits and one[0] <= settings.share * max(before, worst)]
     if left:
         _, field, value, said = left[0]
-        raise InputError(f"the recorded y is {_said(now)} the y that the rig's model predicts for these voltages; "
+        raise InputError(f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages; "
                          f"{said}", field=field, value=value)
     if before > settings.hopeless:
-        raise InputError(f"the recorded y is {_said(now)} the y that the rig's model predicts for these voltages, and "
-                         "no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
+        raise InputError(f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages, "
+                         "and no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
                          "force constants", field="records")
     return doubts
 
@@ -204,7 +204,7 @@ def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, setti
     return tuple(found)
 
 
-def _said(decades: np.ndarray) -> str:
+def _as_text(decades: np.ndarray) -> str:
     middle = [np.nanmedian(column) for column in decades.T if np.isfinite(column).any()]
     low, high = 10 ** min(middle), 10 ** max(middle)
     return f"{low:.3g} times" if high < 1.5 * low else f"{low:.3g} to {high:.3g} times"
@@ -216,7 +216,7 @@ def _worst_channel(decades: np.ndarray, settings: RecordPlausibility) -> float:
     return settings.far * 1.01 if max(each, default=0.0) > 1.5 else 0.0
 
 
-def look(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> Seen | None:
+def record_spectra(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> RecordSpectra | None:
     """Spectra of the first records with drive voltages; None if there are none, or too few samples."""
     driven = [one for one in measured.records if one.header.level_V > 0 or one.header.excitation in ("multisine",
                                                                                                       "noise", "sine")]
@@ -245,13 +245,13 @@ def look(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> Seen | 
     coherence = bands @ estimate.coherence[place] / bands.sum(axis=1)[:, None]
     power = bands @ np.sum(np.abs(Y) ** 2, axis=0)
     answered = np.where((coherence > settings.coherent) & (power > 0), power, np.nan)
-    return Seen(peak_u, peak_y, 2 * np.pi * f, U, answered, bands)
+    return RecordSpectra(peak_u, peak_y, 2 * np.pi * f, U, answered, bands)
 
 
 Candidate = tuple[float, str, object, str]
 
 
-def _candidates(seen: Seen, G: np.ndarray, now: np.ndarray, measured: Campaign, model: ResponseModel,
+def _candidates(seen: RecordSpectra, G: np.ndarray, now: np.ndarray, measured: Campaign, model: ResponseModel,
                 response: Callable[[ResponseModel], np.ndarray], settings: RecordPlausibility) -> Iterator[Candidate]:
     """(remaining distance, field, value, question) for each corrected error, the simplest first."""
     for c in settings.gain_decades:
@@ -282,7 +282,7 @@ def _candidates(seen: Seen, G: np.ndarray, now: np.ndarray, measured: Campaign, 
     yield from _of_rig(seen, model, response, settings)
 
 
-def _of_rig(seen: Seen, model: ResponseModel, response: Callable[[ResponseModel], np.ndarray],
+def _of_rig(seen: RecordSpectra, model: ResponseModel, response: Callable[[ResponseModel], np.ndarray],
             settings: RecordPlausibility) -> Iterator[Candidate]:
     """Errors of each kind of rig parameter; all parameters of a kind have the same factor."""
     known = model.rig.parameters()
@@ -318,7 +318,8 @@ def _kind(name: str) -> str:
     return re.sub(r"_[xyz]$", "", re.sub(r"\d+", "", name))
 
 
-def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseModel) -> tuple[str, object, str]:
+def _common_gain(factor: float, seen: RecordSpectra, measured: Campaign, model: ResponseModel
+                 ) -> tuple[str, object, str]:
     """Question on a factor common to all channels: force constants, sensitivities, units of u and y.
 
     A value beyond a limit is named first, then a value that the factor would bring into the usual range.
@@ -359,7 +360,7 @@ def _common_gain(factor: float, seen: Seen, measured: Campaign, model: ResponseM
     return "unit of y or u", None, f"all channels differ by the same factor: {records} Otherwise check {others}"
 
 
-def _gained(within, value: float, factor: float) -> float:
+def _gained(within: Range, value: float, factor: float) -> float:
     """Change of a value's distance from the middle of the usual range by a factor; negative if it decreases."""
     return within.off_centre(value * factor) - within.off_centre(value)
 

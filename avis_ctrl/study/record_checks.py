@@ -15,17 +15,15 @@ from avis_ctrl.study.plausible_records import records_fit
 
 def expectation(model: ResponseModel) -> Expectation:
     """What the gates compare the records with."""
-    rig, acquisition = model.rig, model.rig.acquisition
-    volts = model.sensors.unit == "V" and acquisition is not None
+    rig, volts = model.rig, model.sensors.unit == "V"
+    converter = rig.converter if volts else None
 
     def response(omega: np.ndarray, inputs: tuple[str, ...]) -> np.ndarray:
         return model.response(omega)[:, :, [model.inputs.index(name) for name in inputs]]
     return Expectation(
-        y_range_V=(-acquisition.adc_range_V, acquisition.adc_range_V * (1 - 2.0 ** (1 - acquisition.adc_bits)))
-        if volts and acquisition else None,
-        y_lsb_V=2 * acquisition.adc_range_V / 2 ** acquisition.adc_bits if volts and acquisition else None,
+        y_range_V=converter.limits_V if converter else None, y_lsb_V=converter.lsb_V if converter else None,
         drive_limits_V=dict(zip(model.actuators, rig.limits_of(model.actuators).tolist(), strict=True)),
-        sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if volts and rig.ambient else None,
+        sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if converter and rig.ambient else None,
         u_names=model.actuators, y_names=model.sensors.names, u_unit="V", y_unit=model.sensors.unit, response=response)
 
 

@@ -7,16 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.simulation.design_check import SimulationCheck
 from avis_ctrl.study.at_rest import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
 from avis_ctrl.study.design_result import AxisGain, ControllerResult, Requirement
 from avis_ctrl.study.limits import no_better_than_none
-
-
-def decibel(value: float) -> float:
-    """20 log10, with -inf for zero."""
-    return 20.0 * float(np.log10(value)) if value > 0 else -np.inf
 
 
 def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
@@ -26,10 +22,10 @@ def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
     """
     if not np.isfinite(skyhook.worst_peak.upper):
         return np.nan
-    return decibel(skyhook.worst_band.lower) - decibel(mu.worst_band.upper)
+    return decibels(skyhook.worst_band.lower) - decibels(mu.worst_band.upper)
 
 
-def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percent: float = 100.0
+def check_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percent: float = 100.0
                ) -> tuple[Requirement, ...]:
     """Requirements that every design must meet, in addition to those of its file.
 
@@ -52,8 +48,8 @@ def judge_loop(check: SimulationCheck, rest: AtRest | None = None, offset_percen
             rest.percent <= offset_percent, "at most", rest.words()),)))
 
 
-def judge(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequence[AxisGain] = ()
-          ) -> tuple[Requirement, ...]:
+def check_requirements(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequence[AxisGain] = ()
+                       ) -> tuple[Requirement, ...]:
     """One row per requirement of the design file, in the order of the file."""
     by_name = {c.name: c for c in controllers}
     mu, skyhook, passive = (by_name.get(name) for name in ("mu", "skyhook", "passive"))
@@ -70,21 +66,21 @@ def judge(design: Design, controllers: Sequence[ControllerResult], by_axis: Sequ
         "mu_gap_percent": ("gap between the bounds of mu at its peak",
                            lambda: 100 * (1 - mu.mu.lower / mu.mu.upper), "the lower bound has its perturbation"),
         "worst_case_peak_transmissibility_dB": (
-            "worst-case peak transmissibility", lambda: decibel(mu.worst_peak.upper), "; ".join(mu.worst_peak.words)),
+            "worst-case peak transmissibility", lambda: decibels(mu.worst_peak.upper), "; ".join(mu.worst_peak.words)),
         "worst_case_band_transmissibility_dB": (
-            f"worst-case transmissibility {band}", lambda: decibel(mu.worst_band.upper),
+            f"worst-case transmissibility {band}", lambda: decibels(mu.worst_band.upper),
             "; ".join(mu.worst_band.words)),
         "passive_peak_transmissibility_dB": (
-            "passive peak transmissibility, nominal", lambda: decibel(passive.peak_transmissibility), ""),
+            "passive peak transmissibility, nominal", lambda: decibels(passive.peak_transmissibility), ""),
         "advantage_over_skyhook_dB": (
             f"worst case {band}: improvement on the tuned skyhook",
             lambda: _advantage(skyhook, mu) if skyhook else np.nan,
-            f"worst case of the skyhook: {decibel(skyhook.worst_band.lower):+.1f} dB in this band, "
-            f"{decibel(skyhook.worst_peak.lower):+.1f} dB at its peak" if skyhook else "no skyhook to compare with"),
+            f"worst case of the skyhook: {decibels(skyhook.worst_band.lower):+.1f} dB in this band, "
+            f"{decibels(skyhook.worst_peak.lower):+.1f} dB at its peak" if skyhook else "no skyhook to compare with"),
         "advantage_on_each_axis_dB": (
             f"worst case {band}: least improvement of any axis on the tuned skyhook",
-            lambda: min((decibel(one.advantage) for one in by_axis), default=np.nan),
-            ", ".join(f"{one.axis} {decibel(one.advantage):+.1f} dB" for one in by_axis)),
+            lambda: min((decibels(one.advantage) for one in by_axis), default=np.nan),
+            ", ".join(f"{one.axis} {decibels(one.advantage):+.1f} dB" for one in by_axis)),
         "fastest_controller_pole_Hz": ("fastest pole of the mu controller",
                                       lambda: np.nan if idle else mu.fastest_pole_Hz,
                                       "no controller better than none was found" if idle else ""),

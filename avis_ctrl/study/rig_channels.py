@@ -16,8 +16,8 @@ USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output")}
 WHAT = {"u": "actuators", "y": "sensors"}
 
 
-def in_words_of(rig: Rig, measured: Campaign | FrequencyResponse,
-                columns: Mapping[str, Sequence[str]] | None = None) -> Campaign | FrequencyResponse:
+def with_rig_names(rig: Rig, measured: Campaign | FrequencyResponse,
+                   columns: Mapping[str, Sequence[str]] | None = None) -> Campaign | FrequencyResponse:
     """The measurement with the rig's name, if the file states none, and the rig's channels, if only numbered.
 
     Numbered channels, if as many as the rig has, are assumed to be in the order of the rig. A note of the campaign

@@ -37,7 +37,7 @@ from avis_ctrl.study.loops import LOOPS_TITLE, tuned_loops
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.random_plants import random_perturbations
-from avis_ctrl.study.requirements import judge, judge_loop
+from avis_ctrl.study.requirements import check_loop, check_requirements
 from avis_ctrl.study.simulation import bare_loop, simulate_study, six_dof_check
 from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
 from avis_ctrl.study.workers import Workers
@@ -65,10 +65,10 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
     # Computations that do not depend on the mu controller run in parallel with the D-K iteration.
     with Workers(beside=True) as workers:
         others, failed = other_controllers(design, plant, rig, progress)
-        early = begin(design, plant, rig, others, workers)
+        early = start_bounds(design, plant, rig, others, workers)
         mu, synthesis = synthesise(design, plant, rig, others, progress, stop)
         compared = compare(design, plant, rig, [mu, *others], failed, progress, early)
-    return conclude(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
+    return finish(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
 
 
 # Controllers from which the D-K iteration starts, by their kind in its history.
@@ -77,7 +77,7 @@ INITIAL = {HINF: "H-infinity, uncertainty as performance", NOMINAL: "H-infinity,
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class Comparison:
     """Controllers in the report's order, failed ones with reasons, the loop of all axes, each axis against skyhook."""
 
     controllers: tuple[ControllerResult, ...]
@@ -107,21 +107,22 @@ def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Pr
 
 
 @dataclass(frozen=True)
-class Early:
+class PendingBounds:
     """Bounds in progress, by controller, and the allowed worst-case peak of the tuned skyhook among them."""
 
-    bounds: Mapping[str, Future]
+    bounds: Mapping[str, Future[Any]]
     peak_limit: float | None
 
 
-def begin(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers) -> Early:
+def start_bounds(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers
+                 ) -> PendingBounds:
     """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design requires."""
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
     jobs = {}
     if limit is not None:
         jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples)
-    return Early(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
+    return PendingBounds(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
 
 
 def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate],
@@ -130,12 +131,15 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
     with threadpool_limits(1):
         def shown(row: Any) -> bool:
             """Called after each iteration; False stops it."""
+            # Numbered as in the report, where the initial controllers are rows of the same table.
             if row.kind in INITIAL:
-                progress(f"initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, order {row.order}")
+                progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, "
+                         f"order {row.order}")
                 return True
             ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
-            progress(f"D-K iteration {row.iteration}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, order "
-                     f"{row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
+            kind = "" if row.kind == "D-K" else f" ({row.kind})"
+            progress(f"step {row.iteration}, D-K iteration{kind}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
+                     f"order {row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
             return not ends
         with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, others)
@@ -143,7 +147,7 @@ def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Ca
         return mu, made
 
 
-def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteration, compared: Compared, seconds: float,
+def finish(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteration, compared: Comparison, seconds: float,
              source: Path | None = None) -> DesignResult:
     """The verdict, the error of the reduction to the kept axes, and the provenance."""
     controllers = compared.controllers
@@ -157,8 +161,8 @@ def conclude(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteratio
         passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in compared.loop.companions.passive]
         notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks())
                       if text)
-    requirements = (*judge_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
-                    *judge(design, controllers, compared.by_axis))
+    requirements = (*check_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
+                    *check_requirements(design, controllers, compared.by_axis))
     return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
                         compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed,
                         compared.by_axis)
@@ -169,7 +173,7 @@ ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
 
 def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
             failed: Sequence[FailedController] = (), progress: Progress = lambda text: None,
-            early: Early | None = None) -> Compared:
+            early: PendingBounds | None = None) -> Comparison:
     """Bounds of every controller, of the tuned loops and the tuned skyhook if required, and the simulation of mu.
 
     Runs on two processes, in parallel with those of `early`. The simulation waits for the bounds of all other
@@ -230,10 +234,10 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
     measured = {name: replace(one, rest=at_rest(bare_loop(design, rig, plant, one.K)) if one.K is not None else None)
                 for name, one in found.items() if isinstance(one, ControllerResult)}
-    return Compared(tuple(measured[name] for name in ORDER if name in measured),
-                    tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop,
-                    tuple(AxisGain(axis, mine, its) for axis, mine, its in
-                          zip(plant.axes, proved, rival, strict=True)))
+    return Comparison(tuple(measured[name] for name in ORDER if name in measured),
+                      tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop,
+                      tuple(AxisGain(axis, mine, its) for axis, mine, its in
+                            zip(plant.axes, proved, rival, strict=True)))
 
 
 def _worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
@@ -274,6 +278,7 @@ def _asked_peaks(design: Design) -> list[float]:
 
 
 def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
+    """Provenance of a design. source : design file."""
     return provenance(rig, design.model_dump_json(), design.simulation.seed, seconds,
                       ("numpy", "scipy", "slycot", "cvxpy", "clarabel", "numba"),
                       design_file=source.name if source else None)

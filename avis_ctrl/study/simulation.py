@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,7 +26,7 @@ from avis_ctrl.study.companions import Companions, design_companions, until_stab
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import ControllerResult, Simulated, SixDofCheck
 from avis_ctrl.study.identified_uncertainty import RESPONSE
-from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.plant import DesignPlant, edge_levers
 from avis_ctrl.study.random_plants import random_perturbations
 
 
@@ -152,7 +153,7 @@ def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, de
     return nominal.with_plant(name, changed, drives, sensors, coupling)
 
 
-def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains: dict, omega: float
+def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains: dict[str, Any], omega: float
                     ) -> StateSpace | None:
     """I + A W(s) Delta(s) T from all drives to all drives; None if the plant has no such error.
 
@@ -165,14 +166,14 @@ def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains:
     n = len(keep)
     W = append(*[plant.weights[RESPONSE].system(f"f{k}", f"z{k}") for k in range(n)])
     axes = actuator_axes(rig, keep)
-    lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+    lever = edge_levers(rig, keep)
     T = axes.matrix[[COORDINATES.index(name) for name in keep]] / lever[:, None]
     error = delta.renamed([f"z{k}" for k in range(n)], [f"w{k}" for k in range(n)]) @ W
     volts = list(axes.actuators)
     return gain(np.eye(len(volts)), volts, volts) + gain(axes.allocation * lever) @ error @ gain(T)
 
 
-def _chain(plant: DesignPlant, chains: dict, kind: str, name: str, omega: float) -> StateSpace | None:
+def _chain(plant: DesignPlant, chains: dict[str, Any], kind: str, name: str, omega: float) -> StateSpace | None:
     """1 + W(s) delta(s) of one channel; None if the channel is certain."""
     if f"{kind} {name}" not in chains:
         return None

@@ -14,13 +14,14 @@ import numpy as np
 from avis_ctrl.classical.skyhook import Skyhook, critical_damping
 from avis_ctrl.classical.tuning import Merit, Scenarios, Search, TuningRange
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
 from avis_ctrl.study.analysis import SETTINGS, SLACK
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
-from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.plant import DesignPlant, edge_levers
 
 # Tilt corner well below the table's modes, roll-off well above the bandwidth of its loops.
 CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
@@ -75,21 +76,21 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
     ------
     ComputationError : no tuning tried, including the classical ones, is stable on the nominal plant.
     """
-    contest = _Contest(plant, design, peak_limit, settings)
+    evaluation = WorstCaseTuning(plant, design, peak_limit, settings)
     classical = classical_loops(plant, rig, design)
-    ranked = [(contest.certified(classical)[0], classical)]
-    task, target = contest.search(rig), settings.room * peak_limit
+    ranked = [(evaluation.certified(classical)[0], classical)]
+    task, target = evaluation.search(rig), settings.room * peak_limit
     points = [task.search.point(1.0, CUSTOMARY_CORNERS_HZ)]
     for _ in range(settings.certified):
-        found, points, task = contest.tuned(task, points, target)
+        found, points, task = evaluation.tuned(task, points, target)
         loops = task.search.skyhook(plant.axes, found)
-        bound, worst = contest.certified(loops)
+        bound, worst = evaluation.certified(loops)
         ranked.append((bound, loops))
         if bound.meets or worst is None:
             break
-        task = contest.learned(task, worst)
+        task = evaluation.with_worst_case(task, worst)
         # The bound lies above the worst case found: the search has to stay below the limit by the same ratio.
-        missed = contest.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
+        missed = evaluation.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
         target = settings.room * peak_limit * min(1.0, missed)
     best, loops = min(ranked, key=lambda one: one[0].key())
     if best.unstable:
@@ -103,15 +104,15 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
         notes.append("this is critical damping with the usual corners: no better tuning was found for the whole "
                      "uncertainty set")
     if not best.meets:
-        reached = (f"this one has the lowest, {_decibel(best.peak):+.2f} dB" if np.isfinite(best.peak)
+        reached = (f"this one has the lowest, {decibels(best.peak):+.2f} dB" if np.isfinite(best.peak)
                    else "none is proved stable for the whole uncertainty set")
-        notes.append(f"no skyhook tuning found has a worst-case peak below {_decibel(peak_limit):+.2f} dB: {reached}")
+        notes.append(f"no skyhook tuning found has a worst-case peak below {decibels(peak_limit):+.2f} dB: {reached}")
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
 
 
 @dataclass(frozen=True, eq=False)
-class _Contest:
-    """Evaluation of all tunings of a plant."""
+class WorstCaseTuning:
+    """Search for a tuning of skyhook loops on a plant, and the bounds that rank the tunings."""
 
     plant: DesignPlant
     design: Design
@@ -120,6 +121,7 @@ class _Contest:
 
     @property
     def band_Hz(self) -> tuple[float, float]:
+        """Band of the design's limit on transmissibility."""
         low, high = self.design.transmissibility.band_Hz
         return low, high
 
@@ -161,14 +163,14 @@ class _Contest:
                            iterations=self.settings.ascent_steps)
         return Merit(float(np.max(found.gain)), float(np.max(found.gain[task.inside])), self.peak_limit), found.delta
 
-    def learned(self, task: Search, worst: MuPeak) -> Search:
+    def with_worst_case(self, task: Search, worst: MuPeak) -> Search:
         """The search with the worst case of a bound added to its samples, and its frequency to the grid."""
         scenarios = task.scenarios
         if np.isfinite(worst.omega) and worst.omega > 0:
             scenarios = scenarios.with_frequencies(worst.omega * np.array(self.settings.beside))
         if worst.delta is not None:
             n_w, n_z = scenarios.deltas.shape[2:]
-            scenarios = scenarios.with_worst(np.broadcast_to(worst.delta[:n_w, :n_z], scenarios.deltas.shape[1:]))
+            scenarios = scenarios.with_delta(worst.delta[:n_w, :n_z])  # a plant: its stability counts
         return replace(task, scenarios=scenarios)
 
     def certified(self, loops: Skyhook) -> tuple[Merit, MuPeak | None]:
@@ -194,7 +196,7 @@ def critical_gains(rig: Rig, axes: Sequence[str]) -> tuple[float, ...]:
     """Classical gains [N s/m] of some axes, rotations at the edge."""
     equations = rig.equations_of_motion()
     kept = [equations.coordinates.index(name) for name in axes]
-    scale = np.array([1.0 / rig.edge_m ** 2 if name.startswith("phi") else 1.0 for name in axes])
+    scale = 1 / edge_levers(rig, axes) ** 2
     return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
 
 
@@ -219,7 +221,3 @@ def at_limits(loops: Skyhook, search: TuningRange) -> list[str]:
 
 def _pair(limits: list[float]) -> tuple[float, float]:
     return limits[0], limits[1]
-
-
-def _decibel(value: float) -> float:
-    return 20.0 * float(np.log10(value))

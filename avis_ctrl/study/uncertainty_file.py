@@ -119,10 +119,12 @@ class UncertaintyFile(Section):
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the identified parameters."""
         return tuple(one.name for one in self.parameter)
 
     @property
     def scale(self) -> np.ndarray:
+        """(n_p,) size of one relative unit of each parameter."""
         return np.array([one.scale for one in self.parameter])
 
     def check_rig(self, rig: Rig) -> None:

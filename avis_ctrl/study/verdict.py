@@ -6,6 +6,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.identifiability_text import listed
+from avis_ctrl.lti.norms import decibels
 from avis_ctrl.study.design_result import DesignResult
 
 
@@ -33,11 +34,11 @@ def all_axes(result: DesignResult) -> str:
     mu, six = result.controller("mu"), result.six_dof
     low, high = result.design.transmissibility.band_Hz
     inside = (six.omega >= 2 * np.pi * low) & (six.omega <= 2 * np.pi * high)
-    peak, band = (20 * float(np.log10(np.max(sigma))) for sigma in (six.kept, six.kept[inside]))
+    peak, band = (decibels(np.max(sigma)) for sigma in (six.kept, six.kept[inside]))
     inside_band = f"from {low:g} to {high:g} Hz"
-    beyond = [f"{value:+.1f} dB {where} (bound {20 * np.log10(bound.upper):+.1f} dB)"
+    beyond = [f"{value:+.1f} dB {where} (bound {decibels(bound.upper):+.1f} dB)"
               for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
-              if np.isfinite(bound.upper) and value > 20 * np.log10(bound.upper)]
+              if np.isfinite(bound.upper) and value > decibels(bound.upper)]
     locked = f"The worst-case bounds hold for {listed(result.design.keep)} with the other coordinates locked"
     if beyond:
         return f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
@@ -46,6 +47,16 @@ def all_axes(result: DesignResult) -> str:
     if not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
         return f"{reached}. For the other plants of the uncertainty set there is no bound."
     return f"{locked}. {reached}."
+
+
+def requirement_rows(result: DesignResult) -> list[tuple[str, str, str, bool]]:
+    """Name, limit and value of each requirement as text, and whether it is met."""
+    rows = []
+    for one in result.requirements:
+        unit = f" {one.unit}" if one.unit else ""
+        limit = "yes" if one.comparison == "is" else f"{one.comparison} {one.limit:.4g}{unit}"
+        rows.append((one.name, limit, f"{one.value:.4g}{unit}" if np.isfinite(one.value) else "-", one.met))
+    return rows
 
 
 def refuse_unstable(result: DesignResult) -> None:

@@ -29,6 +29,11 @@ class WorkerSettings:
 SETTINGS = WorkerSettings()
 
 
+def available() -> int:
+    """Number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, niceness: int = 0) -> None:
     """Make this process a worker: Ctrl-C, SIGTERM and the death of the parent end it at once and silently.
 
@@ -68,9 +73,8 @@ class Workers:
     """
 
     def __init__(self, count: int | None = None, beside: bool = False):
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         most = 1 if _alone else SETTINGS.most
-        self._count = min(most, available) if count is None else count
+        self._count = min(most, available()) if count is None else count
         self._manners = (signal.SIG_IGN, SETTINGS.niceness) if beside else (signal.SIG_DFL, 0)
 
     def __enter__(self) -> Workers:
@@ -81,11 +85,11 @@ class Workers:
         self._others = set(multiprocessing.active_children())
         return self
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """A future of function(*arguments); its result() raises the errors of the function."""
         if self._pool is not None:
             return self._pool.submit(function, *arguments)
-        done: Future = Future()
+        done: Future[Any] = Future()
         try:
             done.set_result(function(*arguments))
         except Exception as error:

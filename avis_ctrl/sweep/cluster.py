@@ -41,7 +41,9 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
     require_distributed()
     settings = settings or SweepSettings()
     import dask
-    from distributed import Client, LocalCluster, as_completed
+    import distributed
+
+    library: Any = distributed  # parts of it have no types
 
     # A killed worker or a lost scheduler is reported in a row or in one line, not in the library's log.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
@@ -50,15 +52,15 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
                                              "distributed.comm.timeouts.connect": settings.patience_s}))
         if address is None:
             with _ignored_interrupts():
-                cluster = stack.enter_context(LocalCluster(
+                cluster = stack.enter_context(library.LocalCluster(
                     n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL))
             address = cluster.scheduler_address
-        client = stack.enter_context(_connected(Client, address, settings.patience_s))
+        client = stack.enter_context(_connected(library.Client, address, settings.patience_s))
         # Tasks are named by their identity: a resumed sweep joins tasks that are still running.
         by_name = {f"avis-sweep-{os.fspath(task.folder)}-{task.identity}": task for task in tasks}
         futures = [client.submit(perform, task, key=name) for name, task in by_name.items()]
-        for future in as_completed(futures, loop=client.loop):
+        for future in library.as_completed(futures, loop=client.loop):
             yield _content(future, by_name[future.key])
             future.release()
 

@@ -11,17 +11,15 @@ from avis_ctrl.sweep.points_file import PointsFile
 
 
 class Base(Protocol):
-    """The common part of the points of a sweep.
-
-    quantities : labels, with units, of the figures. pareto : the two quantities of the plot; None without a natural
-        choice.
-    """
+    """The common part of the points of a sweep."""
 
     @property
-    def quantities(self) -> Mapping[str, str]: ...
+    def quantities(self) -> Mapping[str, str]:
+        """Labels, with units, of the figures."""
 
     @property
-    def pareto(self) -> tuple[str, str] | None: ...
+    def pareto(self) -> tuple[str, str] | None:
+        """The two quantities of the plot; None without a natural choice."""
 
     def expand(self, key: str) -> Sequence[str]:
         """The keys that match a key. Raises InputError for an unknown key."""

@@ -15,11 +15,6 @@ from avis_ctrl.sweep.task import Task, lost, perform
 _parent: int | None = None
 
 
-def available() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def on_this_machine(tasks: Sequence[Task], jobs: int) -> Iterator[dict[str, Any]]:
     """Content of each point as it is finished, in any order.
 

@@ -20,13 +20,13 @@ Point = dict[str, Any]
 class SweepSettings:
     """Limits of a sweep.
 
-    most_points : maximum number; a grid grows as a product, and a typing error in the file could fill the disk.
+    max_points : maximum number; a grid grows as a product, and a typing error in the file could fill the disk.
     patience_s : time [s] to wait for a scheduler and its first worker; a scheduler takes a few seconds to start.
     deaths : number of cluster processes that may die while computing a point before the point counts as the cause (a
         process may also die because its machine is switched off).
     """
 
-    most_points: int = 20_000
+    max_points: int = 20_000
     patience_s: float = 60.0
     deaths: int = 3
 
@@ -54,8 +54,8 @@ def points_of(file: PointsFile, expand: Callable[[str], Sequence[str]], settings
         raise InputError("expected one count: random axes are drawn together", field="vary.random.count",
                          value=sorted(counts))
     sizes = [len(listed), *(len(one.values or ()) for one in grids), *counts]
-    if (total := math.prod(sizes)) > settings.most_points:
-        raise InputError(f"expected at most {settings.most_points}; here are {' x '.join(map(str, sizes))}",
+    if (total := math.prod(sizes)) > settings.max_points:
+        raise InputError(f"expected at most {settings.max_points}; here are {' x '.join(map(str, sizes))}",
                          field="points", value=total)
     keys = [key for point in file.point for key in _flat(point)]
     _require_single([*dict.fromkeys(keys), *(one.key for one in file.vary)])

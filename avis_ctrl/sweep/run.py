@@ -53,13 +53,19 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A checked points file: a task for each point, or the error that prevents it."""
+    """A checked points file: a task for each point, or the error that prevents it. sha256 : of the file as read."""
 
     path: Path
     file: PointsFile
     base: Base
     points: tuple[Point, ...]
     tasks: tuple[Task | InputError, ...]
+    sha256: str
+
+    @property
+    def wrong(self) -> list[InputError]:
+        """The errors of points with values that do not fit."""
+        return [one for one in self.tasks if isinstance(one, InputError)]
 
 
 def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) -> Plan:
@@ -70,6 +76,7 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
     InputError : an invalid file, base or key; values from which not a single point can be made.
     """
     file = read_points_file(path)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     try:
         base = open_base(file, path.parent)
     except InputError as error:
@@ -91,10 +98,10 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
             tasks.append(Task(identity_of(file.kind, job.inputs), where, job))
         except InputError as error:
             tasks.append(error)
-    wrong = [one for one in tasks if isinstance(one, InputError)]
-    if len(wrong) == len(tasks):
-        raise wrong[0].in_file(wrong[0].file or path)
-    return Plan(path, file, base, tuple(points), tuple(tasks))
+    plan = Plan(path, file, base, tuple(points), tuple(tasks), sha256)
+    if len(plan.wrong) == len(tasks):
+        raise plan.wrong[0].in_file(plan.wrong[0].file or path)
+    return plan
 
 
 def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks, 1),
@@ -115,6 +122,9 @@ def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks
         if (kept := read_point(task.folder, identity)) is not None:
             known[identity] = kept
     waiting = [task for identity, task in tasks.items() if identity not in known]
+    if wrong := plan.wrong:  # before minutes of computation
+        progress(len(known), len(tasks), f"{len(wrong)} of {len(plan.points)} points have values that do not fit and "
+                                         f"are not computed; the first: {wrong[0]}")
     progress(len(known), len(tasks), f"{len(known)} were finished before" if known else "")
     for content in backend(waiting) if waiting else ():
         if content["status"] in LASTING:
@@ -124,7 +134,7 @@ def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks
     rows = tuple(_row(plan, k, known) for k in range(len(plan.points)))
     pareto = plan.file.pareto
     about = provenance(None, "".join(tasks), None, time.monotonic() - began, ("numpy", "scipy", "numba", "joblib"),
-                       points_file=plan.path.name, points_sha256=hashlib.sha256(plan.path.read_bytes()).hexdigest())
+                       points_file=plan.path.name, points_sha256=plan.sha256)
     return Sweep(plan.file, rows, plan.base.quantities, (pareto[0], pareto[1]) if pareto else plan.base.pareto,
                  len(waiting), about)
 

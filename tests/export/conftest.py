@@ -11,7 +11,7 @@ from avis_ctrl.export.design_folder import open_design
 from avis_ctrl.study.companions import design_companions
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import read_study
-from avis_ctrl.study.files import write_json
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.output import controller_dict
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.runner import design_provenance
@@ -31,15 +31,15 @@ def write_folder(path: Path, design_name: str, make) -> Path:
     loop = bare_loop(design, rig, plant, made.K)
     companions = design_companions(loop, plant.weights.get("actuator chain *"), design.floor.band_Hz)
     (path / "controllers").mkdir(parents=True)
-    write_json(path / "study.json", study_dict(design, rig))
-    write_json(path / "controllers" / f"{made.name}.json", controller_dict(made))
+    (path / "study.json").write_bytes(as_json(study_dict(design, rig)))
+    (path / "controllers" / f"{made.name}.json").write_bytes(as_json(controller_dict(made)))
     rows = [{"axis": one.axis, "gain": one.gain, "tilt_corner_Hz": one.tilt_corner_Hz,
              "roll_off_Hz": one.roll_off_Hz, "modulus_margin": one.modulus_margin} for one in companions.loops]
-    write_json(path / "result.json", {
+    (path / "result.json").write_bytes(as_json({
         "format": "avis-design", "version": 1, "stable": True, "verdict": "",
         "controllers": [{"name": made.name, "file": f"controllers/{made.name}.json"},
                         {"name": "passive", "file": None}],
-        "all_axes": {"companions": rows}, "provenance": design_provenance(design, source, rig, 0.0)})
+        "all_axes": {"companions": rows}, "provenance": design_provenance(design, source, rig, 0.0)}))
     return path
 
 

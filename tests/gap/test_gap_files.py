@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -27,7 +29,8 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats.hdf5 import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_file import load_rig as read_rig
-from avis_ctrl.study.gap import GapFinding, GapOptions, gap_provenance, predict
+from avis_ctrl.study.gap import GapFinding, GapOptions, find_gap, predict
+from avis_ctrl.study.gap_axis import write_axis_gap, write_axis_predictions
 from avis_ctrl.study.gap_files import read_gap, write_gap, write_gap_predictions
 from avis_ctrl.study.gap_names import GAP_FILES
 
@@ -197,25 +200,66 @@ def test_the_folder(tmp_path):
 def test_gap_json_says_where_it_comes_from(tmp_path):
     made_by = {"seed": 3, "measurement_sha256": "ab"}
     found = GapFinding(gap_of(), campaign_of(1.0, samples=10), (), made_by, None, "no controller")
-    write_gap(tmp_path, found.gap, told=found.to_json())
+    write_gap(tmp_path, found.gap, content=found.to_json())
     told = read_gap(tmp_path)
     assert told["provenance"] == made_by
     assert (told["noise_nrmse"], told["sentences"], told["design"], told["design_note"]) == (
         0.01, ["found"], None, "no controller")
 
 
-def test_a_design_that_cannot_be_read_costs_no_result(tmp_path):
+def find_gap_quickly(monkeypatch, options):
+    """find_gap with a given result of the search."""
+    monkeypatch.setattr("avis_ctrl.study.gap.analyse", lambda *arguments: gap_of())
+    return find_gap(campaign_of(1.0), RIG, replace(options, gates=False))
+
+
+def test_a_design_that_cannot_be_read_costs_no_result(tmp_path, monkeypatch):
     path = tmp_path / "design.toml"
-    options, measured = GapOptions(design=True, design_file=path), campaign_of(1.0, samples=10)
-    assert "design_sha256" not in gap_provenance(measured, RIG, options, 1.0)
-    path.write_text("title = 1\n")
-    assert len(gap_provenance(measured, RIG, options, 1.0)["design_sha256"]) == 64
+    found = find_gap_quickly(monkeypatch, GapOptions(design=True, design_file=path))
+    assert found.design is None and "no such file" in found.design_note
+    assert "design_sha256" not in found.provenance
+
+
+def test_the_hash_is_that_of_the_design_file_as_it_was_read(tmp_path, monkeypatch):
+    path = tmp_path / "design.toml"
+    path.write_text("as read")
+
+    def synthesis(gap, design, progress):
+        design.write_text("edited during the synthesis")
+    monkeypatch.setattr("avis_ctrl.study.gap.design_effect", synthesis)
+    found = find_gap_quickly(monkeypatch, GapOptions(design=True, design_file=path))
+    assert found.provenance["design_sha256"] == hashlib.sha256(b"as read").hexdigest()
 
 
 def test_without_reports_and_again(tmp_path):
     write_gap(tmp_path, gap_of(), b"<html></html>", b"%PDF-1.7")
     write_gap(tmp_path, gap_of())
     assert {one.name for one in tmp_path.iterdir()} == set(GAP_FILES) - {"gap.html", "gap.pdf"}
+
+
+def test_a_run_without_a_design_removes_that_of_an_earlier_run(tmp_path):
+    """Only what avis gap wrote: files of the user in that folder remain."""
+    (tmp_path / "design").mkdir()
+    (tmp_path / "design" / "design.toml").write_text("my own")
+    write_gap(tmp_path, gap_of())
+    assert (tmp_path / "design" / "design.toml").read_text() == "my own"
+    written = write_gap(tmp_path, gap_of(), content=gap_of().to_json() | {"design": {"before": {}}},
+                        design={"rig.toml": "a", "design.toml": "b"})
+    assert written[-1].name == "gap.json" and (tmp_path / "design" / "design.toml").read_text() == "b"
+    (tmp_path / "design" / "notes.txt").write_text("my own")
+    write_gap(tmp_path, gap_of())
+    assert [path.name for path in (tmp_path / "design").iterdir()] == ["notes.txt"]
+
+
+def test_a_response_removes_the_model_of_an_earlier_drive(tmp_path):
+    """A seismometer has no model that predicts records; that of another kind in the same folder would be used."""
+    def written(model):
+        found = SimpleNamespace(model=model, to_json=lambda: {"format": "avis-gap-axis"})
+        return write_axis_gap(tmp_path, found, "record.csv", {}, lambda *given: (b"<html></html>", b"%PDF-1.7"))
+    assert written({"kind": "drive", "reading": {}})[-1] == "axis_model.json"
+    assert written({"kind": "seismometer"}) == ["gap.json", "gap.html", "gap.pdf"]
+    with pytest.raises(InputError, match="expected the model of a drive or an oscillator"):
+        write_axis_predictions(tmp_path, [], tmp_path / "p.h5")
 
 
 def test_a_disk_that_refuses_leaves_the_old_result_whole(tmp_path, monkeypatch):

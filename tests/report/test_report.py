@@ -129,9 +129,10 @@ def test_a_wide_table_folds_on_a_phone(fabricated: DesignResult, html: bytes) ->
     """Each cell carries the title of its column; the style sheet shows it where the header is hidden."""
     page = Reader(html)
     labels = [a["data-label"] for tag, a in page.elements if tag == "td"]
-    table = next(p for p in document(fabricated).sections[1].pieces if isinstance(p, Table))
-    assert table.header[1] == "mu synthesis"  # the delivered controller is not the one that is cut off
-    assert labels.count("mu synthesis") == len(table.rows)
+    tables = [p for s in document(fabricated).sections for p in s.flat() if isinstance(p, Table)]
+    compared = [table for table in tables if "mu synthesis" in table.header]
+    assert compared[0].header[1] == "mu synthesis"  # the delivered controller is not the one that is cut off
+    assert labels.count("mu synthesis") == sum(len(table.rows) for table in compared)
     assert sum("folds" in (a.get("class") or "") for tag, a in page.elements if tag == "table") > 3
 
 

@@ -20,7 +20,7 @@ from avis_ctrl.simulation.loop import flicker, simulate
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.design_file import design_from_table, read_study, study_of
 from avis_ctrl.study.plant import build_plant
-from avis_ctrl.study.requirements import judge_loop
+from avis_ctrl.study.requirements import check_loop
 from avis_ctrl.study.simulation import bare_loop
 
 FILTER = Electronics(anti_alias_order=3, anti_alias_corner_Hz=200.0)
@@ -162,7 +162,7 @@ def test_gate_fails_a_design_whose_offset_uses_too_much():
     design, rig = read_study("designs/avis_z_phix.toml")
     plant = build_plant(design, rig)
     check = type("Check", (), {"plants": (), "duration_s": 1.0, "false_alarm": 0.01})()
-    rows = [judge_loop(check, at_rest(bare_loop(design, rig, plant, gain(size * np.eye(2)))), 10.0)[-1]
+    rows = [check_loop(check, at_rest(bare_loop(design, rig, plant, gain(size * np.eye(2)))), 10.0)[-1]
             for size in (1e5, 5e7)]
     assert [row.met for row in rows] == [True, False]
     assert "mV" in rows[1].note and rows[1].unit == "%"

@@ -29,7 +29,7 @@ from avis_ctrl.study.gap_design import (
     figures,
     start_files,
 )
-from avis_ctrl.study.gap_plant import carried, plant_of, six_dof_is_stable, wiring_of
+from avis_ctrl.study.gap_plant import design_files, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.skyhooks import classical_skyhook
@@ -183,7 +183,7 @@ def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, v
 
 def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
     model = with_one(with_one(baseline, "sensor_gain", "Sz1", (1.2,)), "actuator_gain", "Az1", (0.8,))
-    found = carried(design, model)
+    found = design_files(design, model)
     old = baseline.rig
     assert found.rig.geophones.sensitivity_Vs_per_m[found.rig.geophones.names.index("Sz1")] == pytest.approx(
         1.2 * old.geophones.sensitivity_Vs_per_m[old.geophones.names.index("Sz1")])
@@ -191,13 +191,13 @@ def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
 
 
 def test_drift_is_carried_at_the_moment_asked(baseline, design):
-    found = carried(design, with_one(baseline, "stiffness_drift", "isolators", (0.2,)), -0.5)
+    found = design_files(design, with_one(baseline, "stiffness_drift", "isolators", (0.2,)), -0.5)
     old = baseline.rig.parameters()["isolator2.k_z"].value
     assert found.rig.parameters()["isolator2.k_z"].value == pytest.approx(0.9 * old)
 
 
 def test_files_say_what_they_do_not_hold(baseline, design):
-    found = carried(design, with_one(baseline, "mount_relaxation", "isolators z", (0.4, 3.0)))
+    found = design_files(design, with_one(baseline, "mount_relaxation", "isolators z", (0.4, 3.0)))
     assert found.inside == () and found.outside == ("mount_relaxation@isolators z",)
 
 
@@ -213,6 +213,10 @@ class SensorLowpass(Effect):
         ops.sense[:, ops.sensor(place)] /= 1 + ops.s * values["time_constant_s"]
 
 
+def gap_of(baseline, updated, *effects):
+    return SimpleNamespace(baseline=baseline, updated=updated, effects=effects, covariance=None)
+
+
 def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, baseline, design):
     """A low-pass of 2 Hz in one sensor would matter to any loop; the linear plant does not hold it."""
     monkeypatch.setattr("avis_ctrl.study.gap_design.mu_optimal", lambda asked, plant, rig: (
@@ -225,7 +229,7 @@ def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, ba
                 active(library()["cubic_stiffness"], baseline, "isolators z", (1e9, 0.0, 0.0, 0.0)))
     updated = replace(baseline, effects=left_out)
     hum = SimpleNamespace(name="mains_hum", location="geophones", label="")
-    found = design_effect(SimpleNamespace(baseline=baseline, updated=updated, effects=(hum,)), design)
+    found = design_effect(gap_of(baseline, updated, hum), design)
     assert set(found.not_checked) == {"sensor_lowpass@Sz1", "cubic_stiffness@isolators z", "mains_hum@geophones"}
     assert "contains none of the named effects" in found.sentences[0]
     assert "the effect does not matter" not in " ".join(found.sentences)
@@ -267,19 +271,19 @@ def test_refusals(baseline, design, tmp_path):
     path = tmp_path / "design.toml"
     path.write_text("title = 1\n", encoding="utf-8")
     with pytest.raises(InputError):
-        design_effect(SimpleNamespace(baseline=baseline, updated=baseline), path)
+        design_effect(gap_of(baseline, baseline), path)
     by_name = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
         update={"identified": "uncertainty.json"})})
     with pytest.raises(InputError, match="set by hand"):
-        design_effect(SimpleNamespace(baseline=baseline, updated=baseline), by_name)
+        design_effect(gap_of(baseline, baseline), by_name)
     halcyonics = TableModel(ResponseModel.of(load_rig("halcyonics"), ("mass",), unit="m/s"))
     with pytest.raises(InputError, match="give a design file"):
-        design_effect(SimpleNamespace(baseline=halcyonics, updated=halcyonics))
+        design_effect(gap_of(halcyonics, halcyonics))
 
 
 @pytest.mark.slow
 def test_an_amplifier_lag_costs_the_controller_and_a_new_one_wins_it_back(baseline):
-    found = design_effect(SimpleNamespace(baseline=baseline, updated=with_one(baseline, *LAG_40_HZ)))
+    found = design_effect(gap_of(baseline, with_one(baseline, *LAG_40_HZ)))
     assert found.before.stable and found.before.mu_upper < 1
     assert found.after.mu_upper > 1.1 * found.before.mu_upper
     assert found.new.mu_upper < 0.95 * found.after.mu_upper
@@ -295,7 +299,7 @@ def test_an_iteration_that_stalls_above_its_target_goes_on(baseline, design):
     """D-K iteration alone stalls at 1.24 on the plant of these files and reaches 0.88 on the model's own."""
     model = with_one(with_one(baseline, "contact_friction", "actuators", (1.5e4, 5e-6, *(0.0,) * 7)),
                      "stiffness_drift", "isolators/linear", (-0.037,))
-    found = carried(design, model, -0.5)
+    found = design_files(design, model, -0.5)
     plant = build_plant(found.design, found.rig)
     candidate, made = mu_optimal(found.design, plant, found.rig)
     assert made.status == "target 0.9 reached"

@@ -18,7 +18,7 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import rehearse
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
-from avis_ctrl.study.identification_design import assumed_weights, design_files
+from avis_ctrl.study.identification_design import assumed_weights, design_start
 from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification_output import read_identified, write_identification, write_predictions
 from avis_ctrl.study.plan_file import default_plan
@@ -52,12 +52,12 @@ def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
 
 
 def test_a_design_whose_weights_nobody_stated_says_for_which_table_they_are(found):
-    text = design_files(found)[DESIGN_FILE]
+    text = design_start(found)[0][DESIGN_FILE]
     assert text.startswith("# No weights were specified for this table.")
     assert '\n#   shipped: "avis", 500 kg, modes from 1.94 to 5.24 Hz\n#   this table: "avis", ' in text
     stated = design_from_table(tomllib.loads(text))
     assert stated.rig == RIG_FILE
-    assert not design_files(found, stated)[DESIGN_FILE].startswith("#")
+    assert not design_start(found, stated)[0][DESIGN_FILE].startswith("#")
 
 
 @pytest.mark.parametrize(("name", "lines"), [

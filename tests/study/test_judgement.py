@@ -25,7 +25,7 @@ from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.limits import best_found
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.random_plants import random_perturbations
-from avis_ctrl.study.requirements import judge
+from avis_ctrl.study.requirements import check_requirements
 from avis_ctrl.study.runner import skyhook_limit
 from avis_ctrl.study.skyhooks import classical_skyhook
 
@@ -167,7 +167,7 @@ def test_advantage_counts_the_bounds_against_the_controller(one_axis, measured):
     design, _ = one_axis
     controllers = [measured["passive"], with_bounds(measured["passive"], "skyhook", 4.0, 8.0),
                    with_bounds(measured["passive"], "mu", 1.0, 2.0)]
-    line, = judge(asking(design, advantage_over_skyhook_dB=6.0), controllers)
+    line, = check_requirements(asking(design, advantage_over_skyhook_dB=6.0), controllers)
     assert (line.value, line.met) == (pytest.approx(20 * np.log10(2.0)), True)
 
 
@@ -175,7 +175,7 @@ def test_a_skyhook_that_may_be_unstable_is_no_rival(one_axis, measured):
     design, _ = one_axis
     controllers = [measured["passive"], with_bounds(measured["passive"], "skyhook", np.inf, np.inf),
                    with_bounds(measured["passive"], "mu", 1.0, 2.0)]
-    line, = judge(asking(design, advantage_over_skyhook_dB=6.0), controllers)
+    line, = check_requirements(asking(design, advantage_over_skyhook_dB=6.0), controllers)
     assert np.isnan(line.value)
     assert not line.met
 
@@ -193,12 +193,14 @@ def test_a_controller_no_better_than_none_is_called_so(one_axis, measured):
     rest = measured["passive"]
     idle = gain(np.zeros((1, 1)), plant.synthesis.y, plant.synthesis.u)
     nothing = replace(rest, name="mu", K=idle)
-    line, = judge(asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), nothing])
+    line, = check_requirements(asking(design, fastest_controller_pole_Hz=250.0),
+                               [rest, replace(rest, name="skyhook"), nothing])
     assert np.isnan(line.value) and not line.met
     text = best_found(plant, nothing, [rest])
     assert "no controller better than none" in text and "ended too early" not in text
     better = replace(nothing, mu=replace(rest.mu, upper=0.9 * rest.mu.upper), fastest_pole_Hz=20.0)
-    line, = judge(asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), better])
+    line, = check_requirements(asking(design, fastest_controller_pole_Hz=250.0),
+                               [rest, replace(rest, name="skyhook"), better])
     assert (line.value, line.met) == (20.0, True)
 
 

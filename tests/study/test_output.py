@@ -20,7 +20,7 @@ from avis_ctrl import files
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.files import write_together, write_whole
 from avis_ctrl.study import files as folders
-from avis_ctrl.study.files import write_json
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.output import FILES, FOLDERS
 
 SIZE = 300_000
@@ -296,9 +296,8 @@ values = st.recursive(numbers, lambda inner: st.one_of(st.lists(inner, max_size=
 
 @settings(max_examples=60, deadline=None)
 @given(value=st.dictionaries(st.text(max_size=3), values, max_size=4))
-def test_json_is_strict_and_exact(value, tmp_path_factory):
-    path = tmp_path_factory.mktemp("json") / "v.json"
-    write_json(path, value)
+def test_json_is_strict_and_exact(value):
+    text = as_json(value).decode()
 
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
@@ -309,11 +308,11 @@ def test_json_is_strict_and_exact(value, tmp_path_factory):
         if isinstance(one, list):
             return [finite(inner) for inner in one]
         return None if isinstance(one, float) and not np.isfinite(one) else one
-    assert json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse) == finite(value)
+    assert json.loads(text, parse_constant=refuse) == finite(value)
 
 
-def test_json_of_numpy_values(tmp_path):
-    write_json(tmp_path / "v.json", {"a": np.array([[1.0, np.nan], [np.inf, 0.1]]), "b": np.float64(2.5),
-                                     "c": np.int64(3), "d": np.bool_(True), "e": ("x", np.float32(0.5))})
-    assert json.loads((tmp_path / "v.json").read_text()) == {"a": [[1.0, None], [None, 0.1]], "b": 2.5, "c": 3,
+def test_json_of_numpy_values():
+    text = as_json({"a": np.array([[1.0, np.nan], [np.inf, 0.1]]), "b": np.float64(2.5), "c": np.int64(3),
+                    "d": np.bool_(True), "e": ("x", np.float32(0.5))})
+    assert json.loads(text) == {"a": [[1.0, None], [None, 0.1]], "b": 2.5, "c": 3,
                                                             "d": True, "e": ["x", 0.5]}

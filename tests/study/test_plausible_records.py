@@ -17,7 +17,7 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.gap import NAMED_HERE, find_gap
 from avis_ctrl.study.identification import IdentifyOptions, identify
-from avis_ctrl.study.plausible_records import SETTINGS, check_records, look, records_fit
+from avis_ctrl.study.plausible_records import SETTINGS, check_records, record_spectra, records_fit
 from avis_ctrl.study.record_checks import check_campaign
 
 FS, SAMPLES = 1000.0, 20000
@@ -179,7 +179,7 @@ def test_rigs_off_by_thirty_per_cent_pass_with_room(name, seed):
     moved = {n: p.value * rng.uniform(0.7, 1.3) for n, p in rig.parameters().items() if p.unit != "m"
              and not n.startswith(("I", "J"))}
     other = model_of(rig.with_parameters(moved), measured)
-    seen = look(measured)
+    seen = record_spectra(measured)
     decades = seen.decades(other.response(seen.omega)[:, :, :len(measured.u_names)])
     check_records(measured, other)
     assert np.nanmean(np.abs(decades)) < 0.6 * SETTINGS.far

@@ -11,7 +11,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.study.rig_channels import in_words_of, numbered
+from avis_ctrl.study.rig_channels import numbered, with_rig_names
 
 
 def campaign(u_names, y_names, rig="unnamed"):
@@ -28,26 +28,26 @@ def rig():
 def test_numbered_channels_are_the_rigs_own_in_its_order(rig):
     raw = campaign(numbered("u", 8), numbered("qm", 6))
     with pytest.raises(InputError, match="qm1"):
-        in_words_of(rig, raw)
-    taken = in_words_of(rig, raw, {"y": ["qm"]})
+        with_rig_names(rig, raw)
+    taken = with_rig_names(rig, raw, {"y": ["qm"]})
     assert taken.u_names == rig.equations_of_motion().actuators and taken.y_names == rig.sensor_rows()[0]
     np.testing.assert_array_equal(taken.records[0].load().y, raw.records[0].load().y)
     assert taken.rig == "avis" and len(taken.notes) == 3
     assert all("avis" in note for note in taken.notes)
-    again = in_words_of(rig, taken)
+    again = with_rig_names(rig, taken)
     assert again.notes == taken.notes and digest(again) == digest(taken)
 
 
 def test_what_has_names_stays_as_it_is(rig):
     stated = campaign(("Az4", "Ay1"), ("Sz3", "Sy1"), "another")
-    same = in_words_of(rig, stated)
+    same = with_rig_names(rig, stated)
     assert digest(same) == digest(stated) and same.notes == ()
 
 
 @pytest.mark.parametrize("y_names", [numbered("y", 5), numbered("S", 6), ("y2", "y1", "y3", "y4", "y5", "y6")])
 def test_other_channels_are_refused_with_what_to_do(rig, y_names):
     with pytest.raises(InputError, match=r"y names = .*the sensors of the rig avis are Sy1") as caught:
-        in_words_of(rig, campaign(numbered("u", 8), y_names))
+        with_rig_names(rig, campaign(numbered("u", 8), y_names))
     assert "--columns y_names=Sy1+Sz1+..." in str(caught.value) and "u_names" not in str(caught.value)
     assert "campaign of" not in str(caught.value)
 
@@ -55,7 +55,7 @@ def test_other_channels_are_refused_with_what_to_do(rig, y_names):
 def test_a_campaign_of_another_rig_says_so_and_both_roles_at_once(rig):
     own = campaign(rig.equations_of_motion().actuators, rig.sensor_rows()[0], "avis")
     with pytest.raises(InputError, match="the file is a campaign of avis") as caught:
-        in_words_of(load_rig("halcyonics"), own)
+        with_rig_names(load_rig("halcyonics"), own)
     for said in ("the actuators of the rig halcyonics are A1", "the sensors of the rig halcyonics are acc_A1",
                  "not of halcyonics"):
         assert said in str(caught.value)
@@ -66,6 +66,6 @@ def test_frequency_responses_too(rig):
     value = np.ones((5, 6, 8), complex)
     response = FrequencyResponse(frequency, value, None, None, numbered("u", 8), numbered("y", 6), "V", "V",
                                  entry_variance=np.ones(value.shape))
-    taken = in_words_of(rig, response)
+    taken = with_rig_names(rig, response)
     assert taken.outputs == rig.sensor_rows()[0] and taken.inputs == rig.equations_of_motion().actuators
-    assert in_words_of(rig, replace(taken, inputs=(*taken.inputs[:7], "vz"))).inputs[-1] == "vz"
+    assert with_rig_names(rig, replace(taken, inputs=(*taken.inputs[:7], "vz"))).inputs[-1] == "vz"

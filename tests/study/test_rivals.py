@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,14 @@ from avis_ctrl.study.controllers import best_of, mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.design_result import Bound, Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.skyhooks import at_limits, classical_skyhook, critical_gains, tuned_skyhook
+from avis_ctrl.study.skyhooks import (
+    SkyhookSettings,
+    WorstCaseTuning,
+    at_limits,
+    classical_skyhook,
+    critical_gains,
+    tuned_skyhook,
+)
 
 DESIGN = Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml"
 
@@ -40,6 +48,17 @@ def bounds(design: Design, plant: DesignPlant, K) -> tuple[float, float]:
     band = tuple(2 * np.pi * f for f in design.transmissibility.band_Hz)
     return (worst_case_gain(closed, plant.full.blocks, slack=5e-3).upper,
             worst_case_gain(closed, plant.full.blocks, band=band, slack=5e-3).upper)
+
+
+def test_the_worst_case_of_a_bound_is_a_plant_whose_stability_counts(one_axis):
+    """A perturbation that destabilises a tuning makes its encirclements count, not only its largest gain."""
+    design, plant = one_axis
+    evaluation = WorstCaseTuning(plant, design, 2.0, SkyhookSettings(samples=2))
+    task = evaluation.search(load_rig("avis"))
+    delta = np.zeros((plant.full.blocks.n_w, plant.full.blocks.n_z))
+    more = evaluation.with_worst_case(task, SimpleNamespace(omega=2 * np.pi * 3.3, delta=delta))
+    assert more.scenarios.plants == task.scenarios.plants + 1 == len(more.scenarios.deltas)
+    assert 2 * np.pi * 3.3 in more.scenarios.omega
 
 
 @pytest.mark.slow

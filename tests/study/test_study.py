@@ -327,3 +327,5 @@ def test_whole_study_of_a_shipped_design(name, tmp_path):
     assert all(path.stat().st_size > 0 for path in files)
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     assert any("D-K iteration" in line for line in said)
+    numbers = [int(line.split()[1].rstrip(",")) for line in said if line.startswith("step ")]
+    assert numbers == [row["iteration"] for row in stored["dk_history"]] == [*range(len(numbers))]

@@ -11,7 +11,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import PlantCheck
 from avis_ctrl.study.design_result import DesignResult, Requirement, Simulated
-from avis_ctrl.study.requirements import judge_loop
+from avis_ctrl.study.requirements import check_loop
 from avis_ctrl.study.verdict import all_axes, first_sentence, refuse_unstable
 
 CULPRIT = Culprit("nominal", 1.00016, 0.99, 0.16, ("x", "phi_y"), "companions", ("x", "y"))
@@ -25,7 +25,7 @@ def plant(name: str, radius: float, diverged: bool = False, clipped: int = 0) ->
 def result(plants, culprit=None, asked=()) -> DesignResult:
     check = SimpleNamespace(plants=tuple(plants), duration_s=20.0, false_alarm=0.01)
     loop = Simulated(None, check, None, 1.0, culprit)
-    rows = (*judge_loop(check), *asked)
+    rows = (*check_loop(check), *asked)
     return DesignResult(*(None,) * 5, rows, None, None, loop, {}, 1.0)
 
 

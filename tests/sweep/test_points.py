@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.sweep.design_points import KEYS, DesignBase
 from avis_ctrl.sweep.points import SweepSettings, points_of
 from avis_ctrl.sweep.points_file import PointsFile
-from avis_ctrl.sweep.run import plan_sweep
+from avis_ctrl.sweep.run import plan_sweep, run_sweep
+from avis_ctrl.sweep.task import lost
 
 SMALL = """
 title = "small"
@@ -163,7 +165,7 @@ def test_a_grid_beyond_the_limit_is_refused_before_it_is_made():
         points(vary=axes)
     file = PointsFile.model_validate({"base": "x", "vary": [{"key": "a", "values": [1, 2, 3]}]})
     with pytest.raises(InputError, match="points = 3: expected at most 2;"):
-        points_of(file, same, SweepSettings(most_points=2))
+        points_of(file, same, SweepSettings(max_points=2))
 
 
 def test_a_point_that_cannot_be_made_is_a_task_less(tmp_path):
@@ -171,9 +173,38 @@ def test_a_point_that_cannot_be_made_is_a_task_less(tmp_path):
     (tmp_path / "small.toml").write_text(SMALL)
     (tmp_path / "p.toml").write_text('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\n'
                                      "values = [-3.0, 9.0]")
-    made, refused = plan_sweep(tmp_path / "p.toml", tmp_path / "out").tasks
+    plan = plan_sweep(tmp_path / "p.toml", tmp_path / "out")
+    made, refused = plan.tasks
     assert isinstance(refused, InputError) and "below peak_dB = 6" in str(refused)
-    assert not isinstance(made, InputError)
+    assert not isinstance(made, InputError) and plan.wrong == [refused]
+
+
+def test_wrong_values_are_said_before_the_other_points_are_computed(tmp_path):
+    (tmp_path / "small.toml").write_text(SMALL)
+    (tmp_path / "p.toml").write_text('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\n'
+                                     'values = ["a", -3.0, 9.0]')
+    said = []
+
+    def backend(tasks):
+        assert len(tasks) == 1 and len(said) == 2
+        yield lost(tasks[0], "")
+    found = run_sweep(plan_sweep(tmp_path / "p.toml", tmp_path), backend, lambda done, total, text: said.append(text))
+    assert said[0].startswith("2 of 3 points have values that do not fit and are not computed; the first: "
+                              "transmissibility.band_dB = 'a': expected a number") and "\n" not in said[0]
+    assert [row.status for row in found.rows] == ["failed", "lost", "failed"]
+
+
+def test_the_hash_of_the_points_file_is_that_of_the_text_that_was_read(tmp_path):
+    path = tmp_path / "p.toml"
+    (tmp_path / "small.toml").write_text(SMALL)
+    path.write_text('base = "small.toml"')
+    read = path.read_bytes()
+
+    def backend(tasks):
+        path.write_text("edited during the sweep")
+        yield lost(tasks[0], "")
+    found = run_sweep(plan_sweep(path, tmp_path), backend)
+    assert found.provenance["points_sha256"] == hashlib.sha256(read).hexdigest()
 
 
 def test_the_guide_s_examples_are_points(tmp_path):

@@ -10,8 +10,8 @@ from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.opening import named
 from avis_ctrl.report.identification.gates import figure_of
-from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, Table, table
-from avis_ctrl.report.sections.provenance import document_of, provenance_table
+from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, Table, document_of, table
+from avis_ctrl.report.sections.provenance import provenance_table
 
 
 def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Document:
@@ -25,11 +25,10 @@ def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Doc
 
 def _summary(gap: AxisGap) -> Section:
     first, *rest = gap.sentences
-    good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)
     rows = [(wording.titled(one.name), words.percent(one.nrmse),
              "not computed" if one.chi2_per_dof is None else words.number(one.chi2_per_dof, 4)) for one in gap.stages]
     pieces: list[Piece] = [
-        Paragraph(f"Verdict: {gap.verdict}. {first}", "verdict", good, gap.verdict == "partly explained"),
+        wording.verdict(f"Verdict: {gap.verdict}. {first}", gap.verdict),
         table("Error of each model on data that no fit has used, r.m.s., relative to the measured signal. Each row "
               "adds an effect to the model of the row above.", ("model", "error", "chi-square / dof"), rows),
         figure_of("ladder", "The gap before and after each effect.", gap.pictures[:1], height=0.7)]

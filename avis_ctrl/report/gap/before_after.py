@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level, places, steps
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, places, steps
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.response_panels import difference, drives, magnitude
@@ -71,15 +71,14 @@ def ladder(gap: Gap) -> Figure:
     values = np.array([100 * one.nrmse for one in gap.stages])
     place, axis = places([textwrap.fill(rung(one.name, k), LETTERS) for k, one in enumerate(gap.stages)])
     noise = 100 * gap.noise_nrmse
-    shown = np.append(values, noise)
-    shown = shown[np.isfinite(shown) & (shown > 0)]
-    limits = (10 ** np.floor(np.log10(shown.min() / 1.5)), 1.6 * shown.max()) if shown.size else (0.1, 100.0)
+    low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
+    limits = float(10 ** np.floor(np.log10(low))), high
     bars = Curve(place, np.where(np.isfinite(values) & (values > 0), values, np.nan), "error of the model",
                  Style("#8fbbdc"), line=False, bars=0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
     return Figure("ladder", "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. "
                   "Logarithmic scale.",
-                  (Panel(axis, Axis("n.r.m.s. error [%]", "log", (float(limits[0]), float(limits[1]))),
+                  (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits),
                          (bars, *lines)),), height=0.7)
 
 
@@ -106,16 +105,17 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
     """Description and figure of the input-output pairs that disagree most."""
     pairs, who = worst_pairs(seen), "updated" if named else "re-identified"
     text = (f"Frequency responses from records {', '.join(seen.records)}, some of which were fitted. Points: "
-            f"{seen.method}. Shown are the {len(pairs)} paths on which the re-identified model is furthest off, in "
-            "standard deviations of the measured response; no two have the same output.")
+            f"{seen.method}. The figure shows the {len(pairs)} paths with the largest error of the re-identified "
+            "model, in standard deviations of the measured response; each path has a different output.")
     if seen.method.startswith(BESIDE):
-        text += (" These records allow no response that is measured without a model: the points are the linear part "
-                 f"of the {who} model plus its residual, regressed on the inputs in windows of lines. They depend on "
-                 "that model: a model error narrower than a window is not visible here, but in the residual above.")
+        text += (" From these records, no response can be estimated without a model. The points are therefore the "
+                 f"linear part of the {who} model plus its residual, regressed on the inputs in windows of spectral "
+                 "lines. They depend on that model: a model error narrower than a window is visible only in the "
+                 "residual above.")
     if seen.simulated:
-        text += (f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response "
-                 "of its own: that of the updated model is measured in the same way, from what the model simulates of "
-                 "the same records.")
+        text += (f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response. "
+                 "That of the updated model is therefore estimated in the same way as the measured one, from a "
+                 "simulation of the same records.")
     if seen.left_out:
         names = words.joined(list(map(wording.titled, seen.left_out)))
         text += (f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "

@@ -12,9 +12,9 @@ from avis_ctrl.report.gap.opening import opening
 from avis_ctrl.report.gap.places import places
 from avis_ctrl.report.gap.remaining import remaining
 from avis_ctrl.report.identification.gates import gates
-from avis_ctrl.report.pieces import Document, Section
+from avis_ctrl.report.pieces import Document, Section, document_of
 from avis_ctrl.report.records import records, remarks
-from avis_ctrl.report.sections.provenance import document_of, provenance_table
+from avis_ctrl.report.sections.provenance import provenance_table
 from avis_ctrl.study.gap import GapFinding
 
 

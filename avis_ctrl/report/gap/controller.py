@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level, places
-from avis_ctrl.report.pieces import Bullets, Cell, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.report.pieces import Bullets, Cell, Mark, Paragraph, Piece, Section, table, yes_or_no
 from avis_ctrl.study.gap import GapFinding
 
 if TYPE_CHECKING:
@@ -23,10 +23,10 @@ def controller(found: GapFinding) -> Section | None:
     rows = [(who, model, *_figures(one)) for who, model, one in loops(effect)]
     pieces: list[Piece] = [Paragraph(effect.sentences[0])] if effect.sentences else []
     pieces += [table(
-        "An upper bound of mu below 1 guarantees the specified performance for every table of the design's "
-        "uncertainty set. Decibels are those of the largest singular value from floor to payload. Worst cases are "
-        "upper bounds over the whole set; \"unstable\" means that the controller is not proved to stabilise every "
-        "table of the set. Six: the nominal loop of all six coordinates, those outside the design without control.",
+        "An upper bound of mu below 1 guarantees the specified performance for every table of the design's uncertainty "
+        "set. Decibels are those of the largest singular value from floor to payload. Worst cases are upper bounds "
+        "over the whole set; \"unstable\" means that the controller is not proved to stabilise every table of the set. "
+        "Six: the nominal loop with all six coordinates, where the coordinates outside the design are not controlled.",
         ("controller", "on model", "stable", "stable in six", "mu, upper bound", "mu, lower bound", "peak",
          "worst peak", "worst in band"), rows, "llccrrrrr"), _bounds(effect)]
     if effect.sentences[1:]:
@@ -43,12 +43,8 @@ def loops(effect: DesignEffect) -> list[tuple[str, str, LoopFigures]]:
 
 def _figures(one: LoopFigures) -> tuple[Cell, ...]:
     decibels = [words.quantity(v, "dB") for v in (one.peak_dB, one.worst_peak_dB, one.worst_band_dB)]
-    return (_yes(one.stable), _yes(one.stable_in_six),
+    return (yes_or_no(one.stable), yes_or_no(one.stable_in_six),
             Mark(words.bound(one.mu_upper), bool(one.mu_upper < 1)), words.bound(one.mu_lower), *decibels)
-
-
-def _yes(stable: bool) -> Mark:
-    return Mark("yes", True) if stable else Mark("NO", False)
 
 
 def _bounds(effect: DesignEffect) -> Figure:

@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, steps
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, steps
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
 from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
@@ -30,8 +30,8 @@ LOOKS = {"model": ("model, linear in measured inputs", Style("#222222", "solid",
          "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6))}
 COLUMNS = {"model": "model", "missing": "linear, not in the model", "nonlinear": "not linear",
            "unmeasured": "unmeasured inputs", "sensors": "sensors' noise"}
-HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; the part of the "
-                 "excited lines that exceeds this and any linear response is not linear.",
+HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; any power of the "
+                 "excited lines beyond this and beyond a linear response is counted as not linear.",
        "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
                  "terms, is therefore attributed to noise and unmeasured inputs, which do not grow with the drives; "
                  "any additional residual at a higher level is not linear. Nonlinearity at the lowest level that is "
@@ -62,13 +62,13 @@ def by_record(gap: Gap) -> Figure:
               _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s))
     return Figure("gap_records", "Residual of each record, relative to the noise. Filled: held-out records; open: "
                   "fitted. A missing linear effect gives an error in proportion to the level. An error that is the "
-                  "same at every level is noise; one that grows otherwise depends on amplitude. A slope over time is "
-                  "drift. The frequency lines are a random selection, dense near resonances, the same for all records: "
-                  "these values differ from those of all lines in the table of stages.", panels, 2, 0.85)
+                  "same at every level is noise; an error that grows in any other way depends on amplitude. A slope "
+                  "over time is drift. The frequency lines are a random selection, dense near resonances, the same for "
+                  "all records: these values differ from those of all lines in the table of stages.", panels, 2, 0.85)
 
 
 def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:
-    sides = [("re-identified", BEFORE, lambda one: one.before)]
+    sides: list[tuple[str, Style, Callable[[RecordGap], float]]] = [("re-identified", BEFORE, lambda one: one.before)]
     if gap.effects:
         sides.append(("updated", AFTER, lambda one: one.after))
     curves = []
@@ -79,10 +79,8 @@ def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> P
                                 f"{label}, {word}", Style(style.colour), points=True, line=False, hollow=not held))
     low, high = _limits([of(one) for one in gap.records])
     curves.append(level(low, high, 1.0, "noise alone", NOISE))
-    values = np.array([v for one in gap.records for v in (one.before, one.after)])
-    values = values[np.isfinite(values) & (values > 0)]
-    y = Axis("residual / noise, r.m.s. [-]", "log", (float(min(values.min(initial=1.0), 1.0)) / 1.5,
-                                                     float(max(values.max(initial=1.0), 1.0)) * 1.5))
+    values = np.array([1.0, *(v for one in gap.records for v in (one.before, one.after))])
+    y = Axis("residual / noise, r.m.s. [-]", "log", log_limits(values, 1 / 1.5, 1.5))
     return Panel(Axis(x.label, "linear", (low, high)), y, tuple(curves), (), title)
 
 
@@ -105,10 +103,10 @@ def _explained(one: PowerShares) -> str:
     unknown = "" if "sensors" in one.shares else (" The sensors' own noise is not known by itself and counts as "
                                                   "unmeasured inputs.")
     narrow = float(np.min(np.diff(one.bands_Hz)))
-    return (f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear means any "
-            "response to the measured inputs that is smooth over a band beside the model's own, with up to two poles "
-            f"moved; an error of the model narrower than that (bands are {words.number(narrow, 2)} Hz wide and more) "
-            "counts in part as not linear.")
+    return (f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear means the "
+            "response of the model, with up to two poles moved, plus any response to the measured inputs that is "
+            f"smooth over a band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) "
+            "is partly counted as not linear.")
 
 
 def figure(one: PowerShares, name: str) -> Figure:

@@ -21,7 +21,7 @@ def parameters(found: GapFinding) -> Section:
     gap = found.gap
     pieces: list[Piece] = []
     if gap.effects or gap.traces:
-        pieces += [_sizes(gap), Bullets(tuple(_told(one) for one in (*gap.effects, *gap.traces)))]
+        pieces += [_sizes(gap), Bullets(tuple(_as_text(one) for one in (*gap.effects, *gap.traces)))]
     else:
         pieces.append(Paragraph("No effect is named: the updated model is the rig within its tolerances."))
     if len(gap.baseline.values):
@@ -46,7 +46,7 @@ def _sizes(gap: Gap) -> Table:
                  ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
 
 
-def _told(one: NamedEffect) -> str:
+def _as_text(one: NamedEffect) -> str:
     """Description of an effect: what it is, its influence on the responses, and its confirmation."""
     effect = wording.known(one.name)
     text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."
@@ -89,8 +89,8 @@ def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
     if not groups:
         return []
     told = "; ".join(words.joined(list(group)) for group in groups)
-    return [Paragraph(f"Only in combination can any record determine {told}. How the combination divides among them is "
-                      "taken from the rig file.", "note")]
+    return [Paragraph(f"No record can determine {told} individually, only in combination. Their individual values "
+                      "follow from the combination and the rig file.", "note")]
 
 
 def _always(gap: Gap) -> list[Piece]:
@@ -105,9 +105,9 @@ def _always(gap: Gap) -> list[Piece]:
         size, spread = words.with_std(value, sigma.get(name, np.nan))
         told.append(f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}" if name in sigma else
                     f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}")
-    return [Paragraph("Every model, with or without a named effect, also holds the second-order terms of large "
-                      "rotations, which every table has. They enter with factors, 0 or 1 by theory, that are fitted, "
-                      f"too, and are often poorly determined: {'; '.join(told)}.", "note")]
+    return [Paragraph("Every model, with or without a named effect, also contains the second-order terms of large "
+                      "rotations, which exist in every table. Their factors, 0 or 1 in theory, are fitted as well and "
+                      f"are often poorly determined: {'; '.join(told)}.", "note")]
 
 
 def _deviations(gap: Gap) -> dict[str, float]:

@@ -34,35 +34,36 @@ def method(gap: Gap) -> Section:
                   "Their variance is estimated for each sensor and band, that of an additional noise (distortion) for "
                   "each level too, and the path errors are integrated out. Where octaves or levels differ by more than "
                   "these variances explain, the standard deviations cover it."),
-        Paragraph("Evidence. Of a model with certain effects, by Laplace's method, J the penalised sum of squares at "
-                  "the estimate, C the covariance of path errors and noise, H the information with priors; the "
-                  "constant contains the price of the states at the ends of the records:"),
+        Paragraph("Evidence. The evidence of a model with given effects is computed by Laplace's method. J is the "
+                  "penalised sum of squares at the estimate, C the covariance of path errors and noise, and H the "
+                  "information including the priors; the constant accounts for the states at the ends of the "
+                  "records:"),
         Formula("ln p(Y) = -J/2 - 1/2 ln det C - 1/2 ln det H + \"const.\"",
                 "log evidence is minus half the sum of squares, less half the log determinants"),
-        Paragraph("Search. A score test with priors says by how much each effect at each place would lower J to first "
-                  "order. The best of each name are fitted with all parameters and tolerances, and the one of the "
-                  "largest evidence is taken if it is ahead of the present model by more than the number of candidates "
-                  "explains. The search goes on with it in the model, until an effect explains less than 1 % of the "
-                  "gap."),
+        Paragraph("Search. A score test with priors predicts, to first order, by how much each effect at each place "
+                  "would reduce J. The best candidates of each kind of effect are fitted together with all parameters "
+                  "and tolerances. The candidate with the largest evidence is accepted if its gain over the current "
+                  "model exceeds what the number of candidates explains. The search continues with this effect in the "
+                  "model, until an effect explains less than 1 % of the gap."),
         Paragraph("Names. An effect that was found is named if it is more probable than not, if its parameters from "
                   "the lower and the upper half of the band, and from low and high levels, agree with the whole, if "
                   "its values are physically possible, and if the held-out records are more likely with it. Its "
                   "probability is relative to all that was fitted in its place, including faults that are not in the "
-                  "library. Odds are those of the evidence, or those by how evenly the difference of log-likelihoods "
-                  "d_g is spread over bands and levels g, whichever is less certain, because textbook laws are not "
-                  "quite those of real elements:"),
+                  "library. Two kinds of odds are computed, from the evidence and from how evenly the difference d_g "
+                  "of the log-likelihoods is spread over bands and levels g. The less certain odds are used, because "
+                  "real elements do not follow textbook laws exactly:"),
         Formula("z = sum_g d_g slash (sum_g (d_g - overline(d))^2)^(1 slash 2), quad P = Phi(z)",
                 "z is the sum of the differences over their spread; the probability is the normal distribution of z"),
         Paragraph("Errors and noise in per cent, on records that no fit has seen:"),
         Formula("op(\"n.r.m.s.\") = (1 / n_y sum_i sum_k abs(e_(k i))^2 slash sum_k abs(Y_(k i))^2)^(1 slash 2)",
                 "the normalised error is the root of the mean over outputs of the residual's power over the output's"),
-        Paragraph("What held out means. No parameter is fitted to the held-out records; they decide whether an effect "
-                  "is named, so that their figures after naming are no fully independent test. Hum, faults of "
+        Paragraph("Held-out records. No parameter is fitted to them, but they help to decide whether an effect is "
+                  "named; their errors after naming are therefore not a fully independent test. Hum, faults of "
                   "a converter, and the levels of floor and sensors are found in all records, and hum is removed from "
                   "all. Where a channel clips, the clipped samples are replaced by the model's prediction, in held-out "
                   "records too: these samples test nothing. Forces that depend on amplitude or "
-                  "time act on the motion of the mounts as the model has it, corrected by each record's own sensors; "
-                  "avis predict goes from drives and floor alone."),
+                  "time are computed from the modelled motion of the mounts, corrected with the sensor signals of the "
+                  "same record; avis predict uses drives and floor motion only."),
         Paragraph(f"Held out: {gap.held_out.rstrip('.')}." if gap.held_out else
                   "How the records were divided is not stated."),
         Heading("Sources"), Bullets(SOURCES)]

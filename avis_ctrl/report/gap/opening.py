@@ -23,9 +23,7 @@ CHANCES = (" The probability takes into account the other candidates, the tolera
 def opening(found: GapFinding) -> Section:
     """Verdict, the gap in numbers, named effects."""
     gap = found.gap
-    good = {"none": True, "explained": True, "unexplained": False}.get(gap.verdict)
-    pieces: list[Piece] = [Paragraph(sentence(gap), "verdict", good, gap.verdict == "partly explained")]
-    pieces.append(Paragraph(wording.claim(gap)))
+    pieces: list[Piece] = [wording.verdict(sentence(gap), gap.verdict), Paragraph(wording.claim(gap))]
     if numbers := in_numbers(gap):
         pieces.append(Paragraph(numbers))
     if gap.stages:
@@ -98,7 +96,7 @@ def named(gap: Gap | AxisGap, remark: str) -> Table:
              ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
             for one in (*gap.effects, *gap.traces)]
     return table("Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
-                 "held-out data if this effect alone is removed, relative to the power that the residual has beyond "
-                 f"noise without any effect; below 1 % an effect is a trace.{remark}",
+                 "held-out data if only this effect is removed, divided by the residual power beyond noise of the "
+                 f"model without effects. Effects below 1 % are called traces.{remark}",
                  ("effect", "place", "size", "fraction of the gap", "probability", "indistinguishable from"), rows,
                  "lllrrl")

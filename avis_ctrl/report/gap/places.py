@@ -66,8 +66,8 @@ def table_of(listed: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
     rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value))
             for one in listed]
-    return table(f"{caption}Fraction: of the power beyond noise. Over noise: power of the residual relative to "
-                 "that of the noise. p-value: of noise alone, over all places (family-wise).",
+    return table(f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
+                 "noise power. p-value: probability of such a residual by noise alone, family-wise over all places.",
                  ("place", "fraction", "over noise", "p-value"), rows)
 
 

@@ -10,6 +10,7 @@ from avis_ctrl.gap.effects.base import Effect, Reported
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
 from avis_ctrl.report import words
+from avis_ctrl.report.pieces import Paragraph
 from avis_ctrl.uncertain_value import with_prefix
 
 # What each verdict claims, and what it does not.
@@ -39,6 +40,12 @@ def claim(gap: Gap) -> str:
     return CLAIMS[gap.verdict] if not gap.raised else RAISED.format(
         verdict=gap.verdict, sensors=words.joined(list(gap.raised)),
         with_effects=" with the effects named above" if gap.effects else "")
+
+
+def verdict(text: str, word: str) -> Paragraph:
+    """A verdict, coloured by its word."""
+    good = {"none": True, "explained": True, "unexplained": False}.get(word)
+    return Paragraph(text, "verdict", good, word == "partly explained")
 
 
 def titled(name: str) -> str:

@@ -8,7 +8,7 @@ from avis_ctrl.identification.ekf_result import EkfResult, kinds
 from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
-from avis_ctrl.report.pieces import Bullets, Heading, Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
 
@@ -130,18 +130,19 @@ def _consistency(found: Identification, result: EkfResult) -> Table:
         low, high = (v / n_y for v in one.nis_interval)
         rows.append((name, words.number(one.nis_per_output, 4), f"{low:.4f} to {high:.4f}",
                      f"{words.number(100 * one.outside, 2)} %",
-                     Mark("yes", True) if one.consistent else Mark("no", False)))
-    return table("Innovations of the filter: mean normalised square per output, where 99.9 % of such means lie, and "
-                 "the fraction of autocorrelations outside the 95 % limits of white noise. If the innovations are "
-                 "larger than the filter's covariance predicts, its standard deviations are too small.",
+                     yes_or_no(one.consistent)))
+    return table("Innovations of the filter: mean normalised square per output, the interval that contains 99.9 % of "
+                 "such means for a consistent filter, and the fraction of autocorrelations outside the 95 % limits of "
+                 "white noise. If the innovations are larger than the filter's covariance predicts, its standard "
+                 "deviations are too small.",
                  ("record", "mean square", "expected", "beyond the bound", "consistent"), rows, "lrrrc")
 
 
 def _hidden(result: EkfResult) -> tuple[str, ...]:
     s = result.settings
     said = ["Measurement noise: the sensor noise and converter of the rig file.",
-            "Process noise: the rig file's ambient floor motion, through the isolators. It does not hold for a record "
-            "with stronger floor motion.",
+            "Process noise: the rig file's ambient floor motion, transmitted by the isolators. It is too small for a "
+            "record with stronger floor motion.",
             f"Prior: standard deviation {100 * s.prior_share:g} % of each starting value. A parameter that the data do "
             "not determine keeps this band; the band then depends on the prior only, not on the rig.",
             f"The covariance is kept from record to record, after {s.warm_up} record of warm-up for the linearisation."]

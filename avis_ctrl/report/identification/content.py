@@ -11,8 +11,8 @@ from avis_ctrl.report.identification.opening import opening, parameters
 from avis_ctrl.report.identification.responses import responses
 from avis_ctrl.report.identification.uncertainty import uncertainty
 from avis_ctrl.report.identification.validation import validation
-from avis_ctrl.report.pieces import Document
-from avis_ctrl.report.sections.provenance import document_of, provenance_table
+from avis_ctrl.report.pieces import Document, document_of
+from avis_ctrl.report.sections.provenance import provenance_table
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identified_uncertainty import InDesign
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
 
 def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
     """Each picture once, with the sentences that refer to it; pictures without data are omitted."""
-    seen: dict[tuple, tuple[Picture, list[str]]] = {}
+    seen: dict[tuple[Any, ...], tuple[Picture, list[str]]] = {}
     for finding in findings:
         p = finding.picture
         if p is None or not any(len(s.x) for s in p.series):
@@ -84,7 +85,6 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
     groups = [of[k:k + SETTINGS.together] for of in (many, few) for k in range(0, len(of), SETTINGS.together)]
     return [figure_of(f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group,
                       2, 0.75) for k, group in enumerate(groups)]
-
 
 
 def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:

@@ -55,9 +55,10 @@ def distortion(campaign: Campaign) -> Table | None:
         rows.append((record.header.name, *cells))
     if not rows:
         return None
-    return table("Distortion of the multisines that leave lines out: r.m.s. of the even and of the odd distortion over "
-                 "that of the excited lines, noise subtracted, for the output in which it is largest. Even distortion "
-                 "comes from asymmetry, odd distortion from stiffening, friction or saturation.",
+    return table("Distortion of the multisines that have unexcited lines: r.m.s. of the even and of the odd distortion "
+                 "relative to that of the excited lines, after subtraction of the noise, for the output with the "
+                 "largest distortion. Even distortion comes from asymmetry, odd distortion from stiffening, friction "
+                 "or saturation.",
                  ("record", "even", "odd"), rows, "lrr")
 
 

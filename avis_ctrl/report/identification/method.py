@@ -25,7 +25,7 @@ _TOLERANCES = (
               "its tolerance as the standard deviation of a normal prior. The residual is weighted by noise, by a "
               "relative error of each path from an input to a sensor that is constant over a third of an octave, and "
               "by distortion; the variances of the last two are estimated from the residual in turn with the fit. The "
-              "information on the parameters is what remains of H whatever the tolerances are (Schur complement)."),)
+              "information on the parameters alone is the Schur complement of H with respect to the tolerances."),)
 
 
 def method(found: Identification) -> Section:

@@ -45,7 +45,7 @@ def _measured(found: Identification) -> Paragraph:
     total = sum(r.header.duration_s for r in found.measured.records)
     how = f" {words.sentence(found.split.how)}" if found.split else ""
     return Paragraph(f"Measured: {len(found.measured.records)} records, {words.number(total)} s in total; the fit uses "
-                     f"the spectral lines from {band}.{how} The error is measured on what is held out, which no fit "
+                     f"the spectral lines from {band}.{how} The error is evaluated on held-out data, which no fit "
                      "has used.")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.identification.overlays import ResponseOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_limits
 from avis_ctrl.report.pieces import Paragraph, Piece, Section
 from avis_ctrl.report.response_panels import (
     MEASURED,
@@ -42,8 +42,8 @@ def responses(found: Identification) -> Section:
         f"confidence region about the identified model; 95 % are expected if they differ from the model by noise only "
         f"and the estimate has no bias. Shown in full: the strongest input of each output, {named}.")]
     if seen.method.startswith("response of the model"):
-        pieces.append(Paragraph("From these records, no response can be estimated without a model that is not smoothed "
-                                "at the resonances. The points are therefore the identified model's response plus the "
+        pieces.append(Paragraph("From these records, any response estimated without a model would be smoothed at the "
+                                "resonances. The points are therefore the identified model's response plus the "
                                 "residual of the records, regressed on the inputs. A model error that is narrower than "
                                 "a window of lines is not visible here, but in the tests of the section on "
                                 "validation.", "note"))
@@ -97,8 +97,7 @@ def _overview(seen: ResponseOverlay) -> Figure:
     keep = thin(len(seen.frequency_Hz), MOST_SMALL)
     f, n_y = seen.frequency_Hz[keep], len(seen.outputs)
     size = np.abs(np.concatenate([seen.model[:, :, columns], seen.start[:, :, columns]]))
-    positive = size[size > 0]
-    limits = (0.7 * float(np.quantile(positive, 0.02)), 1.5 * float(positive.max())) if positive.size else (0.1, 10.0)
+    limits = log_limits(size, 0.7, 1.5, quantile=0.02)
     panels = []
     for i in range(n_y):
         for j in columns:

@@ -25,10 +25,10 @@ def uncertainty(found: Identification, made: InDesign | None) -> Section:
                f"direction{'s' * (count != 1)}" if count else
                "the parameters are known so precisely that no direction of their covariance needs a bound of its own")
     text = (f"For a design of {kept}, {bounded}. The spread of the measured response about the model is represented by "
-            f"one filter. The directions together with the remaining parameter uncertainty hold with a probability of "
-            f"{words.number(100 * made.found.coverage)} %, the bound of the spread at each line with "
-            f"{words.number(100 * made.confidence)} %. Outside the measured band, or if the design file states a "
-            "larger uncertainty of the drives, the filter is increased accordingly.")
+            "one filter. The directions and the remaining parameter uncertainty contain the true parameters with a "
+            f"probability of {words.number(100 * made.found.coverage)} %; the bound of the spread is valid with a "
+            f"probability of {words.number(100 * made.confidence)} % at each spectral line. Outside the measured band, "
+            "or if the design file states a larger uncertainty of the drives, the filter is increased accordingly.")
     left = words.number(100 * float(np.max(made.found.rest, initial=0.0)), 2)
     rig = found.rig.parameters()
     return Section(TITLE, "uncertainty", (

@@ -7,8 +7,8 @@ import numpy as np
 from avis_ctrl.identification.validation import HeldOut
 from avis_ctrl.identification.whiteness import Correlation, Whiteness
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, numbered, places
-from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, log_limits, numbered, places
+from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table, yes_or_no
 from avis_ctrl.study.identification import Identification
 
 BEFORE, AFTER, FLOOR = Style("#e69f00"), Style("#0072b2"), Style("#7a7a7a")
@@ -44,12 +44,12 @@ def _records(found: Identification) -> Table:
         rows.append((one.name, str(one.lines), words.number(one.chi2_per_dof, 4), f"{low:.4f} to {high:.4f}",
                      words.number(one.chi2_start, 4),
                      "none" if np.isnan(one.chi2_local) else words.number(one.chi2_local, 4),
-                     Mark("yes", True) if one.consistent else Mark("no", False),
-                     "not tested" if white is None else Mark("yes", True) if white.white else Mark("no", False)))
+                     yes_or_no(one.consistent),
+                     "not tested" if white is None else yes_or_no(white.white)))
     noise = "; ".join(dict.fromkeys(one.noise for one in found.validation.held_out))
-    return table(f"Chi-square per degree of freedom of the held-out data, with its 95 % interval if only noise and the "
-                 f"parameters' uncertainty are left. Noise: {noise}. \"Local noise\" is the same chi-square with the "
-                 "noise covariance of a local polynomial model.",
+    return table("Chi-square per degree of freedom of the held-out data, with its 95 % interval for a residual that is "
+                 f"due only to noise and parameter uncertainty. Noise: {noise}. \"Local noise\" is the same chi-square "
+                 "with the noise covariance of a local polynomial model.",
                  ("record", "lines", "chi-square", "expected", "start model", "local noise", "consistent", "white"),
                  rows, "lrrrrrcc")
 
@@ -70,9 +70,7 @@ def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
     curves = tuple(Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)
                    for k, (v, label, style) in enumerate(zip(values, labels, styles, strict=True)))
-    positive = np.concatenate(values)
-    positive = positive[positive > 0]
-    limits = (float(positive.min()) / 3, float(positive.max()) * 2) if positive.size else (0.01, 100.0)
+    limits = log_limits(np.concatenate(values), 1 / 3, 2, (0.01, 100.0))
     return Figure(f"nrms_{one.name}", f"Normalised r.m.s. error of each output in the band, record {one.name}: error "
                   "divided by output, with the transient of the record removed. Logarithmic.",
                   (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves),), height=0.9)
@@ -92,9 +90,9 @@ def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
 
 def _whiteness(name: str, white: Whiteness) -> Figure:
     panels = tuple(_correlation(one) for one in white.correlations)
-    return Figure(f"whiteness_{name}", f"Correlations of the residual, record {name}, of each output: the largest over "
-                  "the inputs if there are several. Noise alone exceeds any limit (dashed) in 1 % of all "
-                  "validations.", panels, height=0.55)
+    return Figure(f"whiteness_{name}", f"Correlations of the residual of each output in record {name}; the largest "
+                  "over the inputs if there are several. With noise alone, at least one of the limits (dashed) is "
+                  "exceeded in 1 % of all validations.", panels, height=0.55)
 
 
 def _correlation(one: Correlation) -> Panel:

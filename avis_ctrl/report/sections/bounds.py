@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
-from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table, yes_or_no
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 
 Pick = Callable[[ControllerResult], Bound]
@@ -77,8 +77,8 @@ def _stability(result: DesignResult) -> Table:
 def stable_for_the_set(c: ControllerResult) -> Mark:
     """Robust stability of the loop: yes, no, or not shown if the bounds of mu do not decide."""
     if not c.stable or c.stability.lower >= 1:
-        return Mark("no", False)
-    return Mark("yes", True) if c.stability.upper < 1 else Mark("not shown", False)
+        return yes_or_no(False)
+    return yes_or_no(True) if c.stability.upper < 1 else Mark("not shown", False)
 
 
 def _worst(result: DesignResult) -> Table:

@@ -46,9 +46,9 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
              f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
              _offset(c.rest.percent) if c.rest else "") for c in made]
     return table(f"The controllers and their state-space files. The fastest pole is compared with half the sample "
-                 f"rate of {words.number(rate, 4)} Hz. The gain at rest turns the offset of the sensors' electronics "
-                 "into drive voltage: the last column is the part of a drive's range that the largest offsets of the "
-                 "rig file need, each with its worst sign.",
+                 f"rate of {words.number(rate, 4)} Hz. The gain at zero frequency converts offsets of the sensor "
+                 "electronics into drive voltage. The last column is the fraction of a drive's range that the largest "
+                 "offsets of the rig file use up, each with its worst-case sign.",
                  ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself",
                   "gain at rest", "offset needs"), rows, "llrrrcrr")
 

@@ -36,18 +36,18 @@ def _origin(result: DesignResult, found: InDesign) -> Paragraph:
             f"{len(content.parameter)} parameters; {content.undetermined} have no influence on the measurements and "
             f"keep their starting values. ")
     if kept:
-        text += (f"{kept} of them are bounded directions here, within {words.number(d.box)} standard deviations; the "
-                 f"others together change the response by at most {_percent(d.rest)} and the transmissibility by at "
-                 f"most {_percent(d.rest_floor)}. ")
+        text += (f"{kept} of them are bounded directions of the uncertainty set, each with a range of ± "
+                 f"{words.number(d.box)} standard deviations. The remaining combinations together change the response "
+                 f"by at most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}. ")
     else:
-        text += (f"All of them together, within {words.number(d.ball)} standard deviations, change the response by at "
-                 f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}: no block of "
-                 "their own is needed. ")
-    text += (f"The combinations without a direction of their own are added to the spread of the response. The spread "
-             f"acts at the actuators; their influence on the response to floor motion is not covered. Directions and "
-             f"the other combinations together hold with a probability of {words.number(100 * d.coverage)} % if the "
-             f"errors are normally distributed; the spread holds with {words.number(100 * found.confidence)} % at each "
-             "frequency.")
+        text += (f"Within {words.number(d.ball)} standard deviations, all of them together change the response by at "
+                 f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}, so they need "
+                 "no separate uncertainty block. ")
+    text += ("The remaining combinations are added to the spread of the response. As the spread acts at the actuators, "
+             "their influence on the response to floor motion is not covered. If the errors are normally distributed, "
+             "directions and remaining combinations contain the true parameters with a probability of "
+             f"{words.number(100 * d.coverage)} %, and the spread bounds the error of the response with a probability "
+             f"of {words.number(100 * found.confidence)} % at each frequency.")
     return Paragraph(text)
 
 

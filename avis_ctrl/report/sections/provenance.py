@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Document, Section, table
+from avis_ctrl.report.pieces import Section, table
 from avis_ctrl.study.design_result import DesignResult
 
 NAMES = {"avis_ctrl": "avis_ctrl version", "design_file": "design file", "inputs_sha256": "SHA-256 of the inputs",
@@ -32,22 +32,15 @@ def provenance(result: DesignResult) -> Section:
 
 def provenance_table(made: Mapping[str, Any], caption: str) -> Section:
     """Table of the provenance of a result."""
-    rows = [(NAMES.get(key, key), _said(value))
+    rows = [(NAMES.get(key, key), _as_text(value))
             for key, value in made.items() if value is not None]
     return Section("Provenance", "provenance", (table(caption, ("what", "value"), rows, "ll"),))
 
 
-def _said(value: Any) -> str:
+def _as_text(value: Any) -> str:
     if isinstance(value, Mapping) and len(value) > SETTINGS.most_values:
         return "listed in the JSON file of results"
     if isinstance(value, Mapping):
-        return "; ".join(f"{key} ({_said(one)})" if isinstance(one, Mapping) else f"{key} {_said(one)}"
+        return "; ".join(f"{key} ({_as_text(one)})" if isinstance(one, Mapping) else f"{key} {_as_text(one)}"
                          for key, one in value.items() if one is not None)
     return words.number(value) if isinstance(value, float) else str(value)
-
-
-def document_of(title: str, subtitle: str, made: Mapping[str, Any], sections: Iterable[Section]) -> Document:
-    """A report with the date under its title, and version and hash of the inputs in its page header."""
-    date = str(made.get("date", ""))[:10]
-    return Document(title, subtitle + (f", {date}" if date else ""), f"avis_ctrl {made.get('avis_ctrl', '')}, inputs "
-                    f"{str(made.get('inputs_sha256', ''))[:12]}", tuple(sections))

@@ -15,6 +15,7 @@ from avis_ctrl.rigs.instruments import Sensor
 from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.study.plant import edge_levers
 
 # By measured quantity: kind of sensor, unit of its gain, and scale factor and unit of its limit.
 _KINDS = {"velocity": ("geophone", "V s/m", 1e3, "mm/s"), "acceleration": ("accelerometer", "V s²/m", 1.0, "m/s²"),
@@ -59,7 +60,7 @@ def _value(value: float) -> str:
 
 def _modes(one: Rig) -> Table:
     eom = one.equations_of_motion()
-    edge = np.array([one.edge_m if name.startswith("phi") else 1.0 for name in eom.coordinates])
+    edge = edge_levers(one, eom.coordinates)
     modes = eom.natural_frequencies()
     rows = []
     for frequency, shape in zip(modes.frequencies_Hz, modes.shapes.T, strict=True):
@@ -139,7 +140,6 @@ def _electronics(result: DesignResult) -> Table:
 
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
-    n = len(error.keep)
     if not error.left_out.size:
         return [Heading("Design model"), Paragraph("The controller is designed on a model with all six degrees of "
                                                    "freedom; no coordinate is locked.")]
@@ -148,12 +148,12 @@ def _reduction(result: DesignResult) -> list[Piece]:
     kept = words.joined(list(error.keep))
     text = (f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
             "the figure show the difference from the model with six degrees of freedom, relative to the largest gain "
-            "at the same frequency. Floor motion along the other axes, which the design model does not contain, is "
-            f"transmitted to {kept} with at most "
+            "at the same frequency. The design model does not contain floor motion along the other axes; the "
+            f"transmissibility from these axes to {kept} is at most "
             f"{words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. " + _largest(error))
     return [Heading("Error of the design model"), Paragraph(text),
             table("Difference between the design model and six degrees of freedom, relative to the largest gain, over "
-                  "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(result, n)]
+                  "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(error)]
 
 
 def _largest(error: ReductionError) -> str:
@@ -165,8 +165,7 @@ def _largest(error: ReductionError) -> str:
             f"{words.number(100 * float(error.relative[place, k, j]))} % of the largest gain there.")
 
 
-def _compared(result: DesignResult, n: int) -> Figure:
-    error = result.reduction
+def _compared(error: ReductionError) -> Figure:
     f = error.omega / (2 * np.pi)
     curves = []
     for k, name in enumerate(error.keep):

@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, table, yes_or_no
 from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
 from avis_ctrl.study.companions import Companions
@@ -40,7 +40,7 @@ def _plants(check: SimulationCheck) -> Table:
     limits = dict(zip(loop.rig.equations_of_motion().actuators, loop.limits_V.tolist(), strict=True))
     differ = len(set(limits.values())) > 1
     rows = [(p.name, Mark("pass", True) if p.passed else Mark("FAIL", False),
-             Mark("yes", True) if p.stable else Mark("diverged" if p.diverged else "no", False), _agreement(p),
+             Mark("diverged", False) if p.diverged else yes_or_no(p.stable), _agreement(p),
              f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
              str(p.clipped_dac + p.clipped_adc),
              ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()))

@@ -15,8 +15,8 @@ from avis_ctrl.study.design_result import ControllerResult, DesignResult
 def site(result: DesignResult) -> Section:
     """The section on the site."""
     floor = result.plant.floor
-    text = Paragraph(f"The floor motion has the spectrum {floor.name} ({floor.source}), the same and independent along "
-                     "each kept axis; sensor noise is added. Nominal plant, linear model.")
+    text = Paragraph(f"The floor moves independently along each kept axis, each time with the spectrum {floor.name} "
+                     f"({floor.source}); sensor noise is added. Nominal plant, linear model.")
     return Section("On the site", "site", (text, _third_octaves(result), _motion(result), _volts(result),
                                            _compliance(result)))
 

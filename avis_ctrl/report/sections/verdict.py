@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table, yes_or_no
 from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
@@ -71,7 +71,7 @@ def comparison(result: DesignResult) -> Section:
         ("mu, upper bound", lambda c: words.bound(c.mu.upper, 4)),
         ("mu, lower bound", lambda c: words.bound(c.mu.lower, 4)),
         ("mu peaks at", lambda c: words.hertz(c.mu.omega)),
-        ("stable, nominal", lambda c: Mark("yes", True) if c.stable else Mark("no", False)),
+        ("stable, nominal", lambda c: yes_or_no(c.stable)),
         ("stable for the whole set", stable_for_the_set),
         ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
         ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
