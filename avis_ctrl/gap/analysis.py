@@ -268,7 +268,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     small = math.sqrt(max(excess, 0.0)) < settings.small
     verdict = _verdict(told, closed, closed or small, remainder, settings)
     where, remaining = places(before), places(after)
-    onward = _next(told, fits, names)
+    onward = _next(told, fits)
     if onward is None and verdict in ("unexplained", "partly explained"):
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
@@ -337,14 +337,16 @@ def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
     return moved(fitted, with_tolerance(fitted), tolerances_of(fitted.model.rig), settings)
 
 
-def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:
+def _next(told: Sequence[NamedEffect], fits: Fits) -> str | None:
     """The measurement that would distinguish an effect from its strongest rival; None if no rival remains."""
     for one in told:
         if one.indistinguishable_from and one.label:
             step = next(step for step in fits.steps if step.label == one.label)
-            other = one.indistinguishable_from[0]
-            model = next(fit.model for label, fit in step.tried.items() if name_of(label)[0] == other)
-            return between(one.name, other, step.tried[step.label].model, model)
+            mine, other = step.tried[step.label], one.indistinguishable_from[0]
+            # Of the places and laws of the rival, the one with the largest odds cannot be ruled out.
+            rival = max((fit for label, fit in step.tried.items() if name_of(label)[0] == other),
+                        key=lambda fit: odds_against_fit(mine, fit))
+            return between(one.name, other, mine.model, rival.model)
     return None
 
 
@@ -383,8 +385,9 @@ def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[Nam
     if verdict == "unexplained":
         return (f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
                 f"error on held-out records is {_percent(left.nrmse)}; {rest}.{also}")
+    lines = " on the lines without hum" if any(one.name == "mains_hum" for one in (*told, *traces)) else ""
     return (f"{missed(told)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
-            f"{_percent(left.nrmse)}; {rest}.{also}")
+            f"{_percent(left.nrmse)}{lines}; {rest}.{also}")
 
 
 def _remains(left: Remainder, remaining: Sequence[Where]) -> str:

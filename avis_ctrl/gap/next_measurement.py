@@ -40,11 +40,13 @@ SETTINGS = NextMeasurementSettings()
 
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     """How to separate two explanations: measure where the predictions of their refitted models differ most."""
-    bent = {_bent_beside(a, b), _bent_beside(b, a)}
-    if True in bent:
-        why = ("only one of them depends on amplitude" if bent == {True, False} else
-               "they depend on amplitude in different ways")
-        return f"To distinguish {name} from {other}, record the same signals at half and at twice the level: {why}."
+    for time_varying, quantity, advice in ((False, "amplitude", "at half and at twice the level"),
+                                           (True, "time", "over a longer time")):
+        depends = [_depends(model, beside, time_varying) for model, beside in ((a, b), (b, a))]
+        if any(depends):
+            why = f"they depend on {quantity} in different ways" if all(depends) else (
+                f"only one of them depends on {quantity}")
+            return f"To distinguish {name} from {other}, record the same signals {advice}: {why}."
     frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), SETTINGS.points)
     omega, n_u = 2 * np.pi * frequency, len(a.actuators)
     difference = np.abs(a.response(omega)[:, :, :n_u] - b.response(omega)[:, :, :n_u])
@@ -55,10 +57,11 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
             f"there their predictions differ most, by {difference.max():.2g} {a.sensors.unit}/V.")
 
 
-def _bent_beside(model: TableModel, other: TableModel) -> bool:
-    """Whether a model has amplitude-dependent (or time-dependent) effects that the other model lacks."""
+def _depends(model: TableModel, other: TableModel, time_varying: bool) -> bool:
+    """Whether a model has effects that the other model lacks and that depend on time, or on amplitude."""
     common = {one.label for one in other.effects}
-    return any(one.effect.nonlinear for one in model.effects if one.label not in common)
+    return any(one.effect.nonlinear and one.effect.time_varying == time_varying for one in model.effects
+               if one.label not in common)
 
 
 def _about(size: np.ndarray, k: int) -> tuple[int, int]:

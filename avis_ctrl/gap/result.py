@@ -115,7 +115,10 @@ class Where:
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named."""
+    """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named.
+
+    probability : odds against the best candidate of the same step, at most `GapSettings.most_sure`.
+    """
 
     name: str
     location: str
@@ -202,8 +205,8 @@ class Gap:
     Attributes
     ----------
     verdict : one of VERDICTS. effects : named. stages : on held-out data, "nominal", "re-identified", "tolerances",
-        then one for each effect. where : location of the gap after re-identification. remaining : the same after the
-        named effects.
+        then one for each effect; from "tolerances" on without the lines polluted by hum, if there is any.
+    where : location of the gap after re-identification. remaining : the same after the named effects.
     noise_nrmse : residual of the held-out records expected from noise alone. next_experiment : None or a sentence.
     baseline, updated : models (without named effects, updated is the baseline with all tolerances fitted).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.

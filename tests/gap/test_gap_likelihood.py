@@ -397,6 +397,10 @@ def test_odds_by_how_evenly_two_models_differ():
     assert odds_against(even, none) < 1e-12
     assert odds_against(uneven, none) > 0.4
     assert odds_against(none, uneven) * odds_against(uneven, none) == pytest.approx(1.0)
+    certain = dict.fromkeys(groups, 10.0)
+    with np.errstate(all="raise"):
+        assert odds_against(certain, none) == 0.0
+        assert 1e290 < odds_against(none, certain) < np.inf  # below 38 standard deviations
 
 
 def test_what_is_beyond_a_tolerance_and_the_tolerance_behind_it():

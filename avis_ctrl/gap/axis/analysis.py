@@ -18,8 +18,6 @@ from avis_ctrl.gap.axis.search import (
     Progress,
     Rival,
     at_an_edge,
-    borne_out,
-    odds_against_fit,
     parts,
     rivals,
     robust,
@@ -100,7 +98,11 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
             wrong = sorted(uncertain, key=lambda one: shares.of_effect[one.effect.label])[:1]
             refused += [replace(one, refused="its size is not certain to differ from zero") for one in wrong]
         for one in wrong:
-            best = explored.without(best, one.effect.label) or base
+            rest = explored.without(best, one.effect.label)
+            if rest is None:  # nothing is known of the other effects without this one
+                refused += [replace(other, refused=f"no fit without {one.effect.name} succeeded") for other in names
+                            if other not in wrong]
+            best = rest or base
         if not wrong:
             break
     told = power(base) - power(best)
@@ -138,7 +140,7 @@ def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitte
 def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, settings: AxisSettings) -> Name:
     others = rivals(best, one.label, explored, problem.effects)
     rest = explored.without(best, one.label)
-    nothing = 0.0 if rest is None else odds_against_fit(best, rest, settings)
+    nothing = 0.0 if rest is None else explored.odds_against(best, rest)
     by_key: dict[str, float] = {}
     for other in others:
         if not other.same:
@@ -148,7 +150,7 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     # Only linear parameters are compared: a shape parameter is often determined by a part of the data alone.
     parameters = _sizes(one)
     found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
-    return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
+    return Name(one, probability, near, _refusal(best, rest, probability, found, explored, max(
         others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
                 _widening(found, settings))
 
@@ -164,13 +166,14 @@ def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
     return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
 
 
-def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float, found, settings: AxisSettings,
+def _refusal(best: Fitted, rest: Fitted | None, probability: float, found: Sequence[Half], explored: Explored,
              rival: str) -> str:
+    settings = explored.settings
     if probability < settings.headline:
         return f"{rival} in its place is as probable"
     if edge := at_an_edge(best):
         return edge
-    if rest is not None and not borne_out(best, rest, settings):
+    if rest is not None and explored.held_out(best) <= explored.held_out(rest):
         return "held-out data do not bear it out"
     for half in found:
         if half.change > settings.law_change:

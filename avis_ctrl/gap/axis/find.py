@@ -157,7 +157,7 @@ def signals_in(kind: str, paths: Sequence[str | Path], reading: Reading, band_Hz
             u, y = record.u[:, 0] * reading.scale.get(driven, 1.0), record.y[:, 0] * reading.scale.get(measured[0], 1.0)
             if reading.range_s is not None:
                 a, b = (round(t * rate) for t in reading.range_s)
-                if not 0 <= a < b <= len(u) + 1:
+                if not 0 <= a < b <= len(u):
                     raise InputError(f"expected a range inside the record's {len(u) / rate:.5g} s", file=path,
                                      field="range", value=reading.range_s)
                 u, y = u[a:b], y[a:b]

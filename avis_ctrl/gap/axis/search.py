@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from itertools import combinations
 
 import numpy as np
@@ -21,9 +22,12 @@ from avis_ctrl.gap.probability import larger_odds
 from avis_ctrl.gap.score import reduction
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, unseen
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
+from avis_ctrl.identification.priors import Priors
 from avis_ctrl.identification.single_axis.fit import not_below
 
 Progress = Callable[[str], None]
+# Log-likelihood by segment, octave, and whether the data were held out.
+Cells = dict[tuple[int, int, bool], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +42,21 @@ class Candidate:
 
 @dataclass(eq=False)
 class Explored:
-    """Fits by the set of their effects' labels, so that the order in which effects are found has no influence."""
+    """Fits by the set of their effects' labels, so that the order in which effects are found has no influence.
+
+    cells : `cells` of a fit, for the fitted or the held-out data; computed once.
+    """
 
     data: Data
     settings: AxisSettings
     fits: dict[frozenset[str], Fitted | None] = field(default_factory=dict)
+    cells: Callable[[Fitted, bool], Cells] = field(init=False)
 
-    def base(self, model: AxisModel, priors) -> Fitted:
+    def __post_init__(self) -> None:
+        self.cells = cache(partial(cells, settings=self.settings))
+
+    def base(self, model: AxisModel, priors: Priors) -> Fitted:
+        """The fit without effects."""
         found = fit(model, priors, priors.z(model.values), self.data, first_variances(self.data, self.settings),
                     self.settings)
         self.fits[frozenset()] = found
@@ -63,6 +75,7 @@ class Explored:
         return self.fits[labels]
 
     def without(self, now: Fitted, label: str) -> Fitted | None:
+        """The fit without one of its effects; None if it did not converge."""
         labels = frozenset(now.labels) - {label}
         if labels not in self.fits:
             model = now.model.without(label)
@@ -70,12 +83,28 @@ class Explored:
             self.fits[labels] = self._try(model, now.priors.of(model.names), now.z[rows], now)
         return self.fits[labels]
 
-    def _try(self, model: AxisModel, priors, z: np.ndarray, like: Fitted) -> Fitted | None:
+    def _try(self, model: AxisModel, priors: Priors, z: np.ndarray, like: Fitted) -> Fitted | None:
         try:
             with np.errstate(all="ignore"):
                 return fit(model, priors, z, self.data, like.variances, self.settings)
         except (AvisError, np.linalg.LinAlgError, FloatingPointError):
             return None
+
+    def held_out(self, one: Fitted) -> float:
+        """Log-likelihood of the held-out data."""
+        return sum(self.cells(one, True).values())
+
+    def score(self, one: Fitted) -> float:
+        """Evidence of the fitted data plus log-likelihood of the held-out data."""
+        return one.log_evidence + self.held_out(one)
+
+    def odds_against(self, one: Fitted, other: Fitted) -> float:
+        """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out
+        data, or by how evenly their difference is spread over segments and octaves, whichever is larger: the residual
+        of a real record is not white noise."""
+        mine, theirs = self.cells(one, False), self.cells(other, False)
+        beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
+        return larger_odds(mine | self.cells(one, True), theirs | self.cells(other, True), beside)
 
 
 def candidates(now: Fitted, data: Data, effects: Sequence[Effect], settings: AxisSettings) -> list[Candidate]:
@@ -145,25 +174,16 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
                 one = explored.with_effects(now, c.effects)
                 if one is not None and not at_an_edge(one):
                     tried.append(one)
-        best = max(tried, key=lambda one: score(one, settings) - (len(one.labels) - len(now.labels)) * price)
+        best = max(tried, key=lambda one: explored.score(one) - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
             best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
-        if best is now or score(best, settings) <= score(now, settings) or not borne_out(best, now, settings):
+        if best is now or explored.score(best) <= explored.score(now) or (
+                explored.held_out(best) <= explored.held_out(now)):
             revisions += 1
             best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
                 return best
         now = best
-
-
-def score(one: Fitted, settings: AxisSettings) -> float:
-    """Evidence of the fitted data plus log-likelihood of the held-out data."""
-    return one.log_evidence + sum(cells(one, True, settings).values())
-
-
-def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
-    """Whether held-out data are more probable under one model than under another."""
-    return sum(cells(one, True, settings).values()) > sum(cells(other, True, settings).values())
 
 
 def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
@@ -180,18 +200,16 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
             if c.fall < least:
                 break
             one = explored.with_effects(rest, c.effects)
-            if one is not None and not at_an_edge(one) and score(one, settings) > score(now,
-                                                                                        settings) + settings.settled:
+            if one is not None and not at_an_edge(one) and explored.score(one) > explored.score(now) + settings.settled:
                 now = one
     return now
 
 
 def _without_idle(now: Fitted, explored: Explored) -> Fitted:
-    settings = explored.settings
     while len(now.labels) > 1:
         rest = [one for label in now.labels if (one := explored.without(now, label)) is not None]
-        best = max(rest, key=lambda one: score(one, settings), default=None)
-        if best is None or score(best, settings) < score(now, settings) - settings.certain:
+        best = max(rest, key=explored.score, default=None)
+        if best is None or explored.score(best) < explored.score(now) - explored.settings.certain:
             return now
         now = best
     return now
@@ -249,7 +267,7 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
         one = explored.with_effects(rest, c.effects)
         if one is None or at_an_edge(one):
             continue
-        known.append(Rival(effect, one, odds_against_fit(best, one, settings), alike(best, one, settings)))
+        known.append(Rival(effect, one, explored.odds_against(best, one), alike(best, one, settings)))
     return sorted(known, key=lambda r: -r.odds)
 
 
@@ -260,16 +278,7 @@ def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
     return bool(0.5 * left @ left < settings.alike)
 
 
-def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> float:
-    """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out data,
-    or by how evenly their difference is spread over segments and octaves, whichever is larger: the residual of a real
-    record is not white noise."""
-    mine, theirs = cells(one, False, settings), cells(other, False, settings)
-    beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
-    return larger_odds(mine | cells(one, True, settings), theirs | cells(other, True, settings), beside)
-
-
-def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
+def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> Cells:
     """Log-likelihood of the fitted data by segment and octave, or of the held-out data by segment. Each held-out
     segment may have a larger variance than the fitted data, so that a single disturbance decides nothing."""
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
@@ -296,6 +305,7 @@ class Rows:
 
 
 def row_table(fitted: Fitted, data: Data) -> Rows:
+    """Frequency, segment, time and level of the residual of a fit to these data."""
     columns: list[list[np.ndarray]] = [[], [], [], []]
     for block, level in zip(data.blocks, data.levels, strict=True):
         segment, when = fitted.model.lines.of_lines(block.name)

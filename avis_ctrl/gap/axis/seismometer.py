@@ -136,14 +136,16 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     units = dict(zip(start.names, start.information.units, strict=True))
     model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
     positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
-    notes = () if not np.any(h) else (
-        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself "
-        "is nonlinear, which no effect of a channel holds.",)
+    notes = [f"The highest of the {len(f)} frequencies, {f[-1]:.4g} Hz, is not used: they are evaluated in pairs."
+             ] if n < len(f) else []
+    if np.any(h):
+        notes.append(f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the "
+                     "mass itself is nonlinear, which no effect of a channel holds.")
     outputs = " and ".join(names)
     power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
     return Problem("seismometer", model, positive, sensor_effects(f, names),
                    float(np.sum(measured_noise[rows["held out"]])) / power,
-                   {"F": "", "x": "", "input": "drive", "output": outputs}, notes=notes)
+                   {"F": "", "x": "", "input": "drive", "output": outputs}, notes=tuple(notes))
 
 
 HIGHER = "higher frequencies: the phase of a delay stays proportional to them, that of a pole bends"

@@ -374,6 +374,7 @@ class StiffnessDrift(OfMounts):
     looks_like = "resonances move from record to record, in the order of time and not of level"
     at = ("isolators/linear", "isolators/settling")
     nonlinear = True
+    time_varying = True
     strength = "relative_change"
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
