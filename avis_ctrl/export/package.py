@@ -37,6 +37,7 @@ TESTS = {VECTORS: "test_vectors", RESTARTS: "restart_vectors"}
 # The controller of the logical axes from which the exported one was derived, if the design's folder does not have it.
 CONTINUOUS = "continuous_controller.json"
 FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, RESTARTS, CERTIFICATE)
+ORDERS = "orders.png"  # written by the command beside these files, with --order; it has no hash
 FORMATS = ("c", "mat", "json")
 
 
@@ -170,8 +171,9 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     """Inconsistencies in an exported folder, one line each; empty if there are none.
 
     First the files are checked: missing or unlisted files, the hashes, the numbers in the C and .mat files, the test
-    vectors; each finding goes to `progress` at once. Then the certificate is recomputed, unless only files other than
-    controller.json have changed, or the design is another one.
+    vectors; each finding goes to `progress` at once. Files that no export writes are not checked; `progress`
+    gets a note of them. Then the certificate is recomputed, unless only files other than controller.json have changed,
+    or the design is another one.
 
     Parameters
     ----------
@@ -193,6 +195,8 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
              ] if stored.get("content_sha256") != _content_sha256(stored) else []
     wrong = _wrong_files(out, stored)
+    if foreign := _foreign_files(out, stored):
+        progress(f"Note: {CERTIFICATE} does not list {', '.join(foreign)}; not checked")
     try:
         controller = read_controller(out / CONTROLLER)
     except InputError as error:
@@ -244,11 +248,22 @@ def _require_export(out: Path) -> None:
         raise InputError(f"expected a folder that avis export wrote; {lacks}", field="--out", value=str(out))
 
 
+def _hashes(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Hash of each file of the certificate, by name."""
+    hashes = stored.get("files")
+    return hashes if isinstance(hashes, dict) else {}
+
+
+def _foreign_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
+    """Names in the folder that no export writes."""
+    known = {*FILES, ORDERS, *_hashes(stored)}
+    return sorted(one.name for one in out.iterdir() if one.name not in known)
+
+
 def _wrong_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
     """Files that the certificate lists but that are missing or differ from the exported ones; and files of an export
     that it does not list."""
-    hashes, found = stored.get("files"), []
-    hashes = hashes if isinstance(hashes, dict) else {}
+    hashes, found = _hashes(stored), []
     for name, digest in ({CONTROLLER: stored.get("controller_sha256")} | hashes).items():
         try:
             data = (out / Path(name).name).read_bytes()

@@ -108,6 +108,7 @@ class SampledAxes:
 
     @property
     def period_s(self) -> float:
+        """Sample period [s]."""
         return self.controller.system.dt
 
     @property

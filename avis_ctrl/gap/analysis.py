@@ -17,7 +17,7 @@ from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.parallel import Each, one_by_one
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
-from avis_ctrl.gap.probability import odds_against_fit, probability_of
+from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import (
     Considered,
@@ -26,30 +26,27 @@ from avis_ctrl.gap.result import (
     NamedEffect,
     Remainder,
     Stage,
-    Tolerance,
     Verdict,
     Where,
     missed,
 )
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import (
-    Step,
     forbidden,
     implausible,
     is_weak,
-    name_of,
     outliers,
     search,
     without_effect,
     without_needless,
 )
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.signal_effects import left_by, levels, named
-from avis_ctrl.gap.table_model import ActiveEffect
+from avis_ctrl.gap.signal_effects import SignalFaults, left_by, levels, named
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.tolerances import BEYOND, moved, of_effect, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
-from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
+from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
 
@@ -168,7 +165,7 @@ def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: Gap
     return tuple(step for step in steps if step in kept or step not in weak), best
 
 
-def _left(model, data: Data) -> float:
+def _left(model: TableModel, data: Data) -> float:
     return ModelResidual.of(model, data.blocks).nrmse ** 2
 
 
@@ -249,7 +246,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
               Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks)))]
     stages += [Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
                for label, one in _chain(fits, updated, prepared, settings)]
-    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared, settings) for one in updated.model.effects
+    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
              if one.label in updated.labels]
     faults = prepared.faults
     if after.chi2_per_dof <= settings.known_noise:
@@ -305,12 +302,12 @@ def _figures(left: ModelResidual) -> tuple[float, float]:
     return left.nrmse, left.chi2_per_dof
 
 
-def _sensors(faults) -> dict[str, float] | None:
+def _sensors(faults: SignalFaults) -> dict[str, float] | None:
     return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
 
 
-def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared,
-           settings: GapSettings) -> NamedEffect:
+def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared
+           ) -> NamedEffect:
     reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,

@@ -10,6 +10,7 @@ evaluated at `lowest_line` times the line spacing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -58,7 +59,7 @@ class LineResponse:
         self.omega = spacing * np.arange(n)
         self.omega[0] = SETTINGS.lowest_line * spacing
         self.parts = [self.at(slice(k, k + SETTINGS.chunk)) for k in range(0, n, SETTINGS.chunk)]
-        self.kept: dict = {}
+        self.kept: dict[str, Any] = {}
 
     def at(self, lines: slice | np.ndarray) -> Assembled:
         """The table on some of the lines."""
@@ -92,7 +93,7 @@ class LineResponse:
         return self.in_time(np.concatenate(Y)), self.in_time(np.concatenate(d))
 
 
-_last: list[tuple[tuple, LineResponse]] = []
+_last: list[tuple[tuple[object, ...], LineResponse]] = []
 
 
 def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> LineResponse:

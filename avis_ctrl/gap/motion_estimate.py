@@ -33,6 +33,8 @@ class RecordMotionSettings:
     low_Hz : lower edge of the band in which the sensors correct the model; the correction rises from zero to full [Hz].
         Below, inverting the sensor response would amplify sensor noise.
     high_Hz : upper edge of that band; the correction falls from full to zero [Hz]. Above, the mounts deflect little.
+    least_excess : lower limit of the power attributed to a force, in standard deviations of the power of noise alone
+        [1]: next to none, but not zero. A limit of one or more would attribute noise to a force.
     noise_from : fraction of the band above which only noise remains; its power is that of the sensors [1].
     margin_s : length by which a record is extrapolated beyond its ends [s]: several periods of a table's lowest mode.
     passes : iterations of this extrapolation.
@@ -41,6 +43,7 @@ class RecordMotionSettings:
 
     low_Hz: tuple[float, float] = (0.4, 0.8)
     high_Hz: tuple[float, float] = (120.0, 150.0)
+    least_excess: float = 0.02
     noise_from: float = 0.6
     margin_s: float = 5.0
     passes: int = 6
@@ -184,8 +187,7 @@ def _strength(frequency: np.ndarray, white: np.ndarray, H: np.ndarray) -> np.nda
     lines = np.bincount(band) * white.shape[1]
     excess = np.bincount(band, np.sum(np.abs(white) ** 2, axis=1)) - lines
     made = np.bincount(band, np.sum(np.abs(H) ** 2, axis=(1, 2)))
-    # Lower limit of the excess: 2 % of the standard deviation that noise alone would give it.
-    least = 0.02 * np.sqrt(np.maximum(lines, 1))
+    least = SETTINGS.least_excess * np.sqrt(np.maximum(lines, 1))
     strength = np.maximum(excess, least) / np.maximum(made, np.finfo(float).tiny)
     return strength[band]
 

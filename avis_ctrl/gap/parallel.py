@@ -12,7 +12,9 @@ Result = TypeVar("Result")
 class Each(Protocol):
     """Results of independent calculations, in order; computed in parallel where processors are available."""
 
-    def __call__(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]: ...
+    def __call__(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Results of the function, in the order of the items."""
+        ...
 
 
 def one_by_one(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

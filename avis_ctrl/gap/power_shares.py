@@ -85,6 +85,7 @@ class Lines:
     noise: np.ndarray
 
     def some(self, keep: np.ndarray) -> Lines:
+        """Some of the lines."""
         return Lines(self.frequency_Hz[keep], self.Y[keep], self.left[keep], self.beyond[keep], self.columns[keep],
                      self.noise[keep])
 

@@ -49,11 +49,13 @@ class ModelResidual:
 
     @staticmethod
     def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> ModelResidual:
+        """Residual of a model on some blocks."""
         errors = (prediction_error(model, block, derivative=False) for block in blocks)
         return ModelResidual(tuple(errors), model.sensors.names, model.inputs)
 
     @property
     def chi2_per_dof(self) -> float:
+        """Chi-square over degrees of freedom."""
         return sum(e.chi2 for e in self.errors) / sum(e.dof for e in self.errors)
 
     @property

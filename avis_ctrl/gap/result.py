@@ -131,8 +131,8 @@ class Considered:
 @dataclass(frozen=True)
 class Detectable:
     """Detection limit of a parameter of an absent effect: the difference from its value without the effect, five
-    standard deviations in a fit to the fitted records. The search requires more than this for a name. Infinite if
-    re-identification would absorb the parameter."""
+    standard deviations in a fit to the fitted records. A name requires about as much, five to seven
+    (`detection_limits`). Infinite if re-identification would absorb the parameter."""
 
     name: str
     location: str

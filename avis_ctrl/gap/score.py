@@ -12,9 +12,10 @@ degrees of freedom as there are directions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -46,8 +47,7 @@ class ScoreSettings:
         determine a combination [1]: a step along it would be round-off.
     least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which it is round-off, which is
         about 1e-16 of the largest [1].
-    detected : standard deviations from which an effect is detected [1]: a parameter reaches the evidence required for a
-        name at between four and five.
+    detected : standard deviations from which an effect counts as detected [1] (`detection_limits`).
     """
 
     step: float = 1e-3
@@ -74,10 +74,15 @@ class Reduction:
     coefficients: np.ndarray
 
 
+def scaled_eigh(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(k,) sizes, and eigenvalues and eigenvectors of G / (size size^T), which has a unit diagonal."""
+    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
+    return size, *np.linalg.eigh(G / np.outer(size, size))
+
+
 def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
     """b^T inv(G) b in the subspace that G determines."""
-    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(G / np.outer(size, size))
+    size, values, vectors = scaled_eigh(G)
     known = values > SETTINGS.least_direction * max(values[-1], 1e-300)
     along = vectors.T @ (b / size)
     step = np.where(known, along / np.where(known, values, 1.0), 0.0)
@@ -154,7 +159,7 @@ class Score:
 
     def __init__(self, model: TableModel, blocks: Sequence[SpectralBlock]):
         self.model = model
-        self.kept: dict = {}
+        self.kept: dict[Hashable, Any] = {}
         self.parts = [Part(model, block) for block in blocks]
         self.e = np.concatenate([part.real((part.block.Y - part.response.Y)[None])[0] for part in self.parts])
         J = np.concatenate([part.real(model.answer(part.block, part.body, inner=part.inner).dY)
@@ -167,10 +172,12 @@ class Score:
 
     @cached_property
     def chi2(self) -> float:
+        """Sum of squares of the residual."""
         return float(self.e @ self.e)
 
     @cached_property
     def dof(self) -> int:
+        """Degrees of freedom of the residual."""
         return len(self.e) - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
@@ -233,6 +240,7 @@ class EvidenceScore(Score):
         fits: unexplained path errors are not removed there."""
         return Score(self.model, [part.block for part in self.parts])
 
-    def directions(self, dY):
+    def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
+        """(k, N + n) as those of `Score`, with the rows of the priors."""
         return self.profile.free(np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)],
                                                 axis=1))

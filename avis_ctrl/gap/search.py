@@ -25,7 +25,7 @@ from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, spread, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, of_effect, rescaled, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
@@ -114,7 +114,7 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
     z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
-    return _try(fitted, model, held(fitted.priors, one, settings).followed_by(own), z, data, settings)
+    return _try(fitted, model, rescaled(fitted.priors, one, settings.held).followed_by(own), z, data, settings)
 
 
 def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
@@ -130,11 +130,11 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
     model = fitted.model.without(label)
     one = fitted.model.effect(label)
     rows = [fitted.priors.names.index(name) for name in model.names]
-    priors = released(fitted.priors, one, settings)
-    return _try(fitted, model, priors.of(model.names), fitted.z[rows], data, settings)
+    priors = rescaled(fitted.priors, one, 1 / settings.held).of(model.names)
+    return _try(fitted, model, priors, fitted.z[rows], data, settings)
 
 
-def _with_known(priors: Priors, known) -> Priors:
+def _with_known(priors: Priors, known: Mapping[str, tuple[float, float]]) -> Priors:
     """Priors with those that an effect specifies for parameters that records need not determine (`Effect.priors`)."""
     rows = [priors.names.index(name) for name in known if name in priors.names]
     mean, sigma = priors.mean.copy(), priors.sigma.copy()
@@ -143,7 +143,8 @@ def _with_known(priors: Priors, known) -> Priors:
     return replace(priors, mean=mean, sigma=sigma)
 
 
-def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings) -> Fitted | None:
+def _try(fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
+         ) -> Fitted | None:
     try:
         return fit(model, priors, z, data, fitted.variances, settings)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):

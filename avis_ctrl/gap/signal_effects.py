@@ -35,6 +35,7 @@ class SignalFaults:
 
     @property
     def resolution_V(self) -> dict[str, float]:
+        """Steps of the channels whose converter is coarser than stated, by name [V]."""
         return {one.channel: one.parameters["resolution_V"].value for one in self.converter
                 if one.kind == "resolution"}
 

@@ -223,6 +223,7 @@ class Shares:
     @staticmethod
     def of(base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored,
            problem: Problem) -> Shares:
+        """Contributions of the named effects of `best`; free : the fit with a free function, None if there is none."""
         whole = power(best)
         before, after = power(base), whole
         for one in best.model.effects:
@@ -374,6 +375,7 @@ def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[
 
 
 def percent(share: float) -> str:
+    """A fraction in per cent, three digits."""
     return f"{100 * share:.3g} %"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -125,7 +125,8 @@ def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
     return x, float(np.linalg.norm(left) / np.linalg.norm(Q))
 
 
-def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str], settings: AxisSettings) -> None:
+def require_oriented(fitted: Callable[[Sequence[Signals]], tuple[float, bool]], records: Sequence[Signals],
+                     names: tuple[str, str], settings: AxisSettings) -> None:
     """Refuse exchanged columns and a flipped sign; a mass must be positive. If the model fits with the sign of the
     input reversed, or with input and output exchanged, but not with the columns as given, the columns are wrong.
 

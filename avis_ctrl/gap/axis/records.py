@@ -13,7 +13,7 @@ correlation of 2/3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,12 +31,11 @@ from avis_ctrl.identification.weights import bands
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A record: force and position (n,), and the commanded position where known."""
+    """A record: force and position (n,)."""
 
     name: str
     force: np.ndarray
     position: np.ndarray
-    reference: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +51,7 @@ class Motion:
 
     @cached_property
     def sign(self) -> np.ndarray:
+        """(n,) sign of the velocity."""
         return np.sign(self.v)
 
     def dahl(self, distance: float) -> np.ndarray:
@@ -133,9 +133,9 @@ class Lines:
         top = min(band_Hz[1], 0.45 * rate)
         self.over = max(2, int(np.ceil(2 * settings.oversampled * top / rate)))
         self.motion = [self._motion(one) for one in self.records]
-        self.kept: dict[tuple, tuple[Shape, list[np.ndarray]]] = {}
-        self.linear: dict[tuple, tuple[Shape, tuple[float, float]]] = {}
-        self.picked: dict[tuple, tuple[Sequence[np.ndarray], np.ndarray]] = {}
+        self.kept: dict[Hashable, tuple[Shape, list[np.ndarray]]] = {}
+        self.linear: dict[Hashable, tuple[Shape, tuple[float, float]]] = {}
+        self.picked: dict[Hashable, tuple[Sequence[np.ndarray], np.ndarray]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
                                   for order in range(3))

@@ -107,7 +107,7 @@ class Explored:
         return larger_odds(mine | self.cells(one, True), theirs | self.cells(other, True), beside)
 
 
-def candidates(now: Fitted, data: Data, effects: Sequence[Effect], settings: AxisSettings) -> list[Candidate]:
+def candidates(now: Fitted, data: Data, effects: Sequence[Effect]) -> list[Candidate]:
     """Every effect that the model does not contain, at its best seed, the largest reduction first."""
     J, e = now.J, now.e
     Q = np.linalg.qr(J.T)[0]
@@ -170,7 +170,7 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         progress(f"candidates beside {', '.join(now.labels) or 'the base model'}")
         tried = [now]
         if len(now.labels) < settings.longest:
-            for c in shortlist(candidates(now, explored.data, effects, settings), now.e, settings):
+            for c in shortlist(candidates(now, explored.data, effects), now.e, settings):
                 one = explored.with_effects(now, c.effects)
                 if one is not None and not at_an_edge(one):
                     tried.append(one)
@@ -194,7 +194,7 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
         if rest is None:
             continue
         laws = [one for one in effects if one.key == own.key]
-        found = candidates(rest, explored.data, laws if laws_only else effects, settings)
+        found = candidates(rest, explored.data, laws if laws_only else effects)
         least = 0.5 * settings.not_far_behind * max(c.fall for c in found if c.effects[0][0].key == own.key)
         for c in found[:settings.starts + len(laws)]:
             if c.fall < least:
@@ -230,7 +230,7 @@ def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitte
     """The best model with an additional unnamed function; None if the data do not support one."""
     settings, tried = explored.settings, []
     others = [one for one in effects if one.outside]
-    for c in candidates(now, explored.data, others, settings):
+    for c in candidates(now, explored.data, others):
         one = explored.with_effects(now, c.effects)
         if one is not None:
             tried.append(one)
@@ -256,7 +256,7 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
     if rest is None:
         return []
     own = next(one for one in best.model.effects if one.label == label)
-    found = candidates(rest, explored.data, [one for one in effects if not one.outside], settings)
+    found = candidates(rest, explored.data, [one for one in effects if not one.outside])
     mine = next((c for c in found if c.effects[0][0].label == label), None)
     least = 0.5 * mine.fall if mine is not None else 0.0
     known: list[Rival] = []

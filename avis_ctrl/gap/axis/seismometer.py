@@ -11,15 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, split
+from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, central_differences, split
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
+from avis_ctrl.identification.single_axis.identify import distinct, responses_of
 from avis_ctrl.identification.single_axis.seismometer import LARGEST_MODE_DAMPING, Responses, fit_seismometer, response
 from avis_ctrl.identification.single_axis.sine import SineRecord
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -78,11 +80,9 @@ class SensorModel(AxisModel):
         Y = self._predicted(rows, self.values)
         if not derivative:
             return Answer(Y[:, :, None], np.empty((0, *Y.shape, 1)))
-        low, dY = 1e-7 / float(self.lines.f[-1]), []
-        for k in range(len(self.values)):
-            h = np.zeros(len(self.values))
-            h[k] = max(1e-5 * abs(self.values[k]), low if k >= len(self.base) else 0.0)
-            dY.append((self._predicted(rows, self.values + h) - self._predicted(rows, self.values - h)) / (2 * h[k]))
+        least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
+        dY = central_differences(partial(self._predicted, rows), self.values,
+                                 np.maximum(1e-5 * np.abs(self.values), least))
         return Answer(Y[:, :, None], np.array(dY)[..., None])
 
 
@@ -199,19 +199,15 @@ def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str
     ------
     ComputationError : too few frequencies.
     """
-    used = [r for k, r in enumerate(records) if k == 0 or r.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+    used = distinct(records)
     if len(used) < SETTINGS.frequencies:
         raise ComputationError("too few sine records", measured=f"{len(used)} usable frequencies",
                                cause="records refused or columns mapped wrongly",
                                next_step=f"map the columns; give at least {SETTINGS.frequencies} frequencies")
-    pairs = {role: [record.ratio(role, driven) for record in used] for role in measured}
-    responses = Responses(np.array([record.frequency_Hz for record in used]),
-                          {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
-                          {role: np.array([v for _, v in pair]) for role, pair in pairs.items()})
     at = [used[0].channels.index(role) for role in measured]
     # Distortion in every channel is that of the motion; in one channel alone it is its own noise or hum.
     seen = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
-    found: dict[str, Any] = {"responses": responses, "distortion": seen}
+    found: dict[str, Any] = {"responses": responses_of(used, driven, measured), "distortion": seen}
     if {"coil", "displacement"} <= set(measured):
         ratio = [record.ratio("displacement", "coil") for record in used]
         found["ratio_variance"] = np.array([v / abs(H) ** 2 for H, v in ratio])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
-from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
+from avis_ctrl.gap.effects.line_of_action import along, best_direction, foot, told
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.effects.sensors import second_order, sprung
 from avis_ctrl.gap.operators import Operators
@@ -49,10 +49,10 @@ class AttachedOscillator(AtPoint):
         variant = place.partition("/")[2]
         if variant == "oblique":
             most = float(np.sqrt(mass))
-            along = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
-                                     -most, most, 0.1 * most) for axis in "xyz"]
+            root = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
+                                    -most, most, 0.1 * most) for axis in "xyz"]
             # The position along the line of action has no effect, so it may end at a bound.
-            return (*along, frequency, damping, *(replace(one, optional=True) for one in self.position()))
+            return (*root, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant in THREE_AXES:
             each = [replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
                     for axis in "xyz"]
@@ -87,7 +87,7 @@ class AttachedOscillator(AtPoint):
         if not one.place.endswith("oblique"):
             return []
         values = one.by_name
-        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
+        a = along(values)
         mass, first = float(a @ a), int(np.argmax(np.abs(a)))
         parameters = self.parameters(score.model, "payload/axes")
         # A resonance with damping ratio zeta has a relative width of 2 zeta, so a step of zeta misses none.
@@ -98,9 +98,9 @@ class AttachedOscillator(AtPoint):
         points = place_of(values) + np.outer(np.linspace(-LIBRARY.reach_m, LIBRARY.reach_m, 25), a / np.sqrt(mass))
         pair, point = _along_the_others(score, values["damping"], frequencies, points,
                                         "".join("xyz"[k] for k in others))
-        along = np.full(3, values["frequency_Hz"])
-        along[others] = pair
-        return [("payload/axes", tuple(map(float, (mass, *along, values["damping"], *point))))]
+        frequency = np.full(3, values["frequency_Hz"])
+        frequency[others] = pair
+        return [("payload/axes", tuple(map(float, (mass, *frequency, values["damping"], *point))))]
 
     def implausible(self, values: Values, std: Values) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
@@ -114,8 +114,7 @@ class AttachedOscillator(AtPoint):
         """For one direction: mass, direction, and the point on the line of action nearest to the geometric centre,
         because the position along that line has no effect."""
         found = super().reported(model, place, values, covariance)
-        a = np.array([values.get(f"along_{axis}", 0.0) for axis in "xyz"])
-        if not np.any(a):
+        if not np.any(along(values)):
             return found
         line = told(values, covariance, "mass_kg", "kg")
         return {"mass_kg": line.pop("mass_kg"), "frequency_Hz": found["frequency_Hz"], "damping": found["damping"],
@@ -126,7 +125,7 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
     """(row over q (6,), mass, frequency [Hz]) for each direction in which the mass can move."""
     variant, rows = place.partition("/")[2], point_map(place_of(values))
     if variant == "oblique":
-        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
+        a = along(values)
         mass = float(a @ a)
         return [(a / np.sqrt(mass) @ rows, mass, values["frequency_Hz"])] if mass > 0 else []
     if variant == "turned":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -105,7 +106,7 @@ def shape_points(model: Table) -> bool:
     return find is not None and all(find(name) for name in (*model.actuators, *model.sensors.names))
 
 
-def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def shape_rows(rig: Any, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """(n_u, n_g) and (n_y, n_g): mount and axis of each motor and of each sensor, with its sign."""
     return _shape_rows(tuple(map(rig.nearest_mount, actuators)), tuple(map(rig.nearest_mount, sensors)),
                        mount_geometry(rig).names)

@@ -83,10 +83,12 @@ class HumFinding:
 
     @property
     def channels(self) -> tuple[str, ...]:
+        """Channels with hum."""
         return tuple(sorted({line.channel for line in self.lines}))
 
     @property
     def harmonics(self) -> tuple[int, ...]:
+        """Harmonics found in any channel."""
         return tuple(sorted({line.harmonic for line in self.lines}))
 
 

@@ -33,6 +33,8 @@ from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual
 from avis_ctrl.rigs.rig import Rig
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
+# What `_floor_lines` returns.
+FloorLines = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class FloorLevel:
 
     @property
     def sentence(self) -> str:
+        """The finding in one sentence."""
         m, seen = self.mean_rms, self.mean_seen
         each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in self.rms.items())
         return (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
@@ -212,7 +215,7 @@ def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarr
     return _level(S, std, visible, edges, ambient, foreign)
 
 
-def _foreign(estimated: Sequence[tuple], edges: np.ndarray, n_out: int) -> tuple[np.ndarray, float]:
+def _foreign(estimated: Sequence[FloorLines], edges: np.ndarray, n_out: int) -> tuple[np.ndarray, float]:
     """Noise outside the range of G over sensor noise (bands,), at least 1, and the fraction of the excess that it is.
 
     The fraction is the mean over bands that contain more than noise. The median in each band is robust against the few
@@ -240,7 +243,7 @@ def _edges() -> np.ndarray:
     return np.array([*edges[:-1], SETTINGS.floor_band_Hz[1]])
 
 
-def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) -> tuple:
+def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) -> FloorLines:
     """frequency, |v_hat|^2 and its noise (n, 3), e^H D^-1 e inside and outside the range of G (n,); left, level."""
     G = floor_response(2 * np.pi * one.frequency_Hz)
     W = np.conj(G.swapaxes(1, 2)) / D
@@ -254,7 +257,7 @@ def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) 
     return one.frequency_Hz, np.abs(v) ** 2 / one.left[:, None], noise, inside, outside, one.left, one.level
 
 
-def _band(one: tuple, low: float, high: float, white: float, louder: float
+def _band(one: FloorLines, low: float, high: float, white: float, louder: float
           ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """S (3,), its variance, and the record's level; None with fewer than four lines."""
     f, power, noise, _, outside, left, level = one

@@ -68,14 +68,17 @@ class SingleAxisFit(Shown):
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
         return self.information.names
 
     @property
     def values(self) -> np.ndarray:
+        """(n_p,) values of the parameters."""
         return self.information.values
 
     @property
     def chi2_per_dof(self) -> float:
+        """Chi-square over degrees of freedom."""
         return self.chi2 / self.dof
 
     @property

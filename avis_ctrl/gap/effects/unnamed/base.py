@@ -43,4 +43,5 @@ class Late(UnnamedFault):
 
 
 def pairs(names: tuple[str, ...]) -> tuple[str, ...]:
+    """All ordered pairs of channels, as "into/source"."""
     return tuple(f"{a}/{b}" for a in names for b in names if a != b)
