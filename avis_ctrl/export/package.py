@@ -183,15 +183,15 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     ------
     InputError : a folder that is not an export, unreadable files, another controller.
     """
-    def told(lines: list[str]) -> list[str]:
+    def reported(lines: list[str]) -> list[str]:
         for line in lines:
             progress(line)
         return lines
     _require_export(out)
     stored = read_json(out / CERTIFICATE, "avis-certificate", "the certificate of avis export")
     if (inputs := stored.get("design_inputs_sha256")) not in (None, (own := folder.inputs_sha256)):
-        return told([f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in "
-                     f"{folder.path}"])
+        return reported([f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in "
+                         f"{folder.path}"])
     found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
              ] if stored.get("content_sha256") != _content_sha256(stored) else []
     wrong = _wrong_files(out, stored)
@@ -201,7 +201,7 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         controller = read_controller(out / CONTROLLER)
     except InputError as error:
         if found or wrong:
-            return told([*found, *wrong, str(error)])
+            return reported([*found, *wrong, str(error)])
         raise
     if name is not None and name != controller.name:
         raise InputError(f"expected {controller.name!r}, the controller in {out}", field="--controller", value=name)
@@ -213,17 +213,17 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         wrong += _differences(MAT, controller, _numbers_in_mat(out / MAT))
     if not any(line.startswith(tuple(TESTS)) for line in wrong):
         wrong += _wrong_vectors(folder, controller, out, stored, settings)
-    found = told([*found, *wrong])
+    found = reported([*found, *wrong])
     if wrong and stored.get("controller_sha256") == controller.sha256:
         return found
     try:
         content = certify(folder, controller, progress).content
     except AvisError as error:
-        return [*found, *told([f"no certificate can be computed from {CONTROLLER}: {error}"])]
+        return [*found, *reported([f"no certificate can be computed from {CONTROLLER}: {error}"])]
     for key, value in json.loads(as_json(content)).items():
         tolerance = settings.direct if key == "rounding_noise_m_per_s" else settings.searched
         if key not in ("controller_sha256", "step_time_us"):
-            found += told(_unlike(key, stored.get(key), value, tolerance))
+            found += reported(_unlike(key, stored.get(key), value, tolerance))
     return found
 
 
@@ -289,7 +289,7 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
         try:
             y, u = read_csv(out / file, controller)
             guard = _guard(folder, controller, stored)
-            told = float(stored[key]["tolerance_V"])
+            stated = float(stored[key]["tolerance_V"])
             samples = int(stored[key]["samples"])
         except InputError as error:
             found.append(str(error))
@@ -299,13 +299,14 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
             continue
         if samples != len(y):
             found.append(f"{key}.samples: {samples} in {CERTIFICATE}, {len(y)} rows in {file}")
-        if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= told:
+        if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= stated:
             found.append(f"the outputs in {file} are not those that {CONTROLLER} gives for its inputs with the "
                          f"anti-windup of {CERTIFICATE}")
         else:
             tolerance = agreement_V(controller, guard, y, u)
-            if not tolerance / settings.rounding <= told <= tolerance * settings.rounding:
-                found.append(f"{key}.tolerance_V: {told:g} in {CERTIFICATE}, {tolerance:g} computed from {CONTROLLER}")
+            if not tolerance / settings.rounding <= stated <= tolerance * settings.rounding:
+                found.append(f"{key}.tolerance_V: {stated:g} in {CERTIFICATE}, {tolerance:g} computed from "
+                             f"{CONTROLLER}")
     return found
 
 

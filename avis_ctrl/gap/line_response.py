@@ -73,8 +73,8 @@ class LineResponse:
         """(samples, m) time signal of a spectrum (n, m)."""
         return scipy.fft.irfft(spectrum, self.padded, axis=0)[:self.samples]
 
-    def answer(self, u: np.ndarray, floor: np.ndarray | None, moved: np.ndarray | None = None,
-               acceleration: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def record_response(self, u: np.ndarray, floor: np.ndarray | None, moved: np.ndarray | None = None,
+                        acceleration: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """y (samples, n_y), and deflection (samples, n_g) of the mounts.
 
         u (samples, n_u), floor (samples, 3). moved : (n, n_q) spectrum of a motion in addition to the response to u and

@@ -79,16 +79,16 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
                 "one record at rest with the floor measured: a residual in proportion to the drive is linear, one that "
                 "grows faster is not, and one that stays the same is noise or comes through the floor.")
     power, std = growth
-    told = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
+    rise = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
     if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
-        return (f"{told}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
+        return (f"{rise}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
                 "search for other sources.")
     if abs(power - 1) <= max(SETTINGS.within, 2 * std):
-        return (f"{told}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
+        return (f"{rise}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
                 "where it acts.")
     law = ("it grows more slowly than the drive, as with friction or backlash" if power < 1 else
            "it grows faster than the drive, as with stiffening or saturation")
-    return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
+    return (f"{rise}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
             "lines in between, over the level, shows its law.")
 
 
@@ -105,12 +105,12 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
     if len(telling) < len(kinds) + 2:
         return None
     own = np.array([[r.kind == kind for kind in kinds] for r in telling], float)
-    level, left = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
+    level, residual = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
     if max(np.ptp(level[of > 0]) for of in own.T) < np.log(SETTINGS.another_level):
         return None
     A = np.column_stack([own, level])
-    x = np.linalg.lstsq(A, left, rcond=None)[0]
-    scatter = np.sum((left - A @ x) ** 2) / (len(left) - A.shape[1])
+    x = np.linalg.lstsq(A, residual, rcond=None)[0]
+    scatter = np.sum((residual - A @ x) ** 2) / (len(residual) - A.shape[1])
     std = float(np.sqrt(scatter * np.linalg.inv(A.T @ A)[-1, -1]))
     return (float(x[-1]), std) if std < SETTINGS.unsure else None
 

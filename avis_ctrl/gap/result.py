@@ -65,10 +65,10 @@ class NamedEffect:
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 
 
-def missed(told: Sequence[NamedEffect]) -> str:
+def missed(reported: Sequence[NamedEffect]) -> str:
     """The sentence that names the missing effects."""
-    count = "one effect" if len(told) == 1 else f"{len(told)} effects"
-    return f"The model misses {count}: {'; '.join(one.in_words() for one in told)}."
+    count = "one effect" if len(reported) == 1 else f"{len(reported)} effects"
+    return f"The model misses {count}: {'; '.join(one.in_words() for one in reported)}."
 
 
 @dataclass(frozen=True)

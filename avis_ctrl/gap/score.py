@@ -114,8 +114,8 @@ class Part:
             columns, norms = transient_columns(block, model)
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, X = span(T.T)
-            left = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
-            self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block, model)
+            residual = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
+            self.body, self.inner = transient_parts(X @ (self.transient.T @ residual), norms, block, model)
             self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
@@ -141,12 +141,12 @@ class Part:
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y per symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
-        q, left = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
+        q, per_force = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
         out = []
         for i, j in SYMMETRIC:
-            push = left[:, :, i, None] * q[:, None, j]
+            push = per_force[:, :, i, None] * q[:, None, j]
             if i != j:
-                push = push + left[:, :, j, None] * q[:, None, i]
+                push = push + per_force[:, :, j, None] * q[:, None, i]
             out.append(-dynamic[:, None, None] * push)
         return np.array(out)
 
@@ -183,9 +183,9 @@ class Score:
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N) projected directions from changes of y, one (k, n, n_y, m) per block."""
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
-        left = A - (A @ self.basis.T) @ self.basis
-        left[np.linalg.norm(left, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
-        return left
+        rest = A - (A @ self.basis.T) @ self.basis
+        rest[np.linalg.norm(rest, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
+        return rest
 
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
         """(k, N): directions of the linear parameters of an effect at zero strength; without such parameters, the

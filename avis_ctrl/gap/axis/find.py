@@ -55,11 +55,11 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
         raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)
     known = {name: one for name, one in signature(PROBLEMS[kind]).parameters.items() if name not in ("settings",)}
     if set(data) - set(known) or any(name not in data for name, one in known.items() if one.default is one.empty):
-        said = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items())
-        raise InputError(f"expected for kind {kind} the data {said} (in brackets what may be left out)", field="data",
-                         value=sorted(data))
-    begun, told = time.perf_counter(), progress or (lambda text: None)
-    told("reading and windows")
+        expected = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items())
+        raise InputError(f"expected for kind {kind} the data {expected} (in brackets what may be left out)",
+                         field="data", value=sorted(data))
+    begun, report = time.perf_counter(), progress or (lambda text: None)
+    report("reading and windows")
     problem = PROBLEMS[kind](**data)
     taken = {one.label for one in problem.effects}
     for one in own:
@@ -67,7 +67,7 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
             raise InputError("expected an effect with name, location, title and parameters, and a name and place that "
                              "no other has", field="own", value=one.label)
         taken.add(one.label)
-    found = analyse(replace(problem, effects=[*own, *problem.effects]), told)
+    found = analyse(replace(problem, effects=[*own, *problem.effects]), report)
     return replace(found, seconds=time.perf_counter() - begun)
 
 
@@ -179,13 +179,13 @@ def _resampled(x: np.ndarray, rate: float, wanted: float) -> np.ndarray:
 
 def assumed(reading: Reading, rate: float | None = None) -> tuple[str, ...]:
     """Sentence on the units that were assumed for the columns."""
-    said = [f"{role} = {name}{f' times {reading.scale[role]:g}' if role in reading.scale else ''}"
-            + (f" in {UNITS[role]}" if role in UNITS else "") for role, name in reading.columns.items() if role != "t"]
+    units = [f"{role} = {name}{f' times {reading.scale[role]:g}' if role in reading.scale else ''}"
+             + (f" in {UNITS[role]}" if role in UNITS else "") for role, name in reading.columns.items() if role != "t"]
     bare = [role for role in reading.columns if role in UNITS and role not in reading.scale]
     hint = f"; not scaled: where the file has other units, --scale {bare[0]}=FACTOR" if bare else ""
     clock = "" if rate is None or "t" in reading.columns else (
         f" The sample rate of {rate:g} Hz is taken as given: with another one every time and mass is wrong.")
-    return (f"Assumed units: {', '.join(said)}{hint}.{clock}",)
+    return (f"Assumed units: {', '.join(units)}{hint}.{clock}",)
 
 
 def _roles(kind: str, reading: Reading) -> tuple[str, list[str]]:

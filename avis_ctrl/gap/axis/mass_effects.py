@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from avis_ctrl.gap.axis.model import Effect, Parameter
-from avis_ctrl.gap.axis.records import Lines, Motion, Shape, bumps
+from avis_ctrl.gap.axis.records import Lines, Motion, Shape, splines
 
 SLOW = "slow motion at several constant speeds"
 SWEEP = "a sine swept slowly up and down at several levels"
@@ -155,7 +155,7 @@ def unnamed_forces(lines: Lines) -> list[Effect]:
 
 
 def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
-    table = bumps(knots, count)
+    table = splines(knots, count)
     return [np.interp(x, knots, one) for one in table]
 
 
@@ -230,9 +230,9 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
     step = lines.over * max(1, len(one.force) // 20_000)
     q, v = m.q[::step], m.v[::step]
     X = np.column_stack([np.ones_like(q), v, np.sign(v), np.gradient(v), q - m.middle])
-    left = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]
+    residual = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]
     tried = np.arange(2.0, 100.0, 0.25) / float(np.ptp(q))
-    power = np.array([abs(np.sum(left * np.exp(-2j * np.pi * n * q))) for n in tried])
+    power = np.array([abs(np.sum(residual * np.exp(-2j * np.pi * n * q))) for n in tried])
     peaks = [k for k in np.argsort(-power) if power[k] == power[max(k - 3, 0):k + 4].max()]
     return [float(tried[k]) for k in peaks[:few]]
 

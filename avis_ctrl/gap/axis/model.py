@@ -80,13 +80,13 @@ class Effect:
         """Name and location."""
         return f"{self.name}@{self.location}"
 
-    def begins(self) -> list[np.ndarray]:
+    def initial_values(self) -> list[np.ndarray]:
         """Initial values of fits; zero by default."""
         return [np.array(one) for one in self.seeds] or [np.zeros(len(self.parameters))]
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Prediction:
     """Predicted Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
 
     Y: np.ndarray
@@ -165,7 +165,7 @@ class AxisModel:
         return replace(self, effects=tuple(self.effects[k] for k in kept),
                        values=np.concatenate([self.values[:len(self.base)], *(parts[k] for k in kept)]))
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         """Predicted outputs on the lines of a block, and their derivatives."""
         raise NotImplementedError
 
@@ -194,7 +194,7 @@ class MassModel(AxisModel):
         return own, np.array([alpha + 1j * beta * block.omega for alpha, beta in (self.lines.linear_part(shape, by)
                                                                                   for shape in one.shapes)])
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         n, s, around = len(self.base), 1j * block.omega, self.lines.around(block.omega)
         A, V, Q, F = (self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q,
                                                                    self.lines.F))
@@ -214,7 +214,7 @@ class MassModel(AxisModel):
         D = -P[:, 1] if drive else Z
         Y = summed(F if drive else Q) + f / D
         if not derivative:
-            return Answer(Y[:, None, None], np.empty((0, len(s), 1, 1)))
+            return Prediction(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
             return -summed(column) / D - (0.0 if drive else f / D ** 2 * z)
@@ -232,7 +232,7 @@ class MassModel(AxisModel):
             if one.path:
                 dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
                 dY += [summed(slope * F) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
-        return Answer(Y[:, None, None], np.array(dY)[:, :, None, None])
+        return Prediction(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 
 def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:

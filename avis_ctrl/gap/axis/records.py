@@ -74,7 +74,7 @@ def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarra
     return at_all(X) + x[0] + slope * t, at_all(s * X) + slope * rate
 
 
-def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
+def splines(x: np.ndarray, count: int) -> list[np.ndarray]:
     """Quadratic B-splines over the quantiles of x, which represent a function of x of any shape."""
     inner = np.unique(np.quantile(x, np.linspace(0, 1, count - 1)))
     knots = np.r_[[inner[0]] * 2, inner, [inner[-1]] * 2]

@@ -36,7 +36,7 @@ class Candidate:
     their whitened directions (k, N), orthogonal to those of the current model."""
 
     effects: tuple[tuple[Effect, np.ndarray], ...]
-    fall: float
+    reduction: float
     directions: np.ndarray
 
 
@@ -111,20 +111,20 @@ def candidates(now: Fitted, data: Data, effects: Sequence[Effect]) -> list[Candi
     """Every effect that the model does not contain, at its best seed, the largest reduction first."""
     J, e = now.J, now.e
     Q = np.linalg.qr(J.T)[0]
-    left, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
+    residual, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
     for one in effects:
         if one.key in taken:
             continue
         best = None
-        for seed in one.begins():
+        for seed in one.initial_values():
             C = directions(now, data, one, seed)
             C = C - (C @ Q) @ Q.T
-            fall = reduction(C @ C.T, C @ left).chi2
-            if best is None or fall > best.fall:
-                best = Candidate(((one, seed),), fall, C)
+            reduced = reduction(C @ C.T, C @ residual).chi2
+            if best is None or reduced > best.reduction:
+                best = Candidate(((one, seed),), reduced, C)
         if best is not None:
             found.append(best)
-    return sorted(found, key=lambda c: -c.fall)
+    return sorted(found, key=lambda c: -c.reduction)
 
 
 def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.ndarray:
@@ -140,19 +140,19 @@ def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.nda
     return C[linear | (not linear.any())]
 
 
-def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettings) -> list[Candidate]:
+def shortlist(found: Sequence[Candidate], residual: np.ndarray, settings: AxisSettings) -> list[Candidate]:
     """The best single effects, and the best pairs whose joint reduction exceeds the sum of the single ones."""
-    singles = [c for c in found if c.fall > 2 * settings.certain]
+    singles = [c for c in found if c.reduction > 2 * settings.certain]
     one_law: dict[str, Candidate] = {}
     for c in found:
         one_law.setdefault(c.effects[0][0].key, c)
     pairs = []
     for a, b in combinations(one_law.values(), 2):
         C = np.vstack([a.directions, b.directions])
-        fall = reduction(C @ C.T, C @ left).chi2
-        if fall > a.fall + b.fall + 2 * settings.certain:
-            pairs.append(Candidate((*a.effects, *b.effects), fall, C))
-    pairs.sort(key=lambda c: -c.fall)
+        reduced = reduction(C @ C.T, C @ residual).chi2
+        if reduced > a.reduction + b.reduction + 2 * settings.certain:
+            pairs.append(Candidate((*a.effects, *b.effects), reduced, C))
+    pairs.sort(key=lambda c: -c.reduction)
     return [*singles[:settings.refits], *pairs[:settings.pairs]]
 
 
@@ -195,9 +195,9 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
             continue
         laws = [one for one in effects if one.key == own.key]
         found = candidates(rest, explored.data, laws if laws_only else effects)
-        least = 0.5 * settings.not_far_behind * max(c.fall for c in found if c.effects[0][0].key == own.key)
+        least = 0.5 * settings.not_far_behind * max(c.reduction for c in found if c.effects[0][0].key == own.key)
         for c in found[:settings.starts + len(laws)]:
-            if c.fall < least:
+            if c.reduction < least:
                 break
             one = explored.with_effects(rest, c.effects)
             if one is not None and not at_an_edge(one) and explored.score(one) > explored.score(now) + settings.settled:
@@ -258,11 +258,11 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
     own = next(one for one in best.model.effects if one.label == label)
     found = candidates(rest, explored.data, [one for one in effects if not one.outside])
     mine = next((c for c in found if c.effects[0][0].label == label), None)
-    least = 0.5 * mine.fall if mine is not None else 0.0
+    least = 0.5 * mine.reduction if mine is not None else 0.0
     known: list[Rival] = []
     for c in found[:2 * settings.refits]:
         effect = c.effects[0][0]
-        if effect.key == own.key or c.fall < settings.not_far_behind * least:
+        if effect.key == own.key or c.reduction < settings.not_far_behind * least:
             continue
         one = explored.with_effects(rest, c.effects)
         if one is None or at_an_edge(one):
@@ -274,8 +274,8 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
 def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
     """Whether two models predict the same within the data: if one were true, the log-likelihood of the other would be
     lower by less than `alike` [nats] on average."""
-    left = one.white.e - other.white.e
-    return bool(0.5 * left @ left < settings.alike)
+    residual = one.white.e - other.white.e
+    return bool(0.5 * residual @ residual < settings.alike)
 
 
 def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> Cells:
@@ -290,8 +290,8 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> Cells:
     places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
     count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))
     louder = np.maximum(e2 / count, 1.0) if held else np.ones(len(e2))
-    left = e2 / louder + count * np.log(louder)
-    return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (left + rest), strict=True)}
+    residual = e2 / louder + count * np.log(louder)
+    return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (residual + rest), strict=True)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, central_differences, split
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, central_differences, split
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.single_axis.identify import distinct, responses_of
@@ -75,15 +75,15 @@ class SensorModel(AxisModel):
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         return np.zeros((*block.Y.shape[:2], 1))  # an error that is constant over the band is a gain, which is free
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         rows = self.lines.rows[block.name]
         Y = self._predicted(rows, self.values)
         if not derivative:
-            return Answer(Y[:, :, None], np.empty((0, *Y.shape, 1)))
+            return Prediction(Y[:, :, None], np.empty((0, *Y.shape, 1)))
         least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
         dY = central_differences(partial(self._predicted, rows), self.values,
                                  np.maximum(1e-5 * np.abs(self.values), least))
-        return Answer(Y[:, :, None], np.array(dY)[..., None])
+        return Prediction(Y[:, :, None], np.array(dY)[..., None])
 
 
 def seismometer(responses: Responses, distortion: np.ndarray | None = None, ratio_variance: np.ndarray | None = None,
@@ -206,8 +206,8 @@ def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str
                                next_step=f"map the columns; give at least {SETTINGS.frequencies} frequencies")
     at = [used[0].channels.index(role) for role in measured]
     # Distortion in every channel is that of the motion; in one channel alone it is its own noise or hum.
-    seen = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
-    found: dict[str, Any] = {"responses": responses_of(used, driven, measured), "distortion": seen}
+    distortion = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
+    found: dict[str, Any] = {"responses": responses_of(used, driven, measured), "distortion": distortion}
     if {"coil", "displacement"} <= set(measured):
         ratio = [record.ratio("displacement", "coil") for record in used]
         found["ratio_variance"] = np.array([v / abs(H) ** 2 for H, v in ratio])

@@ -207,7 +207,7 @@ class Effect(ABC):
         """(samples, n_y) acceleration along the sensors, added to that of the payload; None for none."""
         return None
 
-    def said(self, place: str, values: Values) -> str:
+    def described(self, place: str, values: Values) -> str:
         """Description with its place, for a sentence."""
         return f"{self.title} ({place})"
 

@@ -45,7 +45,7 @@ def along(values: Values) -> np.ndarray:
     return np.array([values.get(f"along_{axis}", 0.0) for axis in "xyz"])
 
 
-def told(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
+def reported_line(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
     """Size, direction and foot of the line of action from the values along_x .. and x_m .., to first order."""
     names = list(values)
     first, last = names.index("along_x"), names.index("x_m")

@@ -159,8 +159,8 @@ class _Step:
 
 
 def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: float) -> ConverterFinding | None:
-    seen = [one for one in of if one.inside > 1]
-    step = (_gaps(seen) or _comb(seen)) if seen else None
+    varying = [one for one in of if one.inside > 1]
+    step = (_gaps(varying) or _comb(varying)) if varying else None
     if step is None or step.p > level:
         return None
     lsb = nominal.lsb_V

@@ -17,7 +17,7 @@ class UnnamedFault(Effect):
     looks_like = "not in the library"
     words: str
 
-    def said(self, place: str, values: Values) -> str:
+    def described(self, place: str, values: Values) -> str:
         into, _, source = place.partition("/")
         return self.words.format(place=place, into=into, source=source, **values)
 
