@@ -267,7 +267,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     small = math.sqrt(max(excess, 0.0)) < settings.small
     verdict = _verdict(reported, closed, closed or small, remainder, settings)
     where, remaining = places(before), places(after)
-    onward = _next(reported, fits)
+    onward = separating_measurement(reported, fits)
     if onward is None and verdict in ("unexplained", "partly explained"):
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
@@ -337,7 +337,7 @@ def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
     return moved(fitted, with_tolerance(fitted), tolerances_of(fitted.model.rig), settings)
 
 
-def _next(reported: Sequence[NamedEffect], fits: Fits) -> str | None:
+def separating_measurement(reported: Sequence[NamedEffect], fits: Fits) -> str | None:
     """The measurement that would distinguish an effect from its strongest rival; None if no rival remains."""
     for one in reported:
         if one.indistinguishable_from and one.label:

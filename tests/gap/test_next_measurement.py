@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avis_ctrl.gap.analysis import _next
+from avis_ctrl.gap.analysis import separating_measurement
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.next_measurement import between, grows, grows_faster, of_unexplained
 from avis_ctrl.gap.result import NamedEffect, RecordGap, Where
@@ -141,7 +141,8 @@ def test_the_rival_is_compared_at_the_place_that_cannot_be_ruled_out():
     step = SimpleNamespace(label="sensor_gain@Sz1", tried=tried)
     told = [NamedEffect("sensor_gain", "Sz1", "", {}, 0.6, ("actuator_gain",), "sensor_gain@Sz1")]
     mine, best = (tried[label].model for label in ("sensor_gain@Sz1", "actuator_gain@Az3"))
-    assert _next(told, SimpleNamespace(steps=[step])) == between("sensor_gain", "actuator_gain", mine, best)
+    text = separating_measurement(told, SimpleNamespace(steps=[step]))
+    assert text == between("sensor_gain", "actuator_gain", mine, best)
 
 
 def test_growth_is_stated_where_the_records_say_it():
