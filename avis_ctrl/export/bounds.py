@@ -93,6 +93,7 @@ class Grid:
 
     @staticmethod
     def of(half_rate: float, settings: CoverSettings) -> Grid:
+        """Intervals of equal ratio, and equal ones below the lowest of them."""
         above = np.geomspace(settings.lowest, 1.0, settings.intervals + 1)
         below = np.linspace(0.0, above[0], int(np.ceil(above[0] / (above[1] - above[0]))) + 1)
         ends = np.concatenate([below[:-1], above]) * half_rate
@@ -177,6 +178,7 @@ class StabilityNotProvedError(ComputationError):
 
 
 def gain_above_in_words(gain: float) -> str:
+    """The bound of the loop gain above half the sample rate, for a message."""
     return f"the loop gain from half the sample rate on is bounded by {gain:.3g} only"
 
 

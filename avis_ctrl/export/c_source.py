@@ -141,6 +141,7 @@ class Provenance:
     lines: tuple[str, ...]
 
     def comment(self) -> str:
+        """The lines as a C comment."""
         text = "\n".join(f" * {_harmless(line)}" for line in self.lines)
         return f"/*\n{text}\n */"
 
@@ -196,13 +197,6 @@ def _filled(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     spans = [np.flatnonzero(row) for row in A]
     return (np.array([span[0] if span.size else 0 for span in spans], int),
             np.array([span[-1] + 1 if span.size else 0 for span in spans], int))
-
-
-def operations(controller: SampledController) -> int:
-    """Number of multiplications in one step, without limits."""
-    first, last = _filled(controller.system.A)
-    K = controller.system
-    return int(np.sum(last - first)) + K.B.size + K.C.size + K.D.size + K.noutputs
 
 
 def constants_of(source: str, dtype: type[np.floating]) -> dict[str, np.ndarray]:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.export.c_source import SOURCE
 from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.files import write_together
 
@@ -38,6 +37,21 @@ def compiler() -> str | None:
     return shutil.which("gcc")
 
 
+def _library(files: Mapping[str, str], *flags: str) -> ctypes.CDLL:
+    """The shared library of all C sources among the files, by name."""
+    gcc = compiler()
+    if gcc is None:
+        raise ComputationError("the C code was not compiled", cause="gcc is not installed",
+                               next_step="install gcc, or compile the files on the target")
+    with tempfile.TemporaryDirectory() as folder:
+        write_together(Path(folder), {name: text.encode() for name, text in files.items()})
+        sources, library = [name for name in files if name.endswith(".c")], str(Path(folder) / "controller.so")
+        done = subprocess.run([gcc, *flags, *sources, "-o", library], cwd=folder, capture_output=True, text=True)
+        if done.returncode:
+            raise ComputationError("the C code does not compile", measured=done.stderr.strip().splitlines()[0])
+        return ctypes.CDLL(library)  # stays loaded when its file is gone
+
+
 class CompiledController:
     """The shared library of a controller's C files, with its own state.
 
@@ -47,24 +61,13 @@ class CompiledController:
     """
 
     def __init__(self, files: Mapping[str, str], controller: SampledController, flags: Sequence[str] = BUILD):
-        gcc = compiler()
-        if gcc is None:
-            raise ComputationError("the C code was not compiled", cause="gcc is not installed",
-                                   next_step="install gcc, or compile the files on the target")
+        self._library = _library(files, *STRICT, *flags)
         real = ctypes.c_float if controller.arithmetic == "float32" else ctypes.c_double
 
         class State(ctypes.Structure):
             _fields_ = (("x", real * max(controller.system.nstates, 1)), ("excess", real * controller.system.noutputs),
                         ("gain", real), ("wait", ctypes.c_uint32))
 
-        with tempfile.TemporaryDirectory() as folder:
-            write_together(Path(folder), {name: text.encode() for name, text in files.items()})
-            library = Path(folder) / "controller.so"
-            done = subprocess.run([gcc, *STRICT, *flags, str(Path(folder) / SOURCE), "-o", str(library)],
-                                  capture_output=True, text=True)
-            if done.returncode:
-                raise ComputationError("the C code does not compile", measured=done.stderr.strip().splitlines()[0])
-            self._library = ctypes.CDLL(str(library))  # stays loaded when its file is gone
         self._step, self._init = self._library.avis_controller_step, self._library.avis_controller_init
         self._step.restype = self._init.restype = None
         self.dtype, self.state = controller.dtype, State()
@@ -83,10 +86,6 @@ class CompiledController:
         self._y[:] = y
         self._step(*self._arguments)
         return self._u.astype(float)
-
-    def skip_start(self) -> None:
-        """Set the gain to 1, as after the start."""
-        self.state.gain, self.state.wait = 1.0, 0
 
 
 _TIMER = """\
@@ -113,17 +112,9 @@ void time_steps(unsigned runs, unsigned steps, const real_t *y, double *seconds)
 def step_time_us(files: Mapping[str, str], controller: SampledController, settings: TimingSettings = TimingSettings()
                  ) -> float | None:
     """Median time of one step on this machine [us], -O2; None without gcc."""
-    gcc = compiler()
-    if gcc is None:
+    if compiler() is None:
         return None
-    with tempfile.TemporaryDirectory() as folder:
-        write_together(Path(folder), {name: text.encode() for name, text in {**files, "timer.c": _TIMER}.items()})
-        library = Path(folder) / "timer.so"
-        done = subprocess.run([gcc, "-std=gnu99", *BUILD, str(Path(folder) / SOURCE), str(Path(folder) / "timer.c"),
-                               "-o", str(library)], capture_output=True, text=True)
-        if done.returncode:
-            raise ComputationError("the C code does not compile", measured=done.stderr.strip().splitlines()[0])
-        loaded = ctypes.CDLL(str(library))
+    loaded = _library({**files, "timer.c": _TIMER}, "-std=gnu99", *BUILD)
     y = np.random.default_rng(0).normal(0, 1e-2, (16, controller.system.ninputs)).astype(controller.dtype)
     seconds = np.zeros(settings.runs)
     loaded.time_steps(ctypes.c_uint(settings.runs), ctypes.c_uint(settings.steps),

@@ -37,6 +37,7 @@ TESTS = {VECTORS: "test_vectors", RESTARTS: "restart_vectors"}
 # The controller of the logical axes from which the exported one was derived, if the design's folder does not have it.
 CONTINUOUS = "continuous_controller.json"
 FILES = (CONTROLLER, CONTINUOUS, HEADER, SOURCE, MAT, VECTORS, RESTARTS, CERTIFICATE)
+ORDERS = "orders.png"  # written by the command beside these files, with --order; it has no hash
 FORMATS = ("c", "mat", "json")
 
 
@@ -170,8 +171,9 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     """Inconsistencies in an exported folder, one line each; empty if there are none.
 
     First the files are checked: missing or unlisted files, the hashes, the numbers in the C and .mat files, the test
-    vectors; each finding goes to `progress` at once. Then the certificate is recomputed, unless only files other than
-    controller.json have changed, or the design is another one.
+    vectors; each finding goes to `progress` at once. Files that no export writes are not checked; `progress`
+    gets a note of them. Then the certificate is recomputed, unless only files other than controller.json have changed,
+    or the design is another one.
 
     Parameters
     ----------
@@ -181,23 +183,25 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     ------
     InputError : a folder that is not an export, unreadable files, another controller.
     """
-    def told(lines: list[str]) -> list[str]:
+    def reported(lines: list[str]) -> list[str]:
         for line in lines:
             progress(line)
         return lines
     _require_export(out)
     stored = read_json(out / CERTIFICATE, "avis-certificate", "the certificate of avis export")
     if (inputs := stored.get("design_inputs_sha256")) not in (None, (own := folder.inputs_sha256)):
-        return told([f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in "
-                     f"{folder.path}"])
+        return reported([f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in "
+                         f"{folder.path}"])
     found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
              ] if stored.get("content_sha256") != _content_sha256(stored) else []
     wrong = _wrong_files(out, stored)
+    if foreign := _foreign_files(out, stored):
+        progress(f"Note: {CERTIFICATE} does not list {', '.join(foreign)}; not checked")
     try:
         controller = read_controller(out / CONTROLLER)
     except InputError as error:
         if found or wrong:
-            return told([*found, *wrong, str(error)])
+            return reported([*found, *wrong, str(error)])
         raise
     if name is not None and name != controller.name:
         raise InputError(f"expected {controller.name!r}, the controller in {out}", field="--controller", value=name)
@@ -209,17 +213,17 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
         wrong += _differences(MAT, controller, _numbers_in_mat(out / MAT))
     if not any(line.startswith(tuple(TESTS)) for line in wrong):
         wrong += _wrong_vectors(folder, controller, out, stored, settings)
-    found = told([*found, *wrong])
+    found = reported([*found, *wrong])
     if wrong and stored.get("controller_sha256") == controller.sha256:
         return found
     try:
         content = certify(folder, controller, progress).content
     except AvisError as error:
-        return [*found, *told([f"no certificate can be computed from {CONTROLLER}: {error}"])]
+        return [*found, *reported([f"no certificate can be computed from {CONTROLLER}: {error}"])]
     for key, value in json.loads(as_json(content)).items():
         tolerance = settings.direct if key == "rounding_noise_m_per_s" else settings.searched
         if key not in ("controller_sha256", "step_time_us"):
-            found += told(_unlike(key, stored.get(key), value, tolerance))
+            found += reported(_unlike(key, stored.get(key), value, tolerance))
     return found
 
 
@@ -244,11 +248,22 @@ def _require_export(out: Path) -> None:
         raise InputError(f"expected a folder that avis export wrote; {lacks}", field="--out", value=str(out))
 
 
+def _hashes(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Hash of each file of the certificate, by name."""
+    hashes = stored.get("files")
+    return hashes if isinstance(hashes, dict) else {}
+
+
+def _foreign_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
+    """Names in the folder that no export writes."""
+    known = {*FILES, ORDERS, *_hashes(stored)}
+    return sorted(one.name for one in out.iterdir() if one.name not in known)
+
+
 def _wrong_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
     """Files that the certificate lists but that are missing or differ from the exported ones; and files of an export
     that it does not list."""
-    hashes, found = stored.get("files"), []
-    hashes = hashes if isinstance(hashes, dict) else {}
+    hashes, found = _hashes(stored), []
     for name, digest in ({CONTROLLER: stored.get("controller_sha256")} | hashes).items():
         try:
             data = (out / Path(name).name).read_bytes()
@@ -274,7 +289,7 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
         try:
             y, u = read_csv(out / file, controller)
             guard = _guard(folder, controller, stored)
-            told = float(stored[key]["tolerance_V"])
+            stated = float(stored[key]["tolerance_V"])
             samples = int(stored[key]["samples"])
         except InputError as error:
             found.append(str(error))
@@ -284,13 +299,14 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
             continue
         if samples != len(y):
             found.append(f"{key}.samples: {samples} in {CERTIFICATE}, {len(y)} rows in {file}")
-        if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= told:
+        if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= stated:
             found.append(f"the outputs in {file} are not those that {CONTROLLER} gives for its inputs with the "
                          f"anti-windup of {CERTIFICATE}")
         else:
             tolerance = agreement_V(controller, guard, y, u)
-            if not tolerance / settings.rounding <= told <= tolerance * settings.rounding:
-                found.append(f"{key}.tolerance_V: {told:g} in {CERTIFICATE}, {tolerance:g} computed from {CONTROLLER}")
+            if not tolerance / settings.rounding <= stated <= tolerance * settings.rounding:
+                found.append(f"{key}.tolerance_V: {stated:g} in {CERTIFICATE}, {tolerance:g} computed from "
+                             f"{CONTROLLER}")
     return found
 
 

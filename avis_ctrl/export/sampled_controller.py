@@ -39,10 +39,12 @@ class SampledController:
 
     @property
     def dtype(self) -> type[np.floating]:
+        """Type of the numbers on the processor."""
         return np.float32 if self.arithmetic == "float32" else np.float64
 
     @property
     def sample_rate_Hz(self) -> float:
+        """Sample rate [Hz]."""
         return 1.0 / self.system.dt
 
     def matrices(self) -> dict[str, np.ndarray]:

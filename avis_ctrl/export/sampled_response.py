@@ -108,6 +108,7 @@ class SampledAxes:
 
     @property
     def period_s(self) -> float:
+        """Sample period [s]."""
         return self.controller.system.dt
 
     @property
@@ -316,8 +317,8 @@ class SampledAxes:
         part, whole = self._part(source, target)
         M = part.frequency_response(omega)[:, None]
         gains = skewed_upper_bound(M, whole.simplified()).beta if simplified else np.full(omega.size, np.inf)
-        if (left := np.flatnonzero(np.isinf(gains))).size:
-            gains[left] = skewed_upper_bound(M[left], whole).beta
+        if (unbounded := np.flatnonzero(np.isinf(gains))).size:
+            gains[unbounded] = skewed_upper_bound(M[unbounded], whole).beta
         if not np.all(np.isfinite(gains)):
             raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
                                    next_step="design with smaller uncertainty")

@@ -15,9 +15,9 @@ from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
-from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
-from avis_ctrl.gap.probability import odds_against_fit, probability_of
+from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import (
     Considered,
@@ -26,30 +26,27 @@ from avis_ctrl.gap.result import (
     NamedEffect,
     Remainder,
     Stage,
-    Tolerance,
     Verdict,
     Where,
     missed,
 )
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import (
-    Step,
+    backward_elimination,
     forbidden,
     implausible,
     is_weak,
-    name_of,
     outliers,
     search,
     without_effect,
-    without_needless,
 )
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.signal_effects import left_by, levels, named
-from avis_ctrl.gap.table_model import ActiveEffect
+from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.tolerances import BEYOND, moved, of_effect, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
-from avis_ctrl.identification.priors import re_identified, tolerances_of, with_tolerances
+from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
 
@@ -83,7 +80,8 @@ class Names:
 
 def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
             amplifier_corner_Hz: float | None = None, effects: Sequence[Effect] | None = None,
-            progress: Progress = lambda text: None, each: Each = one_by_one, settings: GapSettings = SETTINGS) -> Gap:
+            progress: Progress = lambda text: None, each: Mapper = sequential_map, settings: GapSettings = SETTINGS
+            ) -> Gap:
     """Search for missing effects, name them and update the model.
 
     Parameters
@@ -119,7 +117,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
 
 
-def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Progress, each: Each,
+def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Progress, each: Mapper,
           settings: GapSettings) -> Fits:
     data = prepared.data(prepared.fitted, settings.lines)
     progress("fit of mass, inertia, stiffness and damping")
@@ -136,7 +134,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings)
 
 
-def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Each,
+def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper,
               settings: GapSettings) -> Fits:
     """Refit the last model with the new noise estimate and continue the search from there. Effects found before are
     still judged with the noise estimate with which they were found."""
@@ -145,7 +143,7 @@ def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progres
     return _searched(replace(fits, best=best), data, effects, progress, each, settings)
 
 
-def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Each, settings: GapSettings
+def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
               ) -> Fits:
     """Add the effects that the search finds in addition to those of the best fit."""
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
@@ -164,17 +162,17 @@ def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: Gap
     beyond their tolerance are kept: their evidence lies in how far other values had to move, or in narrower priors
     (`outliers`)."""
     weak = [step for step in steps if name_of(step.label)[0] not in BEYOND and is_weak(best, step.label, settings)]
-    kept, best = without_needless(weak, best, data, settings)
+    kept, best = backward_elimination(weak, best, data, settings)
     return tuple(step for step in steps if step in kept or step not in weak), best
 
 
-def _left(model, data: Data) -> float:
+def _left(model: TableModel, data: Data) -> float:
     return ModelResidual.of(model, data.blocks).nrmse ** 2
 
 
 def _excess(base: Fitted, data: Data) -> float:
-    left = ModelResidual.of(base.model, data.blocks)
-    return left.nrmse ** 2 - left.noise_nrmse ** 2
+    residual = ModelResidual.of(base.model, data.blocks)
+    return residual.nrmse ** 2 - residual.noise_nrmse ** 2
 
 
 def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
@@ -189,15 +187,16 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         why = _refusal(fits.best, step, probability[label], data, held, settings)
         if why:
             one = fits.best.model.effect(label)
-            refused[label] = (f"it behaves most like {one.effect.said(one.place, one.by_name)}, for which the library "
-                              "has no name" if one.effect.outside else
+            refused[label] = (f"it behaves most like {one.effect.described(one.place, one.by_name)}, for which the "
+                              "library has no name" if one.effect.outside else
                               f"{one.effect.name} fits best, but is not named: {why}")
             best = without_effect(best, label, data, settings) or best
     if refused:
-        left = [step for step in fits.steps if step.label in best.labels]
-        kept, best = _without_weak(left, best, data, settings)
+        remaining = [step for step in fits.steps if step.label in best.labels]
+        kept, best = _without_weak(remaining, best, data, settings)
         refused |= {step.label: f"{name_of(step.label)[0]} is not named: without the effects that are refused, its "
-                                "strength is hardly distinguishable from zero" for step in left if step not in kept}
+                                "strength is hardly distinguishable from zero"
+                    for step in remaining if step not in kept}
     named = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, named, {label: rivals[label] for label in named}, refused)
 
@@ -237,7 +236,7 @@ def _judged(one: ActiveEffect) -> list[str]:
 
 
 def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float,
-         progress: Progress, each: Each, settings: GapSettings) -> Gap:
+         progress: Progress, each: Mapper, settings: GapSettings) -> Gap:
     """Assemble the result; stages, maps and sentences are computed on held-out records."""
     blocks, updated = prepared.held_out, names.updated
     before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
@@ -249,16 +248,16 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
               Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks)))]
     stages += [Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
                for label, one in _chain(fits, updated, prepared, settings)]
-    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared, settings) for one in updated.model.effects
+    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
              if one.label in updated.labels]
     faults = prepared.faults
     if after.chi2_per_dof <= settings.known_noise:
         progress("noise of floor and sensors")
-        left = left_by(prepared.campaign, updated.model, each)
-        faults = replace(faults, noise=levels(left, updated.model, faults.hum, faults.converter))
+        residual = time_residuals(prepared.campaign, updated.model, each)
+        faults = replace(faults, noise=levels(residual, updated.model, faults.hum, faults.converter))
     found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults, settings)]
     found.sort(key=lambda one: -(one.share or 0.0))
-    told = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
+    reported = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
     excess = after.nrmse ** 2 - noise
     records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
@@ -266,9 +265,9 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
                           grows_faster(records))
     closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
     small = math.sqrt(max(excess, 0.0)) < settings.small
-    verdict = _verdict(told, closed, closed or small, remainder, settings)
+    verdict = _verdict(reported, closed, closed or small, remainder, settings)
     where, remaining = places(before), places(after)
-    onward = _next(told, fits, names)
+    onward = separating_measurement(reported, fits)
     if onward is None and verdict in ("unexplained", "partly explained"):
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
@@ -276,13 +275,13 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         progress("detection limits of the effects")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
-    sentences = (_opening(verdict, told, traces, stages, remainder, after), *names.refused.values(),
+    sentences = (_opening(verdict, reported, traces, stages, remainder, after), *names.refused.values(),
                  _remains(remainder, remaining), prepared.noise)
-    return Gap(verdict, told, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse, onward,
-               fits.base.model, updated.model, _considered(fits, names, prepared, settings), heat_map(before, after),
-               tuple(one for one in sentences if one), prepared.halves.how, seed, time.monotonic() - began,
-               updated.whole_covariance(), limits, shares, records, faults.raised if closed else (),
-               traces, remainder, _moved(updated, settings))
+    return Gap(verdict, reported, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse,
+               onward, fits.base.model, updated.model, _considered(fits, names, prepared, settings),
+               heat_map(before, after), tuple(one for one in sentences if one), prepared.halves.how, seed,
+               time.monotonic() - began, updated.whole_covariance(), limits, shares, records,
+               faults.raised if closed else (), traces, remainder, _moved(updated, settings))
 
 
 def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
@@ -301,16 +300,16 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
     return found[::-1]
 
 
-def _figures(left: ModelResidual) -> tuple[float, float]:
-    return left.nrmse, left.chi2_per_dof
+def _figures(residual: ModelResidual) -> tuple[float, float]:
+    return residual.nrmse, residual.chi2_per_dof
 
 
-def _sensors(faults) -> dict[str, float] | None:
+def _sensors(faults: SignalFaults) -> dict[str, float] | None:
     return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
 
 
-def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared,
-           settings: GapSettings) -> NamedEffect:
+def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared
+           ) -> NamedEffect:
     reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
     return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
                        names.probability[one.label], names.rivals[one.label], label=one.label,
@@ -324,12 +323,13 @@ def _share_of_signal(name: str, raw: ModelResidual, masked: ModelResidual, power
     return float(own / max(own + power.excess, 1e-300))
 
 
-def _verdict(told: Sequence[NamedEffect], closed: bool, small: bool, left: Remainder, settings: GapSettings) -> Verdict:
+def _verdict(reported: Sequence[NamedEffect], closed: bool, small: bool, residual: Remainder, settings: GapSettings
+             ) -> Verdict:
     """Verdict by the rules of the contract. closed : the residual is noise. small : closed, or below 1 % of the
     response."""
-    if not told:
+    if not reported:
         return "none" if small else "unexplained"
-    return "explained" if closed or left.share <= 1 - settings.explained else "partly explained"
+    return "explained" if closed or residual.share <= 1 - settings.explained else "partly explained"
 
 
 def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
@@ -337,14 +337,16 @@ def _moved(fitted: Fitted, settings: GapSettings) -> tuple[Tolerance, ...]:
     return moved(fitted, with_tolerance(fitted), tolerances_of(fitted.model.rig), settings)
 
 
-def _next(told: Sequence[NamedEffect], fits: Fits, names: Names) -> str | None:
+def separating_measurement(reported: Sequence[NamedEffect], fits: Fits) -> str | None:
     """The measurement that would distinguish an effect from its strongest rival; None if no rival remains."""
-    for one in told:
+    for one in reported:
         if one.indistinguishable_from and one.label:
             step = next(step for step in fits.steps if step.label == one.label)
-            other = one.indistinguishable_from[0]
-            model = next(fit.model for label, fit in step.tried.items() if name_of(label)[0] == other)
-            return between(one.name, other, step.tried[step.label].model, model)
+            mine, other = step.tried[step.label], one.indistinguishable_from[0]
+            # Of the places and laws of the rival, the one with the largest odds cannot be ruled out.
+            rival = max((fit for label, fit in step.tried.items() if name_of(label)[0] == other),
+                        key=lambda fit: odds_against_fit(mine, fit))
+            return between(one.name, other, mine.model, rival.model)
     return None
 
 
@@ -371,33 +373,35 @@ def _percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def _opening(verdict: Verdict, told: Sequence[NamedEffect], traces: Sequence[NamedEffect], stages: Sequence[Stage],
-             left: Remainder, after: ModelResidual) -> str:
+def _opening(verdict: Verdict, reported: Sequence[NamedEffect], traces: Sequence[NamedEffect], stages: Sequence[Stage],
+             residual: Remainder, after: ModelResidual) -> str:
     """The opening sentences: verdict and size of the gap."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"the noise alone is estimated at {_percent(after.noise_nrmse)}"
     also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
     if verdict == "none":
         return (f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
-                f"{_percent(left.nrmse)}; {rest}.{also}")
+                f"{_percent(residual.nrmse)}; {rest}.{also}")
     if verdict == "unexplained":
         return (f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
-                f"error on held-out records is {_percent(left.nrmse)}; {rest}.{also}")
-    return (f"{missed(told)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
-            f"{_percent(left.nrmse)}; {rest}.{also}")
+                f"error on held-out records is {_percent(residual.nrmse)}; {rest}.{also}")
+    lines = " on the lines without hum" if any(one.name == "mains_hum" for one in (*reported, *traces)) else ""
+    return (f"{missed(reported)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
+            f"{_percent(residual.nrmse)}{lines}; {rest}.{also}")
 
 
-def _remains(left: Remainder, remaining: Sequence[Where]) -> str:
+def _remains(residual: Remainder, remaining: Sequence[Where]) -> str:
     """How large the residual is, where, and at which level."""
-    if left.over_noise <= 1.05:
+    if residual.over_noise <= 1.05:
         if not remaining:
             return "the residual is the noise"
         places = sorted({f"{one.output} from {one.from_Hz:.3g} to {one.to_Hz:.3g} Hz" for one in remaining})
         return (f"as a whole the residual does not exceed the noise, but it does in {'; '.join(places[:3])}"
                 f"{' and elsewhere' if places[3:] else ''}")
     level = {True: "; it grows faster than the drives", False: "; it does not grow faster than the drives",
-             None: ""}[left.grows_with_level]
+             None: ""}[residual.grows_with_level]
     lies = f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz" \
         if remaining else ""
-    return (f"the residual is {_percent(left.nrmse)} of the held-out records, {left.over_noise:.3g} times the "
-            f"noise{lies}; its power beyond noise is {_percent(left.share)} of that of the re-identified model{level}")
+    return (f"the residual is {_percent(residual.nrmse)} of the held-out records, {residual.over_noise:.3g} times the "
+            f"noise{lies}; its power beyond noise is {_percent(residual.share)} of that of the re-identified "
+            f"model{level}")

@@ -70,8 +70,8 @@ def divide(campaign: Campaign) -> Halves:
     order = several[:1] + several[:0:-1]
     chosen = [group[-1].header.name for group in order][:max(len(driven) // 3, 1)]
     power = {record.header.name: drive_power(record) for record in driven}
-    left = np.sum([value for name, value in power.items() if name not in chosen], axis=0)
-    if chosen and len(driven) - len(chosen) >= 2 and all(excites_as_well(left, power[name]) for name in chosen):
+    others = np.sum([value for name, value in power.items() if name not in chosen], axis=0)
+    if chosen and len(driven) - len(chosen) >= 2 and all(excites_as_well(others, power[name]) for name in chosen):
         rest = tuple(record.header.name for record in campaign.records if record.header.name not in chosen)
         return Halves(campaign.only(rest), campaign.only(tuple(sorted(chosen))),
                       f"records {', '.join(sorted(chosen))}; another record of the same level is fitted")
@@ -94,7 +94,7 @@ def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float
     return [block for block in found if np.any(block.U)]
 
 
-def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campaign, model: TableModel,
+def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, residual: Campaign, model: TableModel,
                band_Hz: tuple[float, float]) -> tuple[list[SpectralBlock], str]:
     """The blocks with noise that is not affected by errors of the modelled response to the drives, and a sentence.
 
@@ -115,7 +115,7 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, left: Campai
         key = (block.kind, block.omega.tobytes())
         if key not in known:
             known[key] = (noise_from_residuals(quiet, [block], model=model)[0] if block.kind in kinds
-                          else _local(left, block, band_Hz))
+                          else _local(residual, block, band_Hz))
         like = known[key]
         assert like.noise is not None
         made.append(block.with_noise(like.noise, like.dof))
@@ -173,7 +173,7 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
     lines = np.maximum(np.bincount(octave), 1)
     for _ in range(SETTINGS.weightings):
         weights = power[:, :, None] * np.eye(power.shape[1])
-        left = prediction_error(model, block.with_noise(weights.astype(complex)), derivative=False)
-        found = np.mean(np.abs(left.error) ** 2, axis=2)
+        residual = prediction_error(model, block.with_noise(weights.astype(complex)), derivative=False)
+        found = np.mean(np.abs(residual.error) ** 2, axis=2)
         power = np.stack([(np.bincount(octave, one) / lines)[octave] for one in found.T], axis=1)
-    return Residual(block, left.error, left.white, np.zeros_like(left.error))
+    return Residual(block, residual.error, residual.white, np.zeros_like(residual.error))

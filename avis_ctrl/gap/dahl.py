@@ -7,7 +7,7 @@ from numba import njit
 
 
 @njit(cache=True)
-def dahl(deflection, last, slip, state):
+def dahl(deflection: np.ndarray, last: np.ndarray, slip: float, state: np.ndarray) -> np.ndarray:
     """(samples, m) friction force over stiffness [m] for a deflection (samples, m), exact between samples.
 
     While the motion keeps its direction, f approaches +-slip as exp(-|dx|/slip). last, state : (m,) deflection and

@@ -10,6 +10,7 @@ evaluated at `lowest_line` times the line spacing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -58,7 +59,7 @@ class LineResponse:
         self.omega = spacing * np.arange(n)
         self.omega[0] = SETTINGS.lowest_line * spacing
         self.parts = [self.at(slice(k, k + SETTINGS.chunk)) for k in range(0, n, SETTINGS.chunk)]
-        self.kept: dict = {}
+        self.kept: dict[str, Any] = {}
 
     def at(self, lines: slice | np.ndarray) -> Assembled:
         """The table on some of the lines."""
@@ -72,8 +73,8 @@ class LineResponse:
         """(samples, m) time signal of a spectrum (n, m)."""
         return scipy.fft.irfft(spectrum, self.padded, axis=0)[:self.samples]
 
-    def answer(self, u: np.ndarray, floor: np.ndarray | None, moved: np.ndarray | None = None,
-               acceleration: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def record_response(self, u: np.ndarray, floor: np.ndarray | None, moved: np.ndarray | None = None,
+                        acceleration: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """y (samples, n_y), and deflection (samples, n_g) of the mounts.
 
         u (samples, n_u), floor (samples, 3). moved : (n, n_q) spectrum of a motion in addition to the response to u and
@@ -92,7 +93,7 @@ class LineResponse:
         return self.in_time(np.concatenate(Y)), self.in_time(np.concatenate(d))
 
 
-_last: list[tuple[tuple, LineResponse]] = []
+_last: list[tuple[tuple[object, ...], LineResponse]] = []
 
 
 def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> LineResponse:

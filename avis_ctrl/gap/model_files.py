@@ -162,11 +162,11 @@ def _made(file: ModelFile) -> TableModel:
     model = TableModel(base)
     for k, one in enumerate(file.effects, 1):
         model = model.with_effect(_effect(model, one, f"effects[{k}]"))
-    _require_answer(model)
+    _require_finite_response(model)
     return model
 
 
-def _require_answer(model: TableModel) -> None:
+def _require_finite_response(model: TableModel) -> None:
     """Raise InputError for parameter values without a finite response."""
     try:
         with np.errstate(all="ignore"):

@@ -17,7 +17,7 @@ import scipy.fft
 
 from avis_ctrl.gap.line_response import LineResponse, line_response
 from avis_ctrl.gap.operators import Assembled, mount_geometry
-from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.large_motion import second_order
@@ -33,6 +33,8 @@ class RecordMotionSettings:
     low_Hz : lower edge of the band in which the sensors correct the model; the correction rises from zero to full [Hz].
         Below, inverting the sensor response would amplify sensor noise.
     high_Hz : upper edge of that band; the correction falls from full to zero [Hz]. Above, the mounts deflect little.
+    least_excess : lower limit of the power attributed to a force, in standard deviations of the power of noise alone
+        [1]: next to none, but not zero. A limit of one or more would attribute noise to a force.
     noise_from : fraction of the band above which only noise remains; its power is that of the sensors [1].
     margin_s : length by which a record is extrapolated beyond its ends [s]: several periods of a table's lowest mode.
     passes : iterations of this extrapolation.
@@ -41,6 +43,7 @@ class RecordMotionSettings:
 
     low_Hz: tuple[float, float] = (0.4, 0.8)
     high_Hz: tuple[float, float] = (120.0, 150.0)
+    least_excess: float = 0.02
     noise_from: float = 0.6
     margin_s: float = 5.0
     passes: int = 6
@@ -50,7 +53,7 @@ class RecordMotionSettings:
 SETTINGS = RecordMotionSettings()
 
 
-def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Each = one_by_one
+def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Mapper = sequential_map
               ) -> dict[str, RecordMotion]:
     """Motion of every record of a campaign, by record name, from its measured y.
 
@@ -110,26 +113,26 @@ def _in_time(record: Record, linear: TableModel) -> tuple[np.ndarray, np.ndarray
     limit = linear.rig.limits_of(linear.actuators)
     u = np.clip(u, -limit, limit)
     lines = line_response(linear, h.samples, h.sample_rate_Hz)
-    predicted, deflection = lines.answer(u, floor)
+    predicted, deflection = lines.record_response(u, floor)
     rows = [h.y_names.index(name) for name in linear.sensors.names if name in h.y_names]
     if not rows or not deflection.size:  # nothing measured, or no individual mounts
         return u, deflection, np.zeros((0, 0))
-    seen = np.array([name in h.y_names for name in linear.sensors.names])
-    left = record.y[:, rows] - predicted[:, seen]
-    left = left - left.mean(0)
-    if np.any(left):
-        deflection = deflection + _unmodelled(left, lines, seen)
-    return u, deflection, record.y[:, rows] if np.all(seen) else np.zeros((0, 0))
+    measured = np.array([name in h.y_names for name in linear.sensors.names])
+    residual = record.y[:, rows] - predicted[:, measured]
+    residual = residual - residual.mean(0)
+    if np.any(residual):
+        deflection = deflection + _unmodelled(residual, lines, measured)
+    return u, deflection, record.y[:, rows] if np.all(measured) else np.zeros((0, 0))
 
 
-def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.ndarray:
+def _unmodelled(residual: np.ndarray, lines: LineResponse, measured: np.ndarray) -> np.ndarray:
     """(samples, n_g) deflection that explains the difference between the measured and the modelled outputs.
 
     Nothing is measured beyond the ends of the record. The margins start at zero and are then filled with the response
     to the force found so far. After the record this is a decaying motion, so that no artificial step distorts the last
     seconds.
     """
-    samples, fs = len(left), lines.sample_rate_Hz
+    samples, fs = len(residual), lines.sample_rate_Hz
     margin = min(round(SETTINGS.margin_s * fs), (lines.padded - samples) // 2, samples - 1)
     inside = slice(margin, margin + samples)
     frequency = lines.omega / (2 * np.pi)
@@ -140,14 +143,14 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
     table: Assembled = lines.kept["corrected"]
     # A force on the payload; its moments are scaled with the r.m.s. lever arms of the mounts.
     size = np.array([1.0, 1.0, 1.0, *np.sqrt(np.mean(table.G[:, 3:N_Q] ** 2, axis=0))])
-    H = table.left[:, seen, :N_Q] * size
+    H = table.left[:, measured, :N_Q] * size
 
     def in_time(spectrum: np.ndarray) -> np.ndarray:
         whole = np.zeros((len(frequency), spectrum.shape[1]), complex)
         whole[at] = spectrum
         return scipy.fft.irfft(whole, lines.padded, axis=0)
 
-    continued = np.pad(left, ((margin, margin), (0, 0)))
+    continued = np.pad(residual, ((margin, margin), (0, 0)))
     for k in range(SETTINGS.passes):
         spectrum = scipy.fft.rfft(continued, lines.padded, axis=0)[:len(frequency)]
         e = _force(spectrum, H, at, frequency) * fade[at, None]
@@ -156,7 +159,7 @@ def _unmodelled(left: np.ndarray, lines: LineResponse, seen: np.ndarray) -> np.n
             force[margin + samples:] = 0
             response = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
             continued += SETTINGS.relaxation * (response[:len(continued)] - continued)
-            continued[inside] = left
+            continued[inside] = residual
     x = table.inverse[:, :, :N_Q] @ (size * e)[:, :, None]
     return in_time(table.deflection(x, np.zeros((len(x), 3, 1)))[:, :, 0])[inside]
 
@@ -184,8 +187,7 @@ def _strength(frequency: np.ndarray, white: np.ndarray, H: np.ndarray) -> np.nda
     lines = np.bincount(band) * white.shape[1]
     excess = np.bincount(band, np.sum(np.abs(white) ** 2, axis=1)) - lines
     made = np.bincount(band, np.sum(np.abs(H) ** 2, axis=(1, 2)))
-    # Lower limit of the excess: 2 % of the standard deviation that noise alone would give it.
-    least = 0.02 * np.sqrt(np.maximum(lines, 1))
+    least = SETTINGS.least_excess * np.sqrt(np.maximum(lines, 1))
     strength = np.maximum(excess, least) / np.maximum(made, np.finfo(float).tiny)
     return strength[band]
 

@@ -40,11 +40,13 @@ SETTINGS = NextMeasurementSettings()
 
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     """How to separate two explanations: measure where the predictions of their refitted models differ most."""
-    bent = {_bent_beside(a, b), _bent_beside(b, a)}
-    if True in bent:
-        why = ("only one of them depends on amplitude" if bent == {True, False} else
-               "they depend on amplitude in different ways")
-        return f"To distinguish {name} from {other}, record the same signals at half and at twice the level: {why}."
+    for time_varying, quantity, advice in ((False, "amplitude", "at half and at twice the level"),
+                                           (True, "time", "over a longer time")):
+        depends = [_depends(model, beside, time_varying) for model, beside in ((a, b), (b, a))]
+        if any(depends):
+            why = f"they depend on {quantity} in different ways" if all(depends) else (
+                f"only one of them depends on {quantity}")
+            return f"To distinguish {name} from {other}, record the same signals {advice}: {why}."
     frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), SETTINGS.points)
     omega, n_u = 2 * np.pi * frequency, len(a.actuators)
     difference = np.abs(a.response(omega)[:, :, :n_u] - b.response(omega)[:, :, :n_u])
@@ -55,10 +57,11 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
             f"there their predictions differ most, by {difference.max():.2g} {a.sensors.unit}/V.")
 
 
-def _bent_beside(model: TableModel, other: TableModel) -> bool:
-    """Whether a model has amplitude-dependent (or time-dependent) effects that the other model lacks."""
+def _depends(model: TableModel, other: TableModel, time_varying: bool) -> bool:
+    """Whether a model has effects that the other model lacks and that depend on time, or on amplitude."""
     common = {one.label for one in other.effects}
-    return any(one.effect.nonlinear for one in model.effects if one.label not in common)
+    return any(one.effect.nonlinear and one.effect.time_varying == time_varying for one in model.effects
+               if one.label not in common)
 
 
 def _about(size: np.ndarray, k: int) -> tuple[int, int]:
@@ -76,16 +79,16 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
                 "one record at rest with the floor measured: a residual in proportion to the drive is linear, one that "
                 "grows faster is not, and one that stays the same is noise or comes through the floor.")
     power, std = growth
-    told = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
+    rise = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
     if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
-        return (f"{told}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
+        return (f"{rise}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
                 "search for other sources.")
     if abs(power - 1) <= max(SETTINGS.within, 2 * std):
-        return (f"{told}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
+        return (f"{rise}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
                 "where it acts.")
     law = ("it grows more slowly than the drive, as with friction or backlash" if power < 1 else
            "it grows faster than the drive, as with stiffening or saturation")
-    return (f"{told}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
+    return (f"{rise}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
             "lines in between, over the level, shows its law.")
 
 
@@ -102,12 +105,12 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
     if len(telling) < len(kinds) + 2:
         return None
     own = np.array([[r.kind == kind for kind in kinds] for r in telling], float)
-    level, left = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
+    level, residual = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
     if max(np.ptp(level[of > 0]) for of in own.T) < np.log(SETTINGS.another_level):
         return None
     A = np.column_stack([own, level])
-    x = np.linalg.lstsq(A, left, rcond=None)[0]
-    scatter = np.sum((left - A @ x) ** 2) / (len(left) - A.shape[1])
+    x = np.linalg.lstsq(A, residual, rcond=None)[0]
+    scatter = np.sum((residual - A @ x) ** 2) / (len(residual) - A.shape[1])
     std = float(np.sqrt(scatter * np.linalg.inv(A.T @ A)[-1, -1]))
     return (float(x[-1]), std) if std < SETTINGS.unsure else None
 

@@ -113,9 +113,11 @@ class Operators:
         self.decays: list[np.ndarray] = []
 
     def sensor(self, name: str) -> int:
+        """Column of a sensor."""
         return self.base.sensors.names.index(name)
 
     def actuator(self, name: str) -> int:
+        """Column of a motor."""
         return self.base.actuators.index(name)
 
     def borne(self, M: np.ndarray) -> np.ndarray:
@@ -185,6 +187,7 @@ class Assembled:
 
     @cached_property
     def inverse(self) -> np.ndarray:
+        """(n, n_q, n_q) motion per force on the coordinates."""
         return np.linalg.inv(self.D)
 
     @cached_property
@@ -199,6 +202,7 @@ class Assembled:
 
     @property
     def n_q(self) -> int:
+        """Number of coordinates."""
         return self.G.shape[1]
 
     @property

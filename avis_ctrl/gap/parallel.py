@@ -9,12 +9,14 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class Each(Protocol):
+class Mapper(Protocol):
     """Results of independent calculations, in order; computed in parallel where processors are available."""
 
-    def __call__(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]: ...
+    def __call__(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Results of the function, in the order of the items."""
+        ...
 
 
-def one_by_one(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+def sequential_map(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Run the calculations one after the other."""
     return [function(item) for item in items]

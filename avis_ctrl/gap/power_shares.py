@@ -85,6 +85,7 @@ class Lines:
     noise: np.ndarray
 
     def some(self, keep: np.ndarray) -> Lines:
+        """Some of the lines."""
         return Lines(self.frequency_Hz[keep], self.Y[keep], self.left[keep], self.beyond[keep], self.columns[keep],
                      self.noise[keep])
 
@@ -156,9 +157,9 @@ def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dic
 
 def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader]) -> list[list[PredictionError]]:
     """Driven records grouped by level and excitation; the lowest level first."""
-    def told(e: PredictionError) -> tuple[str, float]:
+    def kind_and_level(e: PredictionError) -> tuple[str, float]:
         return headers[e.block.name].excitation, headers[e.block.name].level_V
-    groups = of_one_level([e for e in errors if told(e)[0] not in ("rest", "floor")], told)
+    groups = of_one_level([e for e in errors if kind_and_level(e)[0] not in ("rest", "floor")], kind_and_level)
     return sorted(groups, key=lambda group: headers[group[0].block.name].level_V)
 
 
@@ -173,13 +174,13 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
         if key not in known:
             known[key] = model.response(block.omega)
         columns = known[key] * block.U[:, None, :, 0]
-        answered = (block.Y - e.plain)[:, :, 0]
-        left = e.error[:, :, 0]
+        predicted = (block.Y - e.plain)[:, :, 0]
+        residual = e.error[:, :, 0]
         power = np.sum(np.abs(block.U[:, :n_a, 0]) ** 2, axis=1)
         assert block.noise is not None
         noise = np.real(np.einsum("nkk->nk", block.noise[:, 0]))
-        every = Lines(block.omega / (2 * np.pi), answered + left, left, answered + left - columns.sum(axis=2), columns,
-                      noise)
+        Y = predicted + residual
+        every = Lines(block.omega / (2 * np.pi), Y, residual, Y - columns.sum(axis=2), columns, noise)
         made.append(every.some(power > FIT.silent_line ** 2 * power.max(initial=0.0)))
     joined = Lines(*(np.concatenate([getattr(one, field) for one in made]) for field in Lines.__dataclass_fields__))
     return joined.some(np.argsort(joined.frequency_Hz, kind="stable"))

@@ -16,9 +16,9 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.campaign_spectra import Halves, all_silent, blocks_of, divide, with_noise
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
-from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, left_by, predicted, without_hum
+from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, predicted, time_residuals, without_hum
 from avis_ctrl.gap.signals.converter import ConverterFinding
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.record_residual import RecordResidual
@@ -75,7 +75,7 @@ class Prepared:
 
 def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
             amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None,
-            each: Each = one_by_one, settings: GapSettings = SETTINGS) -> Prepared:
+            each: Mapper = sequential_map, settings: GapSettings = SETTINGS) -> Prepared:
     """Compute spectra with noise from the records.
 
     Raises
@@ -108,7 +108,7 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     return _ready(campaign, halves, nominal, rough, band, converter, clipped, progress, each, settings)
 
 
-def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each: Each, settings: GapSettings
+def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each: Mapper, settings: GapSettings
                 ) -> Prepared:
     """Repair the clipped samples again, with the prediction of a better model."""
     assert prepared.clipped is not None
@@ -119,11 +119,11 @@ def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each:
                   prepared.clipped, progress, each, settings)
 
 
-def with_noise_from(prepared: Prepared, model: TableModel, each: Each) -> Prepared:
+def with_noise_from(prepared: Prepared, model: TableModel, each: Mapper) -> Prepared:
     """Estimate the noise again, from the residual of a better model."""
     groups = [list(prepared.fitted), list(prepared.held_out), list(prepared.unmasked)]
-    left = left_by(prepared.campaign, model, each)
-    (fitted, held_out, unmasked), how = _noise(groups, prepared.halves, left, prepared.rough, prepared.band_Hz)
+    residual = time_residuals(prepared.campaign, model, each)
+    (fitted, held_out, unmasked), how = _noise(groups, prepared.halves, residual, prepared.rough, prepared.band_Hz)
     return replace(prepared, fitted=tuple(fitted), held_out=tuple(held_out), unmasked=tuple(unmasked), noise=how)
 
 
@@ -141,27 +141,27 @@ def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSetti
 
 
 def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: TableModel, band: tuple[float, float],
-           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress, each: Each,
+           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress, each: Mapper,
            settings: GapSettings) -> Prepared:
     """Remove hum; compute spectra with noise, and the motion of every record with its second-order terms."""
-    left = left_by(campaign, rough, each)
+    residual = time_residuals(campaign, rough, each)
     raw_held = blocks_of(halves.held_out, rough, band)
-    hum = find_hum(left)
+    hum = find_hum(residual)
     if hum is not None:
         progress(f"hum of {hum.frequency_Hz.value:.5g} Hz removed")
-        campaign = without_hum(campaign, hum, left)
+        campaign = without_hum(campaign, hum, residual)
         halves = divide(campaign)
         rough = _rough(rough, halves, band, settings)
-        left = left_by(campaign, rough, each)
+        residual = time_residuals(campaign, rough, each)
     fitted = _masked(blocks_of(halves.fitted, rough, band), halves.fitted, hum)
     held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
     progress("noise; motion of the table in every record")
-    (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, left, rough, band)
+    (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, residual, rough, band)
     parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
     motion = with_large_motion(motion_of(parts, rough, campaign, each), rough)
     return Prepared(campaign, halves, band, tuple(fitted), tuple(held_out), tuple(unmasked), how,
                     replace(nominal, motion=motion), with_second_order(replace(rough, motion=motion)),
-                    SignalFaults(converter, hum), left, clipped)
+                    SignalFaults(converter, hum), residual, clipped)
 
 
 def with_second_order(model: TableModel) -> TableModel:
@@ -169,10 +169,10 @@ def with_second_order(model: TableModel) -> TableModel:
     return model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS))
 
 
-def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, left: tuple[RecordResidual, ...], model: TableModel,
-           band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
+def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, residual: tuple[RecordResidual, ...],
+           model: TableModel, band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
     """Groups of blocks with the noise of the fitted records, from the residual of a model in time; and a sentence."""
-    of, records = {one.header.name: one for one in left}, []
+    of, records = {one.header.name: one for one in residual}, []
     for source in halves.fitted.records:
         whole, start, stop = origin(source)
         record = source.load()

@@ -49,7 +49,8 @@ def odds_against(one: Mapping[Any, float], other: Mapping[Any, float], beside: f
     d = np.array([value - other[group] for group, value in one.items() if group in other])
     spread = float(np.sqrt(np.sum((d - d.mean()) ** 2)))
     ahead = (float(d.sum()) + beside) / max(spread, 1.0)
-    return float(stats.norm.sf(ahead) / stats.norm.cdf(ahead))
+    # The tail below -37 standard deviations underflows; odds of 1e300 can still be added.
+    return float(stats.norm.sf(ahead) / max(stats.norm.cdf(ahead), 1e-300))
 
 
 def larger_odds(one: Mapping[Any, float], other: Mapping[Any, float], beside: float) -> float:

@@ -169,10 +169,10 @@ def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
     component."""
     model, n, n_y = table.model, table.n, table.n_y
     ops = _changed_by(model, "sensor_gain", "sensor_misalignment")
-    nominal, seen = table.rows(table.matrices.R), table.rows(ops.rows[0].real)
+    nominal, actual = table.rows(table.matrices.R), table.rows(ops.rows[0].real)
     tilt = _tilt_rows(table)
     filters = append(*_sensor_filters(model, ops.sensor_gain))
-    sees = filters.scaled(1.0, np.hstack([seen, np.eye(n_y)]))
+    sees = filters.scaled(1.0, np.hstack([actual, np.eye(n_y)]))
     total = sees + gain(np.hstack([-nominal, np.zeros((n_y, n_y))]))
     feels = gain(np.zeros((n_y, n + n_y)))
     if np.any(tilt):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -32,9 +32,9 @@ class Kept:
 
     def __init__(self, most_bytes: int):
         self.most_bytes, self.bytes = most_bytes, 0
-        self.arrays: dict[tuple, np.ndarray] = {}
+        self.arrays: dict[Hashable, np.ndarray] = {}
 
-    def of(self, key: tuple, make: Callable[[], np.ndarray]) -> np.ndarray:
+    def of(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
         """The array of a key, computed if it is not cached."""
         found = self.arrays.pop(key, None)
         if found is None:

@@ -49,11 +49,13 @@ class ModelResidual:
 
     @staticmethod
     def of(model: TableModel, blocks: Sequence[SpectralBlock]) -> ModelResidual:
+        """Residual of a model on some blocks."""
         errors = (prediction_error(model, block, derivative=False) for block in blocks)
         return ModelResidual(tuple(errors), model.sensors.names, model.inputs)
 
     @property
     def chi2_per_dof(self) -> float:
+        """Chi-square over degrees of freedom."""
         return sum(e.chi2 for e in self.errors) / sum(e.dof for e in self.errors)
 
     @property
@@ -92,12 +94,12 @@ def _banded(e: PredictionError, edges: np.ndarray) -> tuple[np.ndarray, np.ndarr
             np.divide(along, strength, out=np.zeros(along.shape), where=strength > 0))
 
 
-def places(left: ModelResidual) -> tuple[Where, ...]:
+def places(residual: ModelResidual) -> tuple[Where, ...]:
     """Bands and outputs where the residual exceeds the noise significantly, each with the most coherent input."""
-    edges = edges_of(left.errors)
-    power, lines, found = (np.sum(parts, axis=0) for parts in zip(*(_banded(e, edges) for e in left.errors),
+    edges = edges_of(residual.errors)
+    power, lines, found = (np.sum(parts, axis=0) for parts in zip(*(_banded(e, edges) for e in residual.errors),
                                                                   strict=True))
-    dof = min(e.block.dof for e in left.errors)
+    dof = min(e.block.dof for e in residual.errors)
     excess, count = np.maximum(power - lines, 0.0), max(np.count_nonzero(lines) * power.shape[1], 1)
     made = []
     for b, (low, high) in enumerate(pairwise(edges.tolist())):
@@ -105,13 +107,14 @@ def places(left: ModelResidual) -> tuple[Where, ...]:
         # At most a third of the records is held out: the noise of a band is estimated from at least twice as many
         # lines.
         known = min(dof * max(n / 60, 1), max(dof, 2 * n))
-        for k, output in enumerate(left.outputs if n else ()):
+        for k, output in enumerate(residual.outputs if n else ()):
             p = count * float(stats.f.sf(power[b, k] / n, 2 * n, 2 * known) if np.isfinite(dof)
                               else stats.chi2.sf(2 * power[b, k], 2 * n))
             if p < SETTINGS.place_alarm:
                 best = int(np.argmax(found[b, k]))
-                made.append(Where(low, high, left.inputs[best] if found[b, k, best] > 0.1 * power[b, k] else "", output,
-                                  float(excess[b, k] / excess.sum()), float(power[b, k] / n), p))
+                source = residual.inputs[best] if found[b, k, best] > 0.1 * power[b, k] else ""
+                made.append(Where(low, high, source, output, float(excess[b, k] / excess.sum()),
+                                  float(power[b, k] / n), p))
     return tuple(sorted(made, key=lambda w: -w.share)[:SETTINGS.most_places])
 
 
@@ -119,8 +122,8 @@ def heat_map(before: ModelResidual, after: ModelResidual) -> HeatMap:
     """Residual power over noise power by band, held-out record and output."""
     edges = edges_of(before.errors)
 
-    def ratios(left: ModelResidual) -> np.ndarray:
-        banded = [_banded(e, edges) for e in left.errors]
+    def ratios(residual: ModelResidual) -> np.ndarray:
+        banded = [_banded(e, edges) for e in residual.errors]
         with np.errstate(invalid="ignore"):  # a band without lines has no ratio
             return np.hstack([power / lines for power, lines, _ in banded])
     columns = tuple(f"{e.block.name}: {output}" for e in before.errors for output in before.outputs)

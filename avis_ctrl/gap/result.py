@@ -65,10 +65,10 @@ class NamedEffect:
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 
 
-def missed(told: Sequence[NamedEffect]) -> str:
+def missed(reported: Sequence[NamedEffect]) -> str:
     """The sentence that names the missing effects."""
-    count = "one effect" if len(told) == 1 else f"{len(told)} effects"
-    return f"The model misses {count}: {'; '.join(one.in_words() for one in told)}."
+    count = "one effect" if len(reported) == 1 else f"{len(reported)} effects"
+    return f"The model misses {count}: {'; '.join(one.in_words() for one in reported)}."
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,10 @@ class Where:
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named."""
+    """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named.
+
+    probability : odds against the best candidate of the same step, at most `GapSettings.most_sure`.
+    """
 
     name: str
     location: str
@@ -128,8 +131,8 @@ class Considered:
 @dataclass(frozen=True)
 class Detectable:
     """Detection limit of a parameter of an absent effect: the difference from its value without the effect, five
-    standard deviations in a fit to the fitted records. The search requires more than this for a name. Infinite if
-    re-identification would absorb the parameter."""
+    standard deviations in a fit to the fitted records. A name requires about as much, five to seven
+    (`detection_limits`). Infinite if re-identification would absorb the parameter."""
 
     name: str
     location: str
@@ -202,8 +205,8 @@ class Gap:
     Attributes
     ----------
     verdict : one of VERDICTS. effects : named. stages : on held-out data, "nominal", "re-identified", "tolerances",
-        then one for each effect. where : location of the gap after re-identification. remaining : the same after the
-        named effects.
+        then one for each effect; from "tolerances" on without the lines polluted by hum, if there is any.
+    where : location of the gap after re-identification. remaining : the same after the named effects.
     noise_nrmse : residual of the held-out records expected from noise alone. next_experiment : None or a sentence.
     baseline, updated : models (without named effects, updated is the baseline with all tolerances fitted).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.

@@ -12,9 +12,10 @@ degrees of freedom as there are directions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -46,8 +47,7 @@ class ScoreSettings:
         determine a combination [1]: a step along it would be round-off.
     least_eigenvalue : eigenvalue of a scaled information matrix over the largest, below which it is round-off, which is
         about 1e-16 of the largest [1].
-    detected : standard deviations from which an effect is detected [1]: a parameter reaches the evidence required for a
-        name at between four and five.
+    detected : standard deviations from which an effect counts as detected [1] (`detection_limits`).
     """
 
     step: float = 1e-3
@@ -74,10 +74,15 @@ class Reduction:
     coefficients: np.ndarray
 
 
+def scaled_eigh(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(k,) sizes, and eigenvalues and eigenvectors of G / (size size^T), which has a unit diagonal."""
+    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
+    return size, *np.linalg.eigh(G / np.outer(size, size))
+
+
 def reduction(G: np.ndarray, b: np.ndarray) -> Reduction:
     """b^T inv(G) b in the subspace that G determines."""
-    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(G / np.outer(size, size))
+    size, values, vectors = scaled_eigh(G)
     known = values > SETTINGS.least_direction * max(values[-1], 1e-300)
     along = vectors.T @ (b / size)
     step = np.where(known, along / np.where(known, values, 1.0), 0.0)
@@ -109,8 +114,8 @@ class Part:
             columns, norms = transient_columns(block, model)
             T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
             self.transient, X = span(T.T)
-            left = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
-            self.body, self.inner = transient_parts(X @ (self.transient.T @ left), norms, block, model)
+            residual = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
+            self.body, self.inner = transient_parts(X @ (self.transient.T @ residual), norms, block, model)
             self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
@@ -136,12 +141,12 @@ class Part:
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y per symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
-        q, left = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
+        q, per_force = self.response.x[:, :N_Q], self.response.left[:, :, :N_Q]
         out = []
         for i, j in SYMMETRIC:
-            push = left[:, :, i, None] * q[:, None, j]
+            push = per_force[:, :, i, None] * q[:, None, j]
             if i != j:
-                push = push + left[:, :, j, None] * q[:, None, i]
+                push = push + per_force[:, :, j, None] * q[:, None, i]
             out.append(-dynamic[:, None, None] * push)
         return np.array(out)
 
@@ -154,7 +159,7 @@ class Score:
 
     def __init__(self, model: TableModel, blocks: Sequence[SpectralBlock]):
         self.model = model
-        self.kept: dict = {}
+        self.kept: dict[Hashable, Any] = {}
         self.parts = [Part(model, block) for block in blocks]
         self.e = np.concatenate([part.real((part.block.Y - part.response.Y)[None])[0] for part in self.parts])
         J = np.concatenate([part.real(model.answer(part.block, part.body, inner=part.inner).dY)
@@ -167,18 +172,20 @@ class Score:
 
     @cached_property
     def chi2(self) -> float:
+        """Sum of squares of the residual."""
         return float(self.e @ self.e)
 
     @cached_property
     def dof(self) -> int:
+        """Degrees of freedom of the residual."""
         return len(self.e) - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N) projected directions from changes of y, one (k, n, n_y, m) per block."""
         A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
-        left = A - (A @ self.basis.T) @ self.basis
-        left[np.linalg.norm(left, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
-        return left
+        rest = A - (A @ self.basis.T) @ self.basis
+        rest[np.linalg.norm(rest, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
+        return rest
 
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
         """(k, N): directions of the linear parameters of an effect at zero strength; without such parameters, the
@@ -233,6 +240,7 @@ class EvidenceScore(Score):
         fits: unexplained path errors are not removed there."""
         return Score(self.model, [part.block for part in self.parts])
 
-    def directions(self, dY):
+    def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
+        """(k, N + n) as those of `Score`, with the rows of the priors."""
         return self.profile.free(np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)],
                                                 axis=1))

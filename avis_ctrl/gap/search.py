@@ -19,13 +19,13 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Effect, shares
 from avis_ctrl.gap.effects.flexible_mode import resonance
-from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.probability import Step, name_of, probability_of
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.starting_values import HasRicherLaws, seeds
+from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.gap.tolerances import BEYOND, held, of_effect, released, spread, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, of_effect, rescaled, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
@@ -41,13 +41,13 @@ class Candidate:
     """
 
     effect: ActiveEffect
-    fall: float
+    reduction: float
     p_value: float
     others: tuple[ActiveEffect, ...] = ()
 
 
-def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each = one_by_one
-               ) -> list[Candidate]:
+def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings,
+               each: Mapper = sequential_map) -> list[Candidate]:
     """Every effect at every place with its best seed, the largest reduction first.
 
     Effects that add a resonance with many parameters take long to initialise. They are searched only if a resonance
@@ -70,10 +70,10 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         return found
     resonant = [one for one in effects if one.resonant]
     found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]
-    most = max((one.fall for one in found), default=0.0)
+    most = max((one.reduction for one in found), default=0.0)
     if not found or resonance(score) >= settings.resonance_share * most:
         found += [one for own in each(scored, resonant) for one in own]
-    return sorted(found, key=lambda one: -one.fall)
+    return sorted(found, key=lambda one: -one.reduction)
 
 
 def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candidate]:
@@ -91,17 +91,17 @@ def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -
     return [one for one in found if name_of(one.effect.label) == name_of(best) and one.effect.label not in fitted]
 
 
-def richer_laws(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
+def extensions(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
     """Richer laws of the effects that were fitted last, each starting from the fit of a simpler law. An effect with
     many local minima starts again from other values."""
     found = []
     for one in fits:
         law = one.model.effects[-1].effect
-        if isinstance(law, HasRicherLaws):
+        if isinstance(law, HasExtendedModels):
             whole = without_path_errors(one, data, settings)
             last = whole.model.effects[-1]
             found += [Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
-                      for place, values in law.richer(EvidenceScore(whole, data, settings), last)]
+                      for place, values in law.extended_models(EvidenceScore(whole, data, settings), last)]
     return found
 
 
@@ -114,7 +114,7 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
     z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
-    return _try(fitted, model, held(fitted.priors, one, settings).followed_by(own), z, data, settings)
+    return _try(fitted, model, rescaled(fitted.priors, one, settings.held).followed_by(own), z, data, settings)
 
 
 def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
@@ -130,11 +130,11 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
     model = fitted.model.without(label)
     one = fitted.model.effect(label)
     rows = [fitted.priors.names.index(name) for name in model.names]
-    priors = released(fitted.priors, one, settings)
-    return _try(fitted, model, priors.of(model.names), fitted.z[rows], data, settings)
+    priors = rescaled(fitted.priors, one, 1 / settings.held).of(model.names)
+    return _try(fitted, model, priors, fitted.z[rows], data, settings)
 
 
-def _with_known(priors: Priors, known) -> Priors:
+def _with_known(priors: Priors, known: Mapping[str, tuple[float, float]]) -> Priors:
     """Priors with those that an effect specifies for parameters that records need not determine (`Effect.priors`)."""
     rows = [priors.names.index(name) for name in known if name in priors.names]
     mean, sigma = priors.mean.copy(), priors.sigma.copy()
@@ -143,7 +143,8 @@ def _with_known(priors: Priors, known) -> Priors:
     return replace(priors, mean=mean, sigma=sigma)
 
 
-def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings) -> Fitted | None:
+def _try(fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
+         ) -> Fitted | None:
     try:
         return fit(model, priors, z, data, fitted.variances, settings)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):
@@ -151,7 +152,7 @@ def _try(fitted: Fitted, model, priors: Priors, z: np.ndarray, data: Data, setti
 
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
-           progress: Progress = lambda text: None, each: Each = one_by_one,
+           progress: Progress = lambda text: None, each: Mapper = sequential_map,
            enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
     they show in how far one of them had to move, hardly in the residual.
@@ -187,7 +188,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
 
 
 def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
-             progress: Progress = lambda text: None, each: Each = one_by_one) -> tuple[list[Step], Fitted]:
+             progress: Progress = lambda text: None, each: Mapper = sequential_map) -> tuple[list[Step], Fitted]:
     """Values of the rig file beyond their tolerance that stand out because the other values moved by much less than
     their tolerances; and the last fit, with the tolerances as stated.
 
@@ -227,13 +228,13 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
         one = again.tried[label]
         full = fit(one.model, one.priors, one.z, data, one.variances, settings)
         steps[k] = replace(again, fitted=full.bare(), label=label)
-        steps[k + 1:], best = without_needless(steps[k + 1:], full, data, settings)
+        steps[k + 1:], best = backward_elimination(steps[k + 1:], full, data, settings)
         steps[-1] = replace(steps[-1], fitted=best)
         return True
     return False
 
 
-def without_needless(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
+def backward_elimination(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
                      ) -> tuple[list[Step], Fitted]:
     """Remove, one by one, effects whose removal lowers the evidence by less than a name requires. Returns the remaining
     steps and the fit."""
@@ -278,7 +279,7 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
-def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Each) -> Step | None:
+def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper) -> Step | None:
     """The effect with the largest evidence; None if no effect improves the current model enough."""
     begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, settings, each)
@@ -287,7 +288,7 @@ def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSetti
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)
     while better:
-        further = [*richer_laws(list(better.values()), data, settings), *other_laws(found, best, asked)]
+        further = [*extensions(list(better.values()), data, settings), *other_laws(found, best, asked)]
         asked |= {one.effect.label for one in further}
         more, before = _tried(begun, further, data, settings, each), tried
         tried = _likelier([*before.values(), *more.values()])
@@ -307,10 +308,10 @@ class _Begun:
 
     effect: ActiveEffect
     gain: float
-    fall: float
+    reduction: float
 
 
-def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Each
+def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Mapper
            ) -> dict[str, Fitted]:
     """Fits of candidates by label. First the parameters of each effect alone are fitted, the others following to first
     order; then, for candidates that are not far behind, all parameters. Excluded are fits that fail, that end at values
@@ -324,10 +325,10 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
             at = _without_tolerances_behind(now, one)
             model = now.model.at(now.priors.values(at)).only(one)
             own = _priors_of(one, model, settings)
-            z, gain, fall = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
+            z, gain, reduction = profile.fit(model, own, own.z(np.array(one.values)), iterations, at)
         except (AvisError, np.linalg.LinAlgError, FloatingPointError):
             return None
-        return _Begun(one.at(own.values(z).tolist()), gain, fall)
+        return _Begun(one.at(own.values(z).tolist()), gain, reduction)
 
     def begun(one: Candidate) -> tuple[Candidate, _Begun | None]:
         if at_full_strength(one.effect):
@@ -346,8 +347,8 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
     # shows what an effect can achieve.
     near += [one.effect for one, end in made if at_full_strength(one.effect)
-             or (one.fall >= 2 * settings.not_far_behind * most
-             and (end is None or end.fall < settings.least_promised * one.fall))]
+             or (one.reduction >= 2 * settings.not_far_behind * most
+                 and (end is None or end.reduction < settings.least_promised * one.reduction))]
     further = [_whole(one, now) for one in each(ended, near) if one is not None]
     stated = tolerances_of(now.model.rig)
     return _likelier([one for one in further if not implausible(one)

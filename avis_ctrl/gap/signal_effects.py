@@ -11,7 +11,7 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.motion_estimate import clock_of
-from avis_ctrl.gap.parallel import Each, one_by_one
+from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
@@ -35,6 +35,7 @@ class SignalFaults:
 
     @property
     def resolution_V(self) -> dict[str, float]:
+        """Steps of the channels whose converter is coarser than stated, by name [V]."""
         return {one.channel: one.parameters["resolution_V"].value for one in self.converter
                 if one.kind == "resolution"}
 
@@ -52,7 +53,7 @@ def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ..
     return inspect_converter(campaign, rig) if campaign.y_unit == "V" and rig.acquisition is not None else ()
 
 
-def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> dict[str, np.ndarray]:
+def predicted(campaign: Campaign, model: TableModel, each: Mapper = sequential_map) -> dict[str, np.ndarray]:
     """(samples, n_y) sensor signals predicted by the model in every record, from rest."""
     clock = clock_of(campaign)
 
@@ -63,24 +64,24 @@ def predicted(campaign: Campaign, model: TableModel, each: Each = one_by_one) ->
     return dict(zip((record.header.name for record in campaign.records), each(read, campaign.records), strict=True))
 
 
-def left_by(campaign: Campaign, model: TableModel, each: Each = one_by_one) -> tuple[RecordResidual, ...]:
+def time_residuals(campaign: Campaign, model: TableModel, each: Mapper = sequential_map) -> tuple[RecordResidual, ...]:
     """Residual of the model in every record, in time."""
     return record_residuals(campaign, predicted(campaign, model, each))
 
 
-def levels(left: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding | None,
+def levels(residual: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding | None,
            converter: tuple[ConverterFinding, ...]) -> NoiseLevels | None:
     """Noise of floor and sensors; None if the records or the rig file do not allow an estimate."""
     n_u, steps = len(model.actuators), SignalFaults(converter).resolution_V
     try:
-        return noise_levels(left, lambda omega: model.response(omega)[:, :, n_u:], model.rig, hum, steps)
+        return noise_levels(residual, lambda omega: model.response(omega)[:, :, n_u:], model.rig, hum, steps)
     except AvisError:
         return None
 
 
-def without_hum(campaign: Campaign, hum: HumFinding, left: tuple[RecordResidual, ...]) -> Campaign:
+def without_hum(campaign: Campaign, hum: HumFinding, residual: tuple[RecordResidual, ...]) -> Campaign:
     """The campaign with the sines of the hum subtracted from every record."""
-    of, records = {one.header.name: one for one in left}, []
+    of, records = {one.header.name: one for one in residual}, []
     for source in campaign.records:
         record = source.load()
         h = record.header

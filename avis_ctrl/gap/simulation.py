@@ -69,13 +69,13 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
     """
     u, floor = _checked(model, u, floor)
     lines = line_response(model.linear, len(u), sample_rate_Hz)
-    y, deflection = lines.answer(u, floor)
+    y, deflection = lines.record_response(u, floor)
     record = RecordMotion("", sample_rate_Hz, start_s, campaign_s, u, deflection, *mount_rows(model))
     effects = [one for one in model.effects if one.effect.nonlinear]
     changed = [volts for one in effects if (volts := one.effect.volts(record, one.place, one.by_name)) is not None]
     if changed:
         acting = u + sum(volts - u for volts in changed)
-        y, deflection = lines.answer(acting, floor)
+        y, deflection = lines.record_response(acting, floor)
         record = replace(record, volts=acting, deflection=deflection)
     pushing = [one for one in effects if one.effect.force(record, one.place, one.by_name) is not None]
     if not pushing or not deflection.size:  # without individual mounts there is no deflection for forces to act on
@@ -117,23 +117,23 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, f
         free = linear + lines.in_time(by_force.whole(slow) @ by_force.shape.T)
         z_free = free @ to_z.T
         record.deflection[:] = free
-        push, left, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
+        push, residual, missing = np.zeros((n, N_Q)), np.zeros_like(correction), np.zeros_like(correction)
         if marching:
             z, push = march(by_force, z_free + correction, marching, record, free - z_free @ by_force.shape.T)
-            left = z_free + lines.in_time(by_force.whole(push)) - z
+            residual = z_free + lines.in_time(by_force.whole(push)) - z
         if weak:
             known = with_large_motion({"": record}, model)[""]
             more = np.asarray(weak.effect.force(known, weak.place, weak.by_name))
             reading = weak.effect.reading(known, weak.place, weak.by_name)
             missing, slow = lines.in_time(by_force.whole(more - slow)), more
         size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
-        defect = float(np.sqrt(np.mean(((left + missing) @ by_force.shape.T) ** 2))) / size
+        defect = float(np.sqrt(np.mean(((residual + missing) @ by_force.shape.T) ** 2))) / size
         if defect <= SETTINGS.defect:
             moved = by_force.whole(push + slow)[:, :by_force.n_x]
-            return Simulated(*lines.answer(record.volts, floor, moved, reading), defect)
+            return Simulated(*lines.record_response(record.volts, floor, moved, reading), defect)
         if not np.isfinite(defect):
             break
-        correction = correction + left
+        correction = correction + residual
     raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not converge",
                            measured=f"residual of the equation of motion {defect:.2g} of the deflection after "
                                     f"at most {SETTINGS.most_passes} passes, deflection {size:.3g} m r.m.s.",

@@ -72,7 +72,7 @@ SETTINGS = StartSettings()
 class Seed:
     """Starting point of a fit: values of all parameters, and the reduction of chi2 there to first order.
 
-    directions : number of directions along which the data could have reduced it. looks : number of frequencies, or
+    directions : number of directions along which the data could have reduced it. trials : number of frequencies, or
         other shape values, among which the best was selected. seen : the reduction for the test of significance, if it
         is not chi2 (from fewer data).
     """
@@ -80,14 +80,14 @@ class Seed:
     values: tuple[float, ...]
     chi2: float
     directions: int
-    looks: int = 1
+    trials: int = 1
     seen: float | None = None
 
     @property
     def p_value(self) -> float:
         """Probability of as large a reduction by noise alone."""
-        fall = self.chi2 if self.seen is None else self.seen
-        return min(1.0, self.looks * float(stats.chi2.sf(fall, self.directions)))
+        reduction = self.chi2 if self.seen is None else self.seen
+        return min(1.0, self.trials * float(stats.chi2.sf(reduction, self.directions)))
 
 
 @runtime_checkable
@@ -99,11 +99,11 @@ class FindsItsStart(Protocol):
 
 
 @runtime_checkable
-class HasRicherLaws(Protocol):
+class HasExtendedModels(Protocol):
     """An effect with richer laws that start best from the fit of a simpler one (a second mode, a mass along three
     axes), or with other local minima near the one that was found."""
 
-    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+    def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """Places (with their law) and values from which a fit with a richer law may start; score : of the fit with
         `one`."""
 
@@ -124,9 +124,9 @@ def seeds(effect: Effect, score: Score, place: str) -> list[Seed]:
         A = score.of_effect(begun)
         if not linear:
             # The effect acts at full strength or not at all.
-            fall = float(2 * A[0] @ score.e - A[0] @ A[0])
-            if fall > 0:
-                found.append(Seed(begun.values, fall, len(parameters), len(starts)))
+            reduction = float(2 * A[0] @ score.e - A[0] @ A[0])
+            if reduction > 0:
+                found.append(Seed(begun.values, reduction, len(parameters), len(starts)))
             continue
         took = score.reduction(A)
         values = list(begun.values)

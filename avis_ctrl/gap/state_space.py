@@ -88,6 +88,7 @@ def addition(table: ReducedTable, one: ActiveEffect) -> StateSpace | None:
 
 
 def has_addition(one: ActiveEffect) -> bool:
+    """Whether an effect contributes to the motion as a state-space system."""
     return one.effect.name in _MADE or hasattr(one.effect, "addition")
 
 

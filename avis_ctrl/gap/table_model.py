@@ -50,14 +50,17 @@ class ActiveEffect:
 
     @property
     def label(self) -> str:
+        """Name and place."""
         return f"{self.effect.name}@{self.place}"
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of its parameters in a model."""
         return tuple(f"{self.label}.{one.name}" for one in self.parameters)
 
     @property
     def by_name(self) -> dict[str, float]:
+        """Values by name of the parameter."""
         return dict(zip((one.name for one in self.parameters), self.values, strict=True))
 
     @property
@@ -66,6 +69,7 @@ class ActiveEffect:
         return {name: p.none for name, p in zip(self.names, self.parameters, strict=True) if p.linear}
 
     def at(self, values: Sequence[float]) -> ActiveEffect:
+        """The effect with other values."""
         return replace(self, values=tuple(float(v) for v in values))
 
 
@@ -100,30 +104,37 @@ class TableModel:
     # Interface used by a fit and its blocks.
     @property
     def rig(self) -> Rig:
+        """The rig of the base."""
         return self.base.rig
 
     @property
     def sensors(self) -> SensorModel:
+        """Sensors of the base."""
         return self.base.sensors
 
     @property
     def actuators(self) -> tuple[str, ...]:
+        """Names of the drives."""
         return self.base.actuators
 
     @property
     def inputs(self) -> tuple[str, ...]:
+        """Names of the drives, and of the floor's axes."""
         return self.base.inputs
 
     @property
     def period_s(self) -> float:
+        """Sample period [s]; 0 for responses to the voltage itself."""
         return self.base.period_s
 
     @property
     def delay_s(self) -> float:
+        """Delay of the base [s]."""
         return self.base.delay_s
 
     @property
     def amplifier_corner_Hz(self) -> float | None:
+        """Corner of the amplifiers of the base [Hz]; None without a lag."""
         return self.base.amplifier_corner_Hz
 
     @cached_property
@@ -134,10 +145,12 @@ class TableModel:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the free parameters: those of the rig, then those of the effects."""
         return (*self.base.names, *(self.effects[k].names[j] for k, j in self._free))
 
     @property
     def values(self) -> np.ndarray:
+        """(n_p,) values of the free parameters."""
         return np.concatenate([self.base.values, [self.effects[k].values[j] for k, j in self._free]])
 
     @property
@@ -149,6 +162,7 @@ class TableModel:
 
     @property
     def units(self) -> tuple[str, ...]:
+        """Units of the free parameters."""
         return (*self.base.units, *(self.effects[k].parameters[j].unit for k, j in self._free))
 
     def scales(self) -> np.ndarray:
@@ -196,9 +210,11 @@ class TableModel:
                        effects=(*self.effects, effect), held=frozenset(one.label for one in self.effects))
 
     def effect(self, label: str) -> ActiveEffect:
+        """An effect by label."""
         return next(one for one in self.effects if one.label == label)
 
     def without(self, label: str) -> TableModel:
+        """The model without one of its effects."""
         return replace(self, effects=tuple(one for one in self.effects if one.label != label))
 
     @cached_property
@@ -211,6 +227,7 @@ class TableModel:
 
     @property
     def matrices(self) -> Matrices:
+        """Matrices of the rig as the effects set it."""
         return self.effective.matrices
 
     @cached_property
@@ -227,6 +244,7 @@ class TableModel:
 
     @property
     def nonlinear(self) -> bool:
+        """Whether an effect depends on amplitude or time."""
         return any(one.effect.nonlinear for one in self.effects)
 
     @property
@@ -235,6 +253,7 @@ class TableModel:
         return replace(self, effects=tuple(one for one in self.effects if not one.effect.nonlinear))
 
     def operators(self, omega: np.ndarray) -> Operators:
+        """The table on lines omega (n,) rad/s, changed by the effects."""
         ops = Operators(self.effective, np.asarray(omega, float))
         for one in self.effects:
             one.effect.change(ops, one.place, one.by_name)
@@ -314,7 +333,7 @@ class TableModel:
         if not derivative:
             return Driven(response.Y, np.empty(0))
         dY = response.by_rig(self.effective, self.derivative_matrices, len(self._free))
-        self._by_effects(omega, U, block, made, response, dY)
+        self._by_effects(omega, block, made, response, dY)
         return Driven(response.Y, dY)
 
     def acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
@@ -332,7 +351,8 @@ class TableModel:
             U[:, :len(self.actuators)] += volts
         return Acting(U, force, reading, output, inner)
 
-    def _by_effects(self, omega, U, block, made: Assembled, response: TableResponse, dY: np.ndarray) -> None:
+    def _by_effects(self, omega: np.ndarray, block: SpectralBlock | None, made: Assembled, response: TableResponse,
+                    dY: np.ndarray) -> None:
         """Central differences with respect to the effects' parameters. For an effect that depends on the record they
         are taken of its contribution, in which the response is linear; for an effect that changes the table, of the
         whole response."""

@@ -59,10 +59,10 @@ class DrivenTable:
             moved = moved - (against[:, None] * mat.R) @ self.made.chassis(x, self.w)
         if self.acting.reading is not None:
             moved = moved + self.acting.reading
-        seen = self.sense * moved
+        output = self.sense * moved
         if self.is_driven:
-            seen += self.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ self.folded)
-        Y = self.gain * seen
+            output += self.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ self.folded)
+        Y = self.gain * output
         return Y if self.acting.output is None else Y + self.acting.output
 
 
@@ -93,15 +93,15 @@ class TableResponse(DrivenTable):
         if "loop_delay_s" in model.names:
             raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
                              value="loop_delay_s")
-        made, ops, s, left = self.made, self.made.ops, self.s, self.left
+        made, ops, s, per_force = self.made, self.made.ops, self.s, self.left
         own = made.G @ self.x
-        through = left @ made.G.T
-        inertial = left[:, :, :N_Q]
+        through = per_force @ made.G.T
+        inertial = per_force[:, :, :N_Q]
         if ops.recoil is not None:
             inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
-        operands = Operands(ops.base.sensors, model.matrices, s, left[:, :, :N_Q], inertial, self.gain * self.sense,
-                            self.gain * self.alias, made.hold[:, None, None], self.folded, self.x[:, :N_Q],
-                            made.follow(self.w), made.chassis(self.x, self.w), self.Y)
+        operands = Operands(ops.base.sensors, model.matrices, s, per_force[:, :, :N_Q], inertial,
+                            self.gain * self.sense, self.gain * self.alias, made.hold[:, None, None], self.folded,
+                            self.x[:, :N_Q], made.follow(self.w), made.chassis(self.x, self.w), self.Y)
         dY = operands.derivative(model.names, d, more)
         moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.acting.inner)
         rows = {name: k for k, name in enumerate(ops.mounts.names)}

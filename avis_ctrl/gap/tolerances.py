@@ -41,15 +41,10 @@ def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
     return [k for k, name in enumerate(names) if name.startswith(own) and "@" not in name]
 
 
-def held(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
-    """Priors with an effect of `BEYOND`: the effect alone represents the value, and the tolerances behind it are nearly
-    fixed."""
-    return priors.scaled(tolerances_behind(effect, priors.names), settings.held)
-
-
-def released(priors: Priors, effect: ActiveEffect, settings: GapSettings) -> Priors:
-    """Priors after an effect of `BEYOND` is removed: the inverse of `held`."""
-    return priors.scaled(tolerances_behind(effect, priors.names), 1 / settings.held)
+def rescaled(priors: Priors, effect: ActiveEffect, factor: float) -> Priors:
+    """Priors with the tolerances behind an effect of `BEYOND` multiplied by a factor: `GapSettings.held` with the
+    effect, which then alone represents the value; its inverse after the effect is removed."""
+    return priors.scaled(tolerances_behind(effect, priors.names), factor)
 
 
 def with_tolerance(fitted: Fitted) -> list[str]:
@@ -83,7 +78,7 @@ def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings
         behind = [fitted.priors.names[k] for k in tolerances_behind(effect, fitted.priors.names)]
         if not behind:
             continue
-        priors = released(fitted.priors, effect, settings).of(behind)
+        priors = rescaled(fitted.priors, effect, 1 / settings.held).of(behind)
         size = tolerance_of(effect, tolerances)
         std = np.sqrt(np.diag(fitted.covariance_of(effect.names))) / size
         none = np.array([p.none for p in effect.parameters])

@@ -56,6 +56,7 @@ class Half:
 
     @property
     def p_value(self) -> float:
+        """Probability of as large a difference by noise alone."""
         return float(stats.chi2.sf(self.chi2, self.dof))
 
 

@@ -35,7 +35,7 @@ def test_code_is_the_simulated_controller(skyhook, gcc, rng, arithmetic, toleran
     controller, _, files = exported(skyhook, arithmetic)
     K = digital_controller(skyhook.loop(skyhook.controller("skyhook_classical")))
     code = CompiledController(files, controller)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     y = rng.normal(0, 0.02, (4000, K.ninputs)).astype(controller.dtype).astype(float)
     expected = scipy.signal.dlsim((K.A, K.B, K.C, K.D, K.dt), y)[1]
     u = np.array([code.step(row) for row in y])
@@ -233,7 +233,7 @@ def test_start_is_bumpless(skyhook, gcc):
 def test_an_invalid_input_brings_the_drives_to_zero_and_back(skyhook, gcc, rng, bad):
     controller, guard, files = exported(skyhook, "float32")
     code = CompiledController(files, controller)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     y = rng.normal(0, 0.02, (8000, controller.system.ninputs))
     for row in y[:1000]:
         before = code.step(row)
@@ -254,7 +254,7 @@ def test_an_infinite_input_does_not_stay_in_the_states(skyhook, gcc, rng, arithm
     controller, _, _ = exported(skyhook, arithmetic)
     guard = replace(protection(controller, skyhook.rig), input_limit_V=np.full(6, np.inf))
     code = CompiledController(c_files(controller, guard, Provenance(())), controller)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     y = rng.normal(0, 0.02, (2500, 6)).astype(controller.dtype).astype(float)
     y[200, 1] = bad
     u = np.array([code.step(row) for row in y])
@@ -313,7 +313,7 @@ def test_anti_windup_takes_off_what_passed_its_lag(skyhook, gcc, arithmetic, tol
     law = AntiWindup.of(1.0, 0.5, controller.system.dt)
     guard = replace(protection(controller, skyhook.rig, law), input_limit_V=np.full(6, np.inf))
     code = CompiledController(c_files(controller, guard, Provenance(())), controller)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     K, time = controller.system, np.arange(3000) * controller.system.dt
     y = np.sin(2 * np.pi * np.outer(time, [0.7, 1.1, 1.3, 1.7, 1.9, 2.3])) * (time[:, None] < 2)
     y = 30 * y / np.max(np.abs(scipy.signal.dlsim((K.A, K.B, K.C, K.D, K.dt), y)[1]))  # drives have 10 V

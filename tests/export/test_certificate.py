@@ -196,7 +196,7 @@ def test_rounding_stays_below_its_bound(shipped, package, gcc):
     loop = replace(loop, sensors=replace(loop.sensors, converter=None))
     code = CompiledController(c_files(controller, guard, Provenance(())), controller)
     exact = Processor(controller, guard)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     exact.gain, exact.wait = 1.0, 0
     rounded, smooth = (simulate(loop, 20.0, 3, settle_s=5.0, nonlinear=False, code=one.step) for one in (code, exact))
     error = np.max(np.abs(rounded.q_dot - smooth.q_dot), axis=0) * lever_arms(shipped.rig)
@@ -346,7 +346,7 @@ def recoveries(folder, package, law, speeds, inside: bool = False) -> np.ndarray
         floor = np.zeros((time.size, 6))
         floor[:, 2] = np.where(time < 20, speed * np.sin(2 * np.pi * 0.2 * time), 0.0)
         code = CompiledController(c_files(controller, guard, Provenance(())), controller)
-        code.skip_start()
+        code.state.gain, code.state.wait = 1.0, 0  # as after the start
         record = simulate(loop, 23.0, settle_s=0.0, floor=floor, code=None if inside else code.step)
         assert not record.diverged
         assert np.sum(np.any(np.abs(record.volts) >= controller.limits_V, axis=1)) > 2000

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import control
 import matplotlib.image
@@ -17,10 +18,11 @@ import numpy as np
 import pytest
 import scipy.io
 
-from avis_ctrl.export import package
+from avis_ctrl.export import fewer_states, package
 from avis_ctrl.export.design_folder import open_design
 from avis_ctrl.export.package import CONTINUOUS, FILES, check_package
 from avis_ctrl.export.sampled_controller import read_controller
+from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import digital_controller
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
@@ -94,6 +96,19 @@ def test_exported_numbers_are_those_of_the_simulated_controller(skyhook, out):
     assert np.max(np.abs(a - b)) < 1e-3 * np.max(np.abs(a))
 
 
+def test_a_controller_above_the_required_mu_is_reported_before_the_descent(skyhook, monkeypatch):
+    K = skyhook.controller("skyhook_classical")
+    shorter = StateSpace(np.zeros((0, 0)), np.zeros((0, K.ninputs)), np.zeros((K.noutputs, 0)), K.D)
+    for name, value in (("gain_limit", lambda *known: np.inf), ("Task", lambda *known, **more: None),
+                        ("_order_and_mu", lambda P, K: (K.nstates, 1.2)),
+                        ("fixed_order", lambda *known: iter([SimpleNamespace(K=shorter)]))):
+        monkeypatch.setattr(fewer_states, name, value)
+    told = []
+    folder, name = fewer_states.with_fewer_states(skyhook, "skyhook_classical", 2, told.append)
+    assert folder.controller(name).nstates == 0
+    assert told[0].startswith("mu of 'skyhook_classical' itself is at most 1.2, above the 1 that the design requires")
+
+
 @pytest.mark.parametrize(("file", "words"), [
     ("controller.mat", "controller.mat is missing"), ("avis_controller.h", "avis_controller.h is missing"),
     ("test_vectors.csv", "test_vectors.csv is missing")])
@@ -151,6 +166,13 @@ def test_a_figure_that_is_not_computed_again_is_protected_by_the_hash(skyhook, o
     same = type("Same", (), {"content": {key: stored[key] for key in ("mu_upper", "stable")}})
     monkeypatch.setattr(package, "certify", lambda *arguments: same)
     assert check_package(skyhook, out) == []
+    folder = shutil.copytree(out, tmp_path / "foreign")
+    for name in ("controller.c", "orders.png"):
+        (folder / name).write_text("")
+    told = []
+    assert check_package(skyhook, folder, told.append) == []
+    assert [line for line in told if "controller.c" in line] == [
+        "Note: certificate.json does not list controller.c; not checked"]
     folder = shutil.copytree(out, tmp_path / "out")
     (folder / "certificate.json").write_text(json.dumps({**stored, "step_time_us": 0.1}))
     assert check_package(skyhook, folder) == ["certificate.json is not as it was written: its content_sha256 differs"]

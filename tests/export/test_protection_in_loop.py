@@ -30,7 +30,7 @@ def test_compiled_code_moves_the_table_as_the_simulated_controller(parts, gcc):
     """The inner loop compiled by numba with the controller inside, and the same loop that calls the C code."""
     _, _, loop = parts
     code = compiled(parts)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     inside, outside = simulate(loop, 5.0, 1, settle_s=0.0), simulate(loop, 5.0, 1, settle_s=0.0, code=code.step)
     lsb = loop.sensors.converter.lsb_V
     # A reading next to a code's edge may fall to either side of it.
@@ -45,7 +45,7 @@ def test_start_on_a_moving_table_is_bumpless(parts, gcc):
     swing = np.zeros(12)
     swing[2] = 1e-4  # a tenth of a millimetre
     soft, hard = compiled(parts), compiled(parts)
-    hard.skip_start()
+    hard.state.gain, hard.state.wait = 1.0, 0  # as after the start
     started, jumped = (simulate(loop, 8.0, 1, settle_s=0.0, initial=swing, code=code.step) for code in (soft, hard))
     assert np.all(started.demanded[:guard.wait - 1] == 0)
     steps = [np.max(np.abs(np.diff(record.demanded, axis=0, prepend=0))) for record in (started, jumped)]
@@ -84,7 +84,7 @@ def test_a_sensor_that_fails_for_a_second(parts, gcc, fault):
     """The drives go to zero, the passive table stays in place, and control comes back."""
     controller, guard, loop = parts
     code = compiled(parts)
-    code.skip_start()
+    code.state.gain, code.state.wait = 1.0, 0  # as after the start
     sample = -1
 
     def faulty(y):

@@ -11,10 +11,12 @@ from scipy import signal
 
 from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.axis import Signals, find_axis_gap, find_axis_gap_in
+from avis_ctrl.gap.axis import Signals, analysis, find_axis_gap, find_axis_gap_in
+from avis_ctrl.gap.axis.find import Reading, signals_in
 from avis_ctrl.gap.axis.levels import level_effects
 from avis_ctrl.gap.axis.mass_effects import Scale, drive_effects, oscillator_effects
 from avis_ctrl.gap.axis.model import Effect, Parameter
+from avis_ctrl.gap.axis.search import Explored
 from avis_ctrl.gap.axis.seismometer import sensor_effects
 from avis_ctrl.identification.single_axis.seismometer import Responses
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
@@ -386,6 +388,40 @@ def test_wrong_data_are_refused_in_one_line(kind, data, said):
     with pytest.raises(InputError, match=said) as caught:
         find_axis_gap(kind, **data)
     assert "\n" not in str(caught.value)
+
+
+def test_an_odd_last_frequency_is_left_out_with_a_note():
+    data = seismometer(lambda s: 1.0)["responses"]
+    for count in (17, 18):
+        gap = find_axis_gap("seismometer", responses=data.at(np.arange(18) < count))
+        assert any("is not used" in sentence for sentence in gap.sentences) == (count == 17)
+
+
+def test_a_range_ends_within_the_record(tmp_path):
+    x = np.arange(1000.0)
+    np.savetxt(tmp_path / "a.csv", np.column_stack([x / 1000, np.sin(x), np.cos(x)]), delimiter=",", header="t,F,q",
+               comments="")
+    columns = {"t": "t", "force": "F", "position": "q"}
+    (record,), _ = signals_in("drive", [tmp_path / "a.csv"], Reading(columns, {}, range_s=(0.5, 1.0)))
+    assert len(record.force) == 500
+    with pytest.raises(InputError, match="inside the record's 1 s"):
+        signals_in("drive", [tmp_path / "a.csv"], Reading(columns, {}, range_s=(0.5, 1.001)))
+
+
+def test_effects_that_are_lost_with_a_failed_fit_are_reported(monkeypatch):
+    """One of two effects is refused, and no fit without it succeeds."""
+    u, y = oscillator(lambda y, v: 0.01 * y ** 3, 1, n=4096)
+    (first, second) = ("cubic_stiffness", "quadratic_damping")
+
+    def both(base, explored, effects, progress):
+        chosen = [next(one for one in effects if one.name == name) for name in (first, second)]
+        return explored.with_effects(base, [(one, np.zeros(len(one.parameters))) for one in chosen])
+    monkeypatch.setattr(analysis, "search", both)
+    monkeypatch.setattr(analysis, "_refusal", lambda *known: "it is refused")
+    monkeypatch.setattr(Explored, "without", lambda *known: None)
+    gap = find_axis_gap("oscillator", records=[Signals("a", u, y)], rate=RATE, band_Hz=(2.0, 180.0))
+    (said,) = (sentence for sentence in gap.sentences if sentence.startswith("Not named"))
+    assert gap.effects == () and first in said and second in said and "no fit without" in said
 
 
 def test_few_frequencies_are_refused():

@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear, minimize
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
 from avis_ctrl.gap.probability import odds_against
-from avis_ctrl.gap.search import Step, is_weak, with_effect, without_effect, without_needless
+from avis_ctrl.gap.search import Step, backward_elimination, is_weak, with_effect, without_effect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
@@ -397,6 +397,10 @@ def test_odds_by_how_evenly_two_models_differ():
     assert odds_against(even, none) < 1e-12
     assert odds_against(uneven, none) > 0.4
     assert odds_against(none, uneven) * odds_against(uneven, none) == pytest.approx(1.0)
+    certain = dict.fromkeys(groups, 10.0)
+    with np.errstate(all="raise"):
+        assert odds_against(certain, none) == 0.0
+        assert 1e290 < odds_against(none, certain) < np.inf  # below 38 standard deviations
 
 
 def test_what_is_beyond_a_tolerance_and_the_tolerance_behind_it():
@@ -459,7 +463,7 @@ def test_an_effect_that_those_found_later_replace_is_left_out():
         now = after
     relaxation, delay = now.labels
     assert is_weak(now, relaxation, settings) and not is_weak(now, delay, settings)
-    kept, rest = without_needless(steps, now, data, settings)
+    kept, rest = backward_elimination(steps, now, data, settings)
     assert [step.label for step in kept] == [delay] == list(rest.labels)
     assert rest.model.effects[-1].values[0] == pytest.approx(1e-3, rel=0.02)
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from avis_ctrl.gap.analysis import separating_measurement
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.next_measurement import between, grows, grows_faster, of_unexplained
-from avis_ctrl.gap.result import RecordGap, Where
+from avis_ctrl.gap.result import NamedEffect, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
@@ -113,6 +116,33 @@ def test_amplitude_counts_only_in_what_differs():
     bent = with_effect(MODEL, "cubic_stiffness", "isolators z", 1e9, 0.0, 0.0, 0.0)
     assert "only one of them" in between("cubic_stiffness", "sensor_gain", bent, with_effect(
         MODEL, "sensor_gain", "Sz1", 1.2))
+
+
+def test_a_drift_is_told_apart_by_time_and_not_by_the_level():
+    """A drifting stiffness is the same fraction of the response at every level."""
+    drift = with_effect(MODEL, "stiffness_drift", "isolators/linear", 0.1)
+    gain = with_effect(MODEL, "sensor_gain", "Sz1", 1.2)
+    text = between("stiffness_drift", "sensor_gain", drift, gain)
+    assert "over a longer time: only one of them depends on time" in text and "level" not in text
+    other = with_effect(MODEL, "stiffness_drift", "isolators/settling", 0.1, 0.3)
+    assert "they depend on time in different ways" in between("stiffness_drift", "stiffness_drift", drift, other)
+    bent = with_effect(MODEL, "cubic_stiffness", "isolators z", 1e9, 0.0, 0.0, 0.0)
+    assert "only one of them depends on amplitude" in between("stiffness_drift", "cubic_stiffness", drift, bent)
+
+
+def test_the_rival_is_compared_at_the_place_that_cannot_be_ruled_out():
+    """Not at the first place that was fitted."""
+    def fitted(name, place, log_likelihood, *values):
+        return SimpleNamespace(model=with_effect(MODEL, name, place, *values), log_evidence=log_likelihood,
+                               log_likelihoods={(0.1, 1): log_likelihood})
+    tried = {"sensor_gain@Sz1": fitted("sensor_gain", "Sz1", 0.0, 1.2),
+             "actuator_gain@Az1": fitted("actuator_gain", "Az1", -9.0, 0.9),
+             "actuator_gain@Az3": fitted("actuator_gain", "Az3", -1.0, 0.9)}
+    step = SimpleNamespace(label="sensor_gain@Sz1", tried=tried)
+    told = [NamedEffect("sensor_gain", "Sz1", "", {}, 0.6, ("actuator_gain",), "sensor_gain@Sz1")]
+    mine, best = (tried[label].model for label in ("sensor_gain@Sz1", "actuator_gain@Az3"))
+    text = separating_measurement(told, SimpleNamespace(steps=[step]))
+    assert text == between("sensor_gain", "actuator_gain", mine, best)
 
 
 def test_growth_is_stated_where_the_records_say_it():

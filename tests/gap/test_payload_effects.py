@@ -335,14 +335,14 @@ def test_a_second_mode_and_a_second_frequency_begin_beside_what_is_fitted():
     _, found = seeds_of(one, "payload_flexible_mode", "payload")
     assert found[0].values[0] == pytest.approx(22.0, rel=0.03)
     two = with_effect("payload_flexible_mode", "payload/two", [22.0, 0.01, *first, 41.0, 0.01, *second], FREE)
-    [(place, values)] = one.effects[0].effect.richer(Score(one, [block_of(two, 1e-6)]), one.effects[0])
+    [(place, values)] = one.effects[0].effect.extended_models(Score(one, [block_of(two, 1e-6)]), one.effects[0])
     assert place == "payload/two"
     assert values[:14] == one.effects[0].values
     assert values[14] == pytest.approx(41.0, rel=0.03)
     along_z = with_effect("attached_oscillator", "payload/oblique", [0.0, 0.0, 1.2, 17.0, 0.04, *PLACE], FREE)
     along_all = with_effect("attached_oscillator", "payload/axes", [1.44, 31.0, 24.0, 17.0, 0.04, *PLACE], FREE)
     score = Score(along_z, [block_of(along_all, 1e-6)])
-    [(place, values)] = along_z.effects[0].effect.richer(score, along_z.effects[0])
+    [(place, values)] = along_z.effects[0].effect.extended_models(score, along_z.effects[0])
     assert place == "payload/axes"
     np.testing.assert_allclose(values[:4], [1.44, 31.0, 24.0, 17.0], rtol=0.06)
 

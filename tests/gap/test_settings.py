@@ -17,11 +17,11 @@ from avis_ctrl.gap.tuning_values import tuning_values
 FOLDER = Path(avis_ctrl.gap.__file__).parent
 FILES = sorted(FOLDER.rglob("*.py"))
 # What no tuning can change: physics, mathematics, names, tables.
-NO_TUNING = {"ADDED", "ALL", "AT_REST", "BEYOND", "BY_PHYSICS", "COUNTS", "DECAY", "FASTER", "FILES",
+NO_TUNING = {"ADDED", "ALL", "AT_REST", "BEYOND", "BY_PHYSICS", "COORDINATES", "COUNTS", "DECAY", "FASTER", "FILES",
              "FORMAT", "HANN_COST", "HANN_SHARED", "HIGHER", "MAINS_HZ", "MOUNT", "PROBLEMS",
              "PRODUCTS", "RAYLEIGH", "RELEASED", "REST", "SETTINGS", "SLOW", "SWEEP", "SYMMETRIC",
              "THREE_AXES", "TOGETHER",
-             "UNITS", "VERDICTS", "VERSION", "WAYS", "_AT_REST", "_ELSEWHERE", "_MADE", "_NOTES"}
+             "UNITS", "VERDICTS", "VERSION", "_AT_REST", "_ELSEWHERE", "_MADE", "_NOTES"}
 
 
 def constants(path: Path) -> set[str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,6 +118,25 @@ def test_the_drive_is_held_at_its_limit():
     u = np.tile([-14.0, 3.0, 9.0, 10.5], (4, 2))
     made = repair(one_record(np.zeros((4, 6)), u), rig())
     assert np.array_equal(made.campaign.records[0].load().u, np.tile([-10.0, 3.0, 9.0, 10.0], (4, 2)))
+
+
+def test_memory_does_not_grow_with_the_number_of_records():
+    class Loaded(Record):
+        """A record whose samples exist only while it is loaded."""
+
+        def load(self, *part):
+            return Record(self.header, self.u, convert(np.random.default_rng(1).normal(0, 1.0, (100_000, 6))))
+    u, y = (np.broadcast_to(0.0, (100_000, channels)) for channels in (8, 6))
+    header = one_record(y, u).records[0].header
+
+    def peak(records: int) -> int:
+        campaign = Campaign("avis", tuple(Loaded(replace(header, name=f"{k}"), u, y) for k in range(records)))
+        tracemalloc.start()
+        assert inspect_converter(campaign, rig()) == ()
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return most
+    assert peak(8) < 1.5 * peak(2)
 
 
 def test_wrong_input_is_refused_by_name():

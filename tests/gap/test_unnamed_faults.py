@@ -134,7 +134,7 @@ def test_crosstalk_is_no_misalignment():
     step = searched(truth, "sensor_misalignment", "sensor_gain")[0]
     one = step.fitted.model.effects[-1]
     assert one.effect.outside
-    assert one.effect.said(one.place, one.by_name) == "a fraction of Sz3's signal in Sz1"
+    assert one.effect.described(one.place, one.by_name) == "a fraction of Sz3's signal in Sz1"
     assert one.values[0] == pytest.approx(0.03, abs=4 * np.sqrt(step.fitted.covariance_of(one.names)[0, 0]))
 
 
@@ -146,7 +146,7 @@ def test_a_misalignment_keeps_its_name():
 def test_a_dead_zone_is_no_force_constant():
     truth = MODEL.with_effect(active(unnamed_faults()["dead_zone"], MODEL, "Az2", (0.01,)))
     one = searched(truth, "actuator_gain")[0].fitted.model.effects[-1]
-    assert one.effect.said(one.place, one.by_name) == "a dead zone of Az2"
+    assert one.effect.described(one.place, one.by_name) == "a dead zone of Az2"
 
 
 def test_a_force_constant_is_no_dead_zone():

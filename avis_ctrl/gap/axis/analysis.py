@@ -18,8 +18,6 @@ from avis_ctrl.gap.axis.search import (
     Progress,
     Rival,
     at_an_edge,
-    borne_out,
-    odds_against_fit,
     parts,
     rivals,
     robust,
@@ -95,19 +93,23 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
             refused += wrong
         if not wrong:
             free = unnamed(best, explored, problem.effects)
-            shares = Shares.of(base, best, free, names, explored, problem)
+            shares = Contributions.of(base, best, free, names, explored, problem)
             uncertain = [one for one in names if not shares.certain(best, one.effect, settings)]
             wrong = sorted(uncertain, key=lambda one: shares.of_effect[one.effect.label])[:1]
             refused += [replace(one, refused="its size is not certain to differ from zero") for one in wrong]
         for one in wrong:
-            best = explored.without(best, one.effect.label) or base
+            rest = explored.without(best, one.effect.label)
+            if rest is None:  # nothing is known of the other effects without this one
+                refused += [replace(other, refused=f"no fit without {one.effect.name} succeeded") for other in names
+                            if other not in wrong]
+            best = rest or base
         if not wrong:
             break
-    told = power(base) - power(best)
-    if not names or (free is not None and told < settings.right_shape * (power(base) - power(free))):
+    removed = power(base) - power(best)
+    if not names or (free is not None and removed < settings.right_shape * (power(base) - power(free))):
         refused += [replace(one, refused="a function of another shape takes far more") for one in names]
         names, best, free = [], base, unnamed(base, explored, problem.effects)
-        shares = Shares.of(base, best, free, names, explored, problem)
+        shares = Contributions.of(base, best, free, names, explored, problem)
     return _gap(problem, base, best, free, shares, names, refused, explored, settings)
 
 
@@ -138,7 +140,7 @@ def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitte
 def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, settings: AxisSettings) -> Name:
     others = rivals(best, one.label, explored, problem.effects)
     rest = explored.without(best, one.label)
-    nothing = 0.0 if rest is None else odds_against_fit(best, rest, settings)
+    nothing = 0.0 if rest is None else explored.odds_against(best, rest)
     by_key: dict[str, float] = {}
     for other in others:
         if not other.same:
@@ -148,7 +150,7 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     # Only linear parameters are compared: a shape parameter is often determined by a part of the data alone.
     parameters = _sizes(one)
     found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
-    return Name(one, probability, near, _refusal(best, rest, one, probability, found, settings, max(
+    return Name(one, probability, near, _refusal(best, rest, probability, found, explored, max(
         others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
                 _widening(found, settings))
 
@@ -164,13 +166,14 @@ def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
     return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
 
 
-def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float, found, settings: AxisSettings,
+def _refusal(best: Fitted, rest: Fitted | None, probability: float, found: Sequence[Half], explored: Explored,
              rival: str) -> str:
+    settings = explored.settings
     if probability < settings.headline:
         return f"{rival} in its place is as probable"
     if edge := at_an_edge(best):
         return edge
-    if rest is not None and not borne_out(best, rest, settings):
+    if rest is not None and explored.held_out(best) <= explored.held_out(rest):
         return "held-out data do not bear it out"
     for half in found:
         if half.change > settings.law_change:
@@ -180,46 +183,47 @@ def _refusal(best: Fitted, rest: Fitted | None, one: Effect, probability: float,
 
 def power(fitted: Fitted | AxisModel) -> float:
     """Residual power of a model on held-out data over the power of the data."""
-    left, whole = _power(fitted.model if isinstance(fitted, Fitted) else fitted)
-    return float(sum(map(np.sum, left)) / whole)
+    residual, whole = _power(fitted.model if isinstance(fitted, Fitted) else fitted)
+    return float(sum(map(np.sum, residual)) / whole)
 
 
 def power_by_line(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """(n,) each: frequency [Hz], and residual power of held-out data on that line over the total power of the data."""
-    left, whole = _power(fitted.model)
+    residual, whole = _power(fitted.model)
     # `records` puts the mean of a window at a thousandth of the bin spacing.
     f = [np.where(omega < 0.01 * np.unique(omega)[:2][-1], 0.0, omega / (2 * np.pi))
          for omega in (block.omega for block in fitted.model.lines.held.blocks)]
-    return np.concatenate(f), np.concatenate(left) / whole
+    return np.concatenate(f), np.concatenate(residual) / whole
 
 
 def _power(model: AxisModel) -> tuple[list[np.ndarray], float]:
     """Residual power on each line (n,) of each held-out block, and the total power of the data."""
     blocks = model.lines.held.blocks
-    left = [np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2)) for block in blocks]
-    return left, sum(float(np.sum(np.abs(block.Y) ** 2)) for block in blocks)
+    residual = [np.sum(np.abs(block.Y - model.answer(block, None, False).Y) ** 2, axis=(1, 2)) for block in blocks]
+    return residual, sum(float(np.sum(np.abs(block.Y) ** 2)) for block in blocks)
 
 
 @dataclass(frozen=True, eq=False)
-class Shares:
+class Contributions:
     """Contribution of each effect to the gap on held-out data, and the covariance of the parameters.
 
     floor : power of the noise, or of the residual of the best free function. after : residual power of the model
-    without unnamed functions. left : fraction of the gap that remains. alone : residual power without an effect, no
-    refit; of_effect : fraction of the gap that the effect explains and the other effects, refitted, cannot; both by
+    without unnamed functions. remaining : fraction of the gap. alone : residual power without an effect, no refit;
+    of_effect : fraction of the gap that the effect explains and the other effects, refitted, cannot; both by
     label. covariance : of all parameters.
     """
 
     floor: float
     after: float
-    left: float
+    remaining: float
     alone: Mapping[str, float]
     of_effect: Mapping[str, float]
     covariance: np.ndarray
 
     @staticmethod
     def of(base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored,
-           problem: Problem) -> Shares:
+           problem: Problem) -> Contributions:
+        """Contributions of the named effects of `best`; free : the fit with a free function, None if there is none."""
         whole = power(best)
         before, after = power(base), whole
         for one in best.model.effects:
@@ -228,13 +232,13 @@ class Shares:
                 after = max(after, power(rest) if rest else before)
         floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
         excess = max(before - floor, 1e-300)
-        left = max(after - floor, 0.0) / excess
+        remaining = max(after - floor, 0.0) / excess
         shares, alone = {}, {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
         for label, left_out in alone.items():
             rest = explored.without(best, label)
             taken = min(left_out, power(rest) if rest else left_out) - whole
             shares[label] = float(np.clip(taken / excess, 0.0, 1.0))
-        return Shares(floor, after, left, alone, shares, _widened(best, names, shares, left))
+        return Contributions(floor, after, remaining, alone, shares, _widened(best, names, shares, remaining))
 
     def certain(self, best: Fitted, one: Effect, settings: AxisSettings) -> bool:
         """Whether an effect's size differs from zero by at least `apart` standard deviations."""
@@ -242,7 +246,7 @@ class Shares:
         return any(abs(best.model.values[k]) >= settings.apart * std[k] for k in at)
 
 
-def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], left: float) -> np.ndarray:
+def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], remaining: float) -> np.ndarray:
     """Covariance of all parameters, widened because no law describes the real element exactly. The parameters of an
     effect are known only as well as halves of the data agree. The residual beyond noise may have any correlation from
     -1 to 1 with the effect (variance 1/3)."""
@@ -251,36 +255,36 @@ def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], l
         for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
             k = best.model.names.index(f"{p.name}@{one.effect.label}")
             factor[k] = one.widened
-            beside[k] = value ** 2 * left / (3 * max(shares[one.effect.label], left, 1e-12))
+            beside[k] = value ** 2 * remaining / (3 * max(shares[one.effect.label], remaining, 1e-12))
     return robust(best) * np.outer(factor, factor) + np.diag(beside)
 
 
-def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, found: Shares, names: Sequence[Name],
+def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, found: Contributions, names: Sequence[Name],
          refused: Sequence[Name], explored: Explored, settings: AxisSettings) -> AxisGap:
-    covariance, left = found.covariance, found.left
+    covariance, remaining = found.covariance, found.remaining
     effects = [_reported(one, best, covariance, found.of_effect[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -found.alone[one.label])
-    told = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
+    reported = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
     outside = [one.label for one in best.model.effects if one.outside]
     stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
     closed = found.after <= settings.within_noise * found.floor or (
         max(found.after - found.floor, 0.0) < settings.small ** 2)
-    verdict = ("partly explained", "explained")[closed] if told else ("unexplained", "none")[closed]
+    verdict = ("partly explained", "explained")[closed] if reported else ("unexplained", "none")[closed]
     base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
                                   unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
     where = _where(best, problem)
     onward = next((one.effect.separated_by for one in names if one.rivals), None)
     unknown = next((one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects
                     if one.outside), "")
-    said = _sentences(problem, verdict, told, traces, stages, names, refused, unknown)
+    sentences = _sentences(problem, verdict, reported, traces, stages, names, refused, unknown)
     ups = tuple(RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
                 for one in names for r in one.rivals)
-    return AxisGap(problem.kind, verdict, told, traces, tuple(stages), where, tuple(said), onward, base_values,
+    return AxisGap(problem.kind, verdict, reported, traces, tuple(stages), where, tuple(sentences), onward, base_values,
                    _ratios(problem, best, covariance), ups,
-                   None if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300))), left,
-                   _pictures(base, best, stages), {"kind": problem.kind, **problem.plain, "baseline": _plain(base),
-                                                   "updated": _plain(best)})
+                   None if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300))),
+                   remaining, _pictures(base, best, stages), {
+                       "kind": problem.kind, **problem.plain, "baseline": _plain(base), "updated": _plain(best)})
 
 
 def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
@@ -340,12 +344,12 @@ def _plain(fitted: Fitted) -> dict[str, Any]:
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
     """The fewest octaves that contain at least half of the residual power, largest first; the mean is in the lowest."""
-    f, left = power_by_line(best)
+    f, residual = power_by_line(best)
     octave = np.floor(np.log2(np.maximum(f, np.min(f[f > 0])))).astype(int)
     found: list[dict[str, Any]] = []
-    for k in sorted(np.unique(octave), key=lambda k: -float(left[octave == k].sum())):
+    for k in sorted(np.unique(octave), key=lambda k: -float(residual[octave == k].sum())):
         inside = octave == k
-        share = float(left[inside].sum() / max(left.sum(), 1e-300))
+        share = float(residual[inside].sum() / max(residual.sum(), 1e-300))
         found.append({"from_Hz": float(f[inside].min()), "to_Hz": float(f[inside].max()),
                       "input": problem.units.get("input", ""), "output": problem.units.get("output", ""),
                       "share": share})
@@ -361,50 +365,51 @@ def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[
                      tuple(one.name for one in stages))
     series = []
     for name, fitted in (("base", base), ("updated", best)):
-        f, left = power_by_line(fitted)
+        f, residual = power_by_line(fitted)
         lines = np.unique(np.round(f, 9))
         lines = lines[lines > 0]
-        series.append(Series(name, lines, np.array([np.sqrt(np.mean(left[np.round(f, 9) == one])) for one in lines]),
-                             "points" if len(lines) < 40 else "line"))
+        rms = np.array([np.sqrt(np.mean(residual[np.round(f, 9) == one])) for one in lines])
+        series.append(Series(name, lines, rms, "points" if len(lines) < 40 else "line"))
     return ladder, Picture("Residual of each model on held-out data", "frequency [Hz]", "r.m.s. on a line, relative",
                            tuple(series), (), "log", "log")
 
 
 def percent(share: float) -> str:
+    """A fraction in per cent, three digits."""
     return f"{100 * share:.3g} %"
 
 
-def _sentences(problem: Problem, verdict: str, told: Sequence[NamedEffect], traces: Sequence[NamedEffect],
+def _sentences(problem: Problem, verdict: str, reported: Sequence[NamedEffect], traces: Sequence[NamedEffect],
                stages: Sequence[AxisStage], names: Sequence[Name], refused: Sequence[Name], unknown: str) -> list[str]:
     first, last = percent(stages[0].nrmse), percent(stages[-1].nrmse)
     if verdict == "none":
-        said = [f"No missing effect was found: the error on held-out data is {last}."]
+        sentences = [f"No missing effect was found: the error on held-out data is {last}."]
     elif verdict == "unexplained":
-        said = [f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
-                "library explains it."]
+        sentences = [f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
+                     "library explains it."]
     else:
-        said = [f"{missed(told)} With this the gap on held-out data falls from {first} to {last}."
-                f"{' A part is not explained.' * (verdict != 'explained')}"]
+        sentences = [f"{missed(reported)} With this the gap on held-out data falls from {first} to {last}."
+                     f"{' A part is not explained.' * (verdict != 'explained')}"]
     if traces:
-        said.append("Traces, below 1 % of the gap: " + "; ".join(
+        sentences.append("Traces, below 1 % of the gap: " + "; ".join(
             f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})"
             for one in traces) + ".")
     for one in names:
-        delay = one.effect.name == "delay" and next(p for e in (*told, *traces) if e.label == one.effect.label
+        delay = one.effect.name == "delay" and next(p for e in (*reported, *traces) if e.label == one.effect.label
                                                     for p in e.parameters.values()).value < 0
         if delay:
-            said.append("The delay is negative: the motion comes before the force, so that the force was logged late, "
-                        "or the motion early.")
+            sentences.append("The delay is negative: the motion comes before the force, so that the force was logged "
+                             "late, or the motion early.")
         if one.rivals and one.effect.separated_by:
-            said.append(f"{one.effect.name}: these data cannot distinguish it from "
-                        f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
-                        f"{one.effect.separated_by}.")
+            sentences.append(f"{one.effect.name}: these data cannot distinguish it from "
+                             f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
+                             f"{one.effect.separated_by}.")
     if stages[-1].chi2_per_dof is None:
-        said.append("Nothing in these data repeats, so the noise cannot be estimated.")
+        sentences.append("Nothing in these data repeats, so the noise cannot be estimated.")
     else:
-        said.append(f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
-                    "noise.")
+        sentences.append(f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
+                         "noise.")
     if unknown:
-        said.append(f"The residual is most similar to {unknown}, which is not in the library.")
+        sentences.append(f"The residual is most similar to {unknown}, which is not in the library.")
     lost = {one.effect.name: f"{one.effect.name} reduces the gap, but {one.refused}" for one in refused}
-    return [*said, *problem.notes, *(f"Not named: {'; '.join(lost.values())}." for _ in [lost] if lost)]
+    return [*sentences, *problem.notes, *(f"Not named: {'; '.join(lost.values())}." for _ in [lost] if lost)]

@@ -28,9 +28,8 @@ from avis_ctrl.gap.axis.records import Signals
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.axis.search import Progress
 from avis_ctrl.gap.axis.seismometer import of_sines, seismometer
-from avis_ctrl.identification.single_axis.identify import ROLES, sine_records
+from avis_ctrl.identification.single_axis.identify import read_columns, roles_of, sine_records
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.measurement.formats.reader import read_measurements
 
 PROBLEMS: dict[str, Callable[..., Problem]] = {"drive": drive, "oscillator": oscillator, "seismometer": seismometer,
                                                "levels": levels}
@@ -56,11 +55,11 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
         raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)
     known = {name: one for name, one in signature(PROBLEMS[kind]).parameters.items() if name not in ("settings",)}
     if set(data) - set(known) or any(name not in data for name, one in known.items() if one.default is one.empty):
-        said = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items())
-        raise InputError(f"expected for kind {kind} the data {said} (in brackets what may be left out)", field="data",
-                         value=sorted(data))
-    begun, told = time.perf_counter(), progress or (lambda text: None)
-    told("reading and windows")
+        expected = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items())
+        raise InputError(f"expected for kind {kind} the data {expected} (in brackets what may be left out)",
+                         field="data", value=sorted(data))
+    begun, report = time.perf_counter(), progress or (lambda text: None)
+    report("reading and windows")
     problem = PROBLEMS[kind](**data)
     taken = {one.label for one in problem.effects}
     for one in own:
@@ -68,7 +67,7 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
             raise InputError("expected an effect with name, location, title and parameters, and a name and place that "
                              "no other has", field="own", value=one.label)
         taken.add(one.label)
-    found = analyse(replace(problem, effects=[*own, *problem.effects]), told)
+    found = analyse(replace(problem, effects=[*own, *problem.effects]), report)
     return replace(found, seconds=time.perf_counter() - begun)
 
 
@@ -88,6 +87,7 @@ class Reading:
     resample_Hz: float | None = None
 
     def to_json(self) -> dict[str, Any]:
+        """The fields as plain data."""
         return {**vars(self), "columns": dict(self.columns), "scale": dict(self.scale)}
 
 
@@ -124,13 +124,13 @@ def find_axis_gap_in(kind: str, path: str | Path | Sequence[str | Path], columns
         records, refused = sine_records(campaign, driven, measured, dict(reading.scale))
         found = find_axis_gap(kind, progress=progress, **of_sines(records, measured, driven), **options)
         return replace(found, sentences=(*found.sentences, *(f"Left out: {reason}." for reason in refused),
-                                         *assumed(kind, reading)))
+                                         *assumed(reading)))
     several, rate = signals_in(kind, paths, reading, options.get("band_Hz"))
     try:
         found = find_axis_gap(kind, records=several, rate=rate, progress=progress, **options)
     except InputError as error:
         raise error.in_file(str(paths[0])) from None
-    return replace(found, sentences=(*found.sentences, *assumed(kind, reading, rate)),
+    return replace(found, sentences=(*found.sentences, *assumed(reading, rate)),
                    model={**found.model, "reading": reading.to_json()})
 
 
@@ -157,7 +157,7 @@ def signals_in(kind: str, paths: Sequence[str | Path], reading: Reading, band_Hz
             u, y = record.u[:, 0] * reading.scale.get(driven, 1.0), record.y[:, 0] * reading.scale.get(measured[0], 1.0)
             if reading.range_s is not None:
                 a, b = (round(t * rate) for t in reading.range_s)
-                if not 0 <= a < b <= len(u) + 1:
+                if not 0 <= a < b <= len(u):
                     raise InputError(f"expected a range inside the record's {len(u) / rate:.5g} s", file=path,
                                      field="range", value=reading.range_s)
                 u, y = u[a:b], y[a:b]
@@ -177,42 +177,23 @@ def _resampled(x: np.ndarray, rate: float, wanted: float) -> np.ndarray:
     return signal.resample_poly(x, ratio.numerator, ratio.denominator, padtype="line")
 
 
-def assumed(kind: str, reading: Reading, rate: float | None = None) -> tuple[str, ...]:
+def assumed(reading: Reading, rate: float | None = None) -> tuple[str, ...]:
     """Sentence on the units that were assumed for the columns."""
-    said = [f"{role} = {name}{f' times {reading.scale[role]:g}' if role in reading.scale else ''}"
-            + (f" in {UNITS[role]}" if role in UNITS else "") for role, name in reading.columns.items() if role != "t"]
+    units = [f"{role} = {name}{f' times {reading.scale[role]:g}' if role in reading.scale else ''}"
+             + (f" in {UNITS[role]}" if role in UNITS else "") for role, name in reading.columns.items() if role != "t"]
     bare = [role for role in reading.columns if role in UNITS and role not in reading.scale]
     hint = f"; not scaled: where the file has other units, --scale {bare[0]}=FACTOR" if bare else ""
     clock = "" if rate is None or "t" in reading.columns else (
         f" The sample rate of {rate:g} Hz is taken as given: with another one every time and mass is wrong.")
-    return (f"Assumed units: {', '.join(said)}{hint}.{clock}",)
+    return (f"Assumed units: {', '.join(units)}{hint}.{clock}",)
 
 
 def _roles(kind: str, reading: Reading) -> tuple[str, list[str]]:
-    driven, needed, optional = ROLES[kind]
-    optional = tuple(role for role in optional if role != "ground")
-    known, columns = ("t", driven, *needed, *optional), reading.columns
-    for role in [*columns, *reading.scale]:
-        if role not in known:
-            raise InputError(f"expected one of {', '.join(known)}", field=f"role of {kind}", value=role)
-    for role in (driven, *needed, *(() if needed or set(optional) & set(columns) else optional[:1])):
-        if role not in columns:
-            raise InputError(f"expected a column for {role}", field="columns", value=dict(columns))
-    for role, factor in reading.scale.items():
-        if role not in columns or not (np.isfinite(factor) and factor != 0):
-            raise InputError("expected a finite factor, not zero, of a role that is mapped", field=f"scale of {role}",
-                             value=factor)
-    return driven, [role for role in (*needed, *optional) if role in columns]
+    return roles_of(kind, reading.columns, reading.scale, without=("ground",))
 
 
 def _campaign(path: str | Path, reading: Reading, driven: str, measured: Sequence[str]) -> Campaign:
-    columns = reading.columns
-    mapping = {"u": [columns[driven]], "y": [columns[role] for role in measured]}
-    mapping |= {"t": [columns["t"]]} if "t" in columns else {}
-    hints: dict[str, Any] = {} if reading.sample_rate_Hz is None else {"sample_rate_Hz": reading.sample_rate_Hz}
-    campaign = read_measurements(path, mapping, **hints)
-    if not isinstance(campaign, Campaign):
-        raise InputError("expected records over time, found a frequency response", file=path)
+    campaign = read_columns(path, reading.columns, driven, measured, reading.sample_rate_Hz)
     stated, given = campaign.sample_rate_Hz, reading.sample_rate_Hz
     if given is not None and abs(stated / given - 1) > 1e-3:
         raise InputError(f"expected the sample rate of the file's times, {stated:.6g} Hz", file=path,

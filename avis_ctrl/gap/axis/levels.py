@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy import signal
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, split
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, central_differences, split
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -71,13 +72,11 @@ class ModeModel(AxisModel):
         mode = r * 2j * x[1] * w ** 2 / (s ** 2 + 2 * x[1] * w * s + w ** 2 + change)
         return gain * lines.size * (mode + b0 + b1 * (block.omega / lines.middle - 1))
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
-        Y, dY = self._predicted(block, self.values), []
-        for k in range(len(self.values) if derivative else 0):
-            h = np.zeros(len(self.values))
-            h[k] = 1e-6 * max(abs(self.values[k]), 1e-3)
-            dY.append((self._predicted(block, self.values + h) - self._predicted(block, self.values - h)) / (2 * h[k]))
-        return Answer(Y[:, None, None], np.array(dY).reshape(len(dY), len(Y), 1, 1))
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
+        Y, predicted = self._predicted(block, self.values), partial(self._predicted, block)
+        dY = central_differences(predicted, self.values, 1e-6 * np.maximum(np.abs(self.values), 1e-3)
+                                 ) if derivative else []
+        return Prediction(Y[:, None, None], np.array(dY).reshape(len(dY), len(Y), 1, 1))
 
 
 def level_effects(scatters: bool) -> list[Effect]:

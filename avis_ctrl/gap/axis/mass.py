@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -40,8 +40,9 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
         lines = Lines(some, rate, "force", band, cutoff_Hz, settings)
         # Free functions of position are included, because a spring or a stop acts like a negative mass.
         places = next(one for one in unnamed_forces(lines) if one.variable == "position").shapes
-        x, left = _least_squares(_flat(lines.A, lines.V, *map(lines.of, (lambda m: m.sign, *places))), *_flat(lines.F))
-        return left, bool(x[0] > 0)
+        columns = _flat(lines.A, lines.V, *map(lines.of, (lambda m: m.sign, *places)))
+        x, residual = _least_squares(columns, *_flat(lines.F))
+        return residual, bool(x[0] > 0)
     require_oriented(fitted, records, ("force", "position"), settings)
     lines = Lines(records, rate, "force", band, cutoff_Hz, settings)
     start, _ = _least_squares(_flat(lines.A, lines.V), *_flat(lines.F))
@@ -70,8 +71,8 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
         raise InputError(f"expected low < high between 0 and {rate / 2:g} Hz", field="band_Hz", value=band)
 
     def fitted(some: Sequence[Signals]) -> tuple[float, bool]:
-        x, left = _modal_start(Lines(some, rate, "position", band, None, settings))
-        return left, bool(x[0] > 0 and x[2] > 0)
+        x, residual = _modal_start(Lines(some, rate, "position", band, None, settings))
+        return residual, bool(x[0] > 0 and x[2] > 0)
     require_oriented(fitted, records, ("u", "y"), settings)
     lines = Lines(records, rate, "position", band, None, settings)
     start, _ = _modal_start(lines)
@@ -121,11 +122,12 @@ def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
     for _ in range(steps):
         x, _ = _least_squares([A, V, Q], F, weight)
         weight = 1 / np.maximum(np.abs(x[0] * s ** 2 + x[1] * s + x[2]), 1e-300)
-    left = (F - x[0] * A - x[1] * V - x[2] * Q) * weight
-    return x, float(np.linalg.norm(left) / np.linalg.norm(Q))
+    residual = (F - x[0] * A - x[1] * V - x[2] * Q) * weight
+    return x, float(np.linalg.norm(residual) / np.linalg.norm(Q))
 
 
-def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str], settings: AxisSettings) -> None:
+def require_oriented(fitted: Callable[[Sequence[Signals]], tuple[float, bool]], records: Sequence[Signals],
+                     names: tuple[str, str], settings: AxisSettings) -> None:
     """Refuse exchanged columns and a flipped sign; a mass must be positive. If the model fits with the sign of the
     input reversed, or with input and output exchanged, but not with the columns as given, the columns are wrong.
 
@@ -134,16 +136,16 @@ def require_oriented(fitted, records: Sequence[Signals], names: tuple[str, str],
     InputError : as above.
     """
     field = ", ".join(names)
-    left, positive = fitted(records)
-    if positive and left < settings.no_model:
+    residual, positive = fitted(records)
+    if positive and residual < settings.no_model:
         return
     turned, sensible = fitted([Signals(one.name, -one.force, one.position) for one in records])
     turned = turned if sensible else np.inf
     swapped, sensible = fitted([Signals(one.name, one.position, one.force) for one in records])
     swapped = swapped if sensible else np.inf
-    if swapped < min(turned, settings.no_model, settings.much_better * left):
-        raise InputError(f"the model leaves {100 * left:.3g} % of these columns and {100 * swapped:.2g} % with input "
-                         "and output exchanged: the columns look exchanged", field=field)
+    if swapped < min(turned, settings.no_model, settings.much_better * residual):
+        raise InputError(f"the model leaves {100 * residual:.3g} % of these columns and {100 * swapped:.2g} % with "
+                         "input and output exchanged: the columns look exchanged", field=field)
     if turned < settings.no_model:
         raise InputError("expected a positive mass: with the input's sign turned the model fits "
                          f"({100 * turned:.2g} % are left), so that the sign of one column looks flipped; give it a "

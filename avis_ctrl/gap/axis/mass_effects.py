@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from avis_ctrl.gap.axis.model import Effect, Parameter
-from avis_ctrl.gap.axis.records import Lines, Motion, Shape, bumps
+from avis_ctrl.gap.axis.records import Lines, Motion, Shape, splines
 
 SLOW = "slow motion at several constant speeds"
 SWEEP = "a sine swept slowly up and down at several levels"
@@ -36,6 +36,7 @@ class Scale:
 
     @staticmethod
     def of(lines: Lines, pitches: bool) -> Scale:
+        """Scales of the records; pitches : whether to search for spatial frequencies."""
         def most(value: Callable[[Motion], float]) -> float:
             return max(float(value(m)) for m in lines.motion)
         high = float(lines.s.imag.max()) / (2 * np.pi)
@@ -68,6 +69,14 @@ def _attached(s: np.ndarray, p: np.ndarray) -> np.ndarray:
     w = 2 * np.pi * p[1]
     inner = 2 * p[2] * w * s + w ** 2
     return p[0] * s ** 2 * inner / (s ** 2 + inner)
+
+
+def _coulomb(scale: Scale, title: str, separated_by: str, location: str) -> list[Effect]:
+    """Friction of constant size; rounded, for slow motion through rest, where no real friction jumps."""
+    friction = partial(_force, "coulomb_friction", title, separated_by, low=0.0, location=location, variable="velocity")
+    return [friction(("Fc", "{F}", lambda m: m.sign)),
+            friction(("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)), law="rounded",
+                     shaped_by=_shape("v_rounded", "{x}/s", scale.speed), seeds=_falling(scale.speed, 10)[1::2])]
 
 
 def _delay(s: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -146,28 +155,22 @@ def unnamed_forces(lines: Lines) -> list[Effect]:
 
 
 def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
-    table = bumps(knots, count)
+    table = splines(knots, count)
     return [np.interp(x, knots, one) for one in table]
 
 
 def drive_effects(scale: Scale) -> list[Effect]:
     """Library of effects for a drive."""
     at = partial(_force, location="drive")
-    friction = partial(at, "coulomb_friction", "Coulomb friction, a force of constant size against the motion", SLOW,
-                       low=0.0, variable="velocity")
-    rounded, creeping = _shape("v_rounded", "{x}/s", scale.speed), _falling(scale.speed, 10)[1::2]
     found = [
-        friction(("Fc", "{F}", lambda m: m.sign)),
-        # For slow motion through rest, where no real friction jumps.
-        friction(("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)), law="rounded",
-                 shaped_by=rounded, seeds=creeping),
+        *_coulomb(scale, "Coulomb friction, a force of constant size against the motion", SLOW, "drive"),
         at("force_offset", "a constant force (weight on an inclined axis, or an offset of the current sensor)",
            RELEASED, ("offset", "{F}", lambda m: np.ones_like(m.v))),
         at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
            ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2)),
         at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
            ("Fc_ahead_less_back", "{F}", lambda m, speed: np.abs(np.tanh(m.v / speed)) / 2), law="rounded",
-           shaped_by=rounded, seeds=creeping),
+           shaped_by=_shape("v_rounded", "{x}/s", scale.speed), seeds=_falling(scale.speed, 10)[1::2]),
         at("viscous_asymmetry", "viscous friction that differs between the two directions",
            "several constant speeds in each direction",
            ("Fv_ahead_less_back", "{F} s/{x}", lambda m: np.abs(m.v) / 2)),
@@ -227,9 +230,9 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
     step = lines.over * max(1, len(one.force) // 20_000)
     q, v = m.q[::step], m.v[::step]
     X = np.column_stack([np.ones_like(q), v, np.sign(v), np.gradient(v), q - m.middle])
-    left = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]
+    residual = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]
     tried = np.arange(2.0, 100.0, 0.25) / float(np.ptp(q))
-    power = np.array([abs(np.sum(left * np.exp(-2j * np.pi * n * q))) for n in tried])
+    power = np.array([abs(np.sum(residual * np.exp(-2j * np.pi * n * q))) for n in tried])
     peaks = [k for k in np.argsort(-power) if power[k] == power[max(k - 3, 0):k + 4].max()]
     return [float(tried[k]) for k in peaks[:few]]
 
@@ -250,11 +253,7 @@ def oscillator_effects(scale: Scale) -> list[Effect]:
            ("d2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v), low=0.0, variable="velocity"),
         at("cubic_damping", "cubic damping, a force d3 y'^3", DECAY, ("d3", "{F} s^3/{x}^3", lambda m: m.v ** 3),
            low=0.0, variable="velocity"),
-        at("coulomb_friction", "friction damping, a force of constant size against the motion", DECAY,
-           ("Fc", "{F}", lambda m: m.sign), low=0.0, variable="velocity"),
-        at("coulomb_friction", "friction damping, a force of constant size against the motion", DECAY,
-           ("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)), low=0.0, variable="velocity", law="rounded",
-           shaped_by=_shape("v_rounded", "{x}/s", scale.speed), seeds=_falling(scale.speed, 10)[1::2]),
+        *_coulomb(scale, "friction damping, a force of constant size against the motion", DECAY, "oscillator"),
         at("position_damping", "damping that grows with the square of the position, a force c y^2 y'", DECAY,
            ("c", "{F} s/{x}^3", lambda m: m.q ** 2 * m.v), low=0.0),
         drive("input_nonlinearity", "a drive whose gain changes with its level, u + g u^3", far,

@@ -72,18 +72,21 @@ class Effect:
 
     @property
     def label(self) -> str:
+        """Name, location and law."""
         return f"{self.name}@{self.location}" + (f"/{self.law}" if self.law else "")
 
     @property
     def key(self) -> str:
+        """Name and location."""
         return f"{self.name}@{self.location}"
 
-    def begins(self) -> list[np.ndarray]:
+    def initial_values(self) -> list[np.ndarray]:
+        """Initial values of fits; zero by default."""
         return [np.array(one) for one in self.seeds] or [np.zeros(len(self.parameters))]
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Prediction:
     """Predicted Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
 
     Y: np.ndarray
@@ -99,14 +102,16 @@ def split(values: np.ndarray, effects: Sequence[Effect], base: int) -> list[np.n
     return found
 
 
+def central_differences(function: Callable[[np.ndarray], np.ndarray], p: np.ndarray, steps: Sequence[float]
+                        ) -> list[np.ndarray]:
+    """Derivative of a function with respect to each of its parameters."""
+    return [(function(p + h) - function(p - h)) / (2 * h.sum()) for h in np.diag(steps)]
+
+
 def slopes(curve: Curve, s: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
-    """Derivatives of a curve with respect to each of its parameters, by central differences."""
-    found = []
-    for j in range(len(p)):
-        h = np.zeros(len(p))
-        h[j] = 1e-5 * abs(p[j]) or 1e-6 / float(np.max(np.abs(s)))
-        found.append((curve(s, p + h) - curve(s, p - h)) / (2 * h[j]))
-    return found
+    """Derivatives of a curve with respect to each of its parameters."""
+    steps = [1e-5 * abs(one) or 1e-6 / float(np.max(np.abs(s))) for one in p]
+    return central_differences(lambda x: curve(s, x), p, steps)
 
 
 def summed(parts: np.ndarray) -> np.ndarray:
@@ -125,15 +130,18 @@ class AxisModel:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of all parameters: those of the base model, then those of the effects."""
         return (*(name for name, _ in self.base), *(f"{p.name}@{one.label}" for one in self.effects
                                                     for p in one.parameters))
 
     @property
     def units(self) -> tuple[str, ...]:
+        """Units of all parameters."""
         return (*(unit for _, unit in self.base), *(p.unit for one in self.effects for p in one.parameters))
 
     @property
     def labels(self) -> tuple[str, ...]:
+        """Labels of the effects."""
         return tuple(one.label for one in self.effects)
 
     def of(self, effect: Effect) -> np.ndarray:
@@ -141,20 +149,24 @@ class AxisModel:
         return split(self.values, self.effects, len(self.base))[self.effects.index(effect)]
 
     def at(self, values: np.ndarray) -> AxisModel:
+        """The model with other values of its parameters."""
         if not np.all(np.isfinite(values)):
             raise InputError("expected finite values", field="values")
         return replace(self, values=np.asarray(values, float))
 
     def with_effect(self, one: Effect, values: np.ndarray) -> AxisModel:
+        """The model with one more effect, which comes last."""
         return replace(self, effects=(*self.effects, one), values=np.concatenate([self.values, values]))
 
     def without(self, label: str) -> AxisModel:
+        """The model without one of its effects."""
         parts = split(self.values, self.effects, len(self.base))
         kept = [k for k, one in enumerate(self.effects) if one.label != label]
         return replace(self, effects=tuple(self.effects[k] for k in kept),
                        values=np.concatenate([self.values[:len(self.base)], *(parts[k] for k in kept)]))
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
+        """Predicted outputs on the lines of a block, and their derivatives."""
         raise NotImplementedError
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
@@ -163,6 +175,7 @@ class AxisModel:
         return self.answer(block, None, False).Y
 
     def columns(self, block: SpectralBlock, derivative: bool = True) -> np.ndarray:
+        """(p, n, n_y, 1) derivatives of the prediction."""
         return self.answer(block, None, derivative).dY
 
 
@@ -181,7 +194,7 @@ class MassModel(AxisModel):
         return own, np.array([alpha + 1j * beta * block.omega for alpha, beta in (self.lines.linear_part(shape, by)
                                                                                   for shape in one.shapes)])
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         n, s, around = len(self.base), 1j * block.omega, self.lines.around(block.omega)
         A, V, Q, F = (self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q,
                                                                    self.lines.F))
@@ -201,7 +214,7 @@ class MassModel(AxisModel):
         D = -P[:, 1] if drive else Z
         Y = summed(F if drive else Q) + f / D
         if not derivative:
-            return Answer(Y[:, None, None], np.empty((0, len(s), 1, 1)))
+            return Prediction(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
             return -summed(column) / D - (0.0 if drive else f / D ** 2 * z)
@@ -219,7 +232,7 @@ class MassModel(AxisModel):
             if one.path:
                 dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
                 dY += [summed(slope * F) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
-        return Answer(Y[:, None, None], np.array(dY)[:, :, None, None])
+        return Prediction(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 
 def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:

@@ -13,7 +13,7 @@ correlation of 2/3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,12 +31,11 @@ from avis_ctrl.identification.weights import bands
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A record: force and position (n,), and the commanded position where known."""
+    """A record: force and position (n,)."""
 
     name: str
     force: np.ndarray
     position: np.ndarray
-    reference: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +51,7 @@ class Motion:
 
     @cached_property
     def sign(self) -> np.ndarray:
+        """(n,) sign of the velocity."""
         return np.sign(self.v)
 
     def dahl(self, distance: float) -> np.ndarray:
@@ -74,7 +74,7 @@ def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarra
     return at_all(X) + x[0] + slope * t, at_all(s * X) + slope * rate
 
 
-def bumps(x: np.ndarray, count: int) -> list[np.ndarray]:
+def splines(x: np.ndarray, count: int) -> list[np.ndarray]:
     """Quadratic B-splines over the quantiles of x, which represent a function of x of any shape."""
     inner = np.unique(np.quantile(x, np.linspace(0, 1, count - 1)))
     knots = np.r_[[inner[0]] * 2, inner, [inner[-1]] * 2]
@@ -133,9 +133,9 @@ class Lines:
         top = min(band_Hz[1], 0.45 * rate)
         self.over = max(2, int(np.ceil(2 * settings.oversampled * top / rate)))
         self.motion = [self._motion(one) for one in self.records]
-        self.kept: dict[tuple, tuple[Shape, list[np.ndarray]]] = {}
-        self.linear: dict[tuple, tuple[Shape, tuple[float, float]]] = {}
-        self.picked: dict[tuple, tuple[Sequence[np.ndarray], np.ndarray]] = {}
+        self.kept: dict[Hashable, tuple[Shape, list[np.ndarray]]] = {}
+        self.linear: dict[Hashable, tuple[Shape, tuple[float, float]]] = {}
+        self.picked: dict[Hashable, tuple[Sequence[np.ndarray], np.ndarray]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
                                   for order in range(3))

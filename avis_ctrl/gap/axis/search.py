@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from itertools import combinations
 
 import numpy as np
@@ -21,9 +22,12 @@ from avis_ctrl.gap.probability import larger_odds
 from avis_ctrl.gap.score import reduction
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, unseen
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
+from avis_ctrl.identification.priors import Priors
 from avis_ctrl.identification.single_axis.fit import not_below
 
 Progress = Callable[[str], None]
+# Log-likelihood by segment, octave, and whether the data were held out.
+Cells = dict[tuple[int, int, bool], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,19 +36,27 @@ class Candidate:
     their whitened directions (k, N), orthogonal to those of the current model."""
 
     effects: tuple[tuple[Effect, np.ndarray], ...]
-    fall: float
+    reduction: float
     directions: np.ndarray
 
 
 @dataclass(eq=False)
 class Explored:
-    """Fits by the set of their effects' labels, so that the order in which effects are found has no influence."""
+    """Fits by the set of their effects' labels, so that the order in which effects are found has no influence.
+
+    cells : `cells` of a fit, for the fitted or the held-out data; computed once.
+    """
 
     data: Data
     settings: AxisSettings
     fits: dict[frozenset[str], Fitted | None] = field(default_factory=dict)
+    cells: Callable[[Fitted, bool], Cells] = field(init=False)
 
-    def base(self, model: AxisModel, priors) -> Fitted:
+    def __post_init__(self) -> None:
+        self.cells = cache(partial(cells, settings=self.settings))
+
+    def base(self, model: AxisModel, priors: Priors) -> Fitted:
+        """The fit without effects."""
         found = fit(model, priors, priors.z(model.values), self.data, first_variances(self.data, self.settings),
                     self.settings)
         self.fits[frozenset()] = found
@@ -63,6 +75,7 @@ class Explored:
         return self.fits[labels]
 
     def without(self, now: Fitted, label: str) -> Fitted | None:
+        """The fit without one of its effects; None if it did not converge."""
         labels = frozenset(now.labels) - {label}
         if labels not in self.fits:
             model = now.model.without(label)
@@ -70,32 +83,48 @@ class Explored:
             self.fits[labels] = self._try(model, now.priors.of(model.names), now.z[rows], now)
         return self.fits[labels]
 
-    def _try(self, model: AxisModel, priors, z: np.ndarray, like: Fitted) -> Fitted | None:
+    def _try(self, model: AxisModel, priors: Priors, z: np.ndarray, like: Fitted) -> Fitted | None:
         try:
             with np.errstate(all="ignore"):
                 return fit(model, priors, z, self.data, like.variances, self.settings)
         except (AvisError, np.linalg.LinAlgError, FloatingPointError):
             return None
 
+    def held_out(self, one: Fitted) -> float:
+        """Log-likelihood of the held-out data."""
+        return sum(self.cells(one, True).values())
 
-def candidates(now: Fitted, data: Data, effects: Sequence[Effect], settings: AxisSettings) -> list[Candidate]:
+    def score(self, one: Fitted) -> float:
+        """Evidence of the fitted data plus log-likelihood of the held-out data."""
+        return one.log_evidence + self.held_out(one)
+
+    def odds_against(self, one: Fitted, other: Fitted) -> float:
+        """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out
+        data, or by how evenly their difference is spread over segments and octaves, whichever is larger: the residual
+        of a real record is not white noise."""
+        mine, theirs = self.cells(one, False), self.cells(other, False)
+        beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
+        return larger_odds(mine | self.cells(one, True), theirs | self.cells(other, True), beside)
+
+
+def candidates(now: Fitted, data: Data, effects: Sequence[Effect]) -> list[Candidate]:
     """Every effect that the model does not contain, at its best seed, the largest reduction first."""
     J, e = now.J, now.e
     Q = np.linalg.qr(J.T)[0]
-    left, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
+    residual, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
     for one in effects:
         if one.key in taken:
             continue
         best = None
-        for seed in one.begins():
+        for seed in one.initial_values():
             C = directions(now, data, one, seed)
             C = C - (C @ Q) @ Q.T
-            fall = reduction(C @ C.T, C @ left).chi2
-            if best is None or fall > best.fall:
-                best = Candidate(((one, seed),), fall, C)
+            reduced = reduction(C @ C.T, C @ residual).chi2
+            if best is None or reduced > best.reduction:
+                best = Candidate(((one, seed),), reduced, C)
         if best is not None:
             found.append(best)
-    return sorted(found, key=lambda c: -c.fall)
+    return sorted(found, key=lambda c: -c.reduction)
 
 
 def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.ndarray:
@@ -111,19 +140,19 @@ def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.nda
     return C[linear | (not linear.any())]
 
 
-def shortlist(found: Sequence[Candidate], left: np.ndarray, settings: AxisSettings) -> list[Candidate]:
+def shortlist(found: Sequence[Candidate], residual: np.ndarray, settings: AxisSettings) -> list[Candidate]:
     """The best single effects, and the best pairs whose joint reduction exceeds the sum of the single ones."""
-    singles = [c for c in found if c.fall > 2 * settings.certain]
+    singles = [c for c in found if c.reduction > 2 * settings.certain]
     one_law: dict[str, Candidate] = {}
     for c in found:
         one_law.setdefault(c.effects[0][0].key, c)
     pairs = []
     for a, b in combinations(one_law.values(), 2):
         C = np.vstack([a.directions, b.directions])
-        fall = reduction(C @ C.T, C @ left).chi2
-        if fall > a.fall + b.fall + 2 * settings.certain:
-            pairs.append(Candidate((*a.effects, *b.effects), fall, C))
-    pairs.sort(key=lambda c: -c.fall)
+        reduced = reduction(C @ C.T, C @ residual).chi2
+        if reduced > a.reduction + b.reduction + 2 * settings.certain:
+            pairs.append(Candidate((*a.effects, *b.effects), reduced, C))
+    pairs.sort(key=lambda c: -c.reduction)
     return [*singles[:settings.refits], *pairs[:settings.pairs]]
 
 
@@ -141,29 +170,20 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         progress(f"candidates beside {', '.join(now.labels) or 'the base model'}")
         tried = [now]
         if len(now.labels) < settings.longest:
-            for c in shortlist(candidates(now, explored.data, effects, settings), now.e, settings):
+            for c in shortlist(candidates(now, explored.data, effects), now.e, settings):
                 one = explored.with_effects(now, c.effects)
                 if one is not None and not at_an_edge(one):
                     tried.append(one)
-        best = max(tried, key=lambda one: score(one, settings) - (len(one.labels) - len(now.labels)) * price)
+        best = max(tried, key=lambda one: explored.score(one) - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
             best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
-        if best is now or score(best, settings) <= score(now, settings) or not borne_out(best, now, settings):
+        if best is now or explored.score(best) <= explored.score(now) or (
+                explored.held_out(best) <= explored.held_out(now)):
             revisions += 1
             best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
                 return best
         now = best
-
-
-def score(one: Fitted, settings: AxisSettings) -> float:
-    """Evidence of the fitted data plus log-likelihood of the held-out data."""
-    return one.log_evidence + sum(cells(one, True, settings).values())
-
-
-def borne_out(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
-    """Whether held-out data are more probable under one model than under another."""
-    return sum(cells(one, True, settings).values()) > sum(cells(other, True, settings).values())
 
 
 def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
@@ -174,24 +194,22 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
         if rest is None:
             continue
         laws = [one for one in effects if one.key == own.key]
-        found = candidates(rest, explored.data, laws if laws_only else effects, settings)
-        least = 0.5 * settings.not_far_behind * max(c.fall for c in found if c.effects[0][0].key == own.key)
+        found = candidates(rest, explored.data, laws if laws_only else effects)
+        least = 0.5 * settings.not_far_behind * max(c.reduction for c in found if c.effects[0][0].key == own.key)
         for c in found[:settings.starts + len(laws)]:
-            if c.fall < least:
+            if c.reduction < least:
                 break
             one = explored.with_effects(rest, c.effects)
-            if one is not None and not at_an_edge(one) and score(one, settings) > score(now,
-                                                                                        settings) + settings.settled:
+            if one is not None and not at_an_edge(one) and explored.score(one) > explored.score(now) + settings.settled:
                 now = one
     return now
 
 
 def _without_idle(now: Fitted, explored: Explored) -> Fitted:
-    settings = explored.settings
     while len(now.labels) > 1:
         rest = [one for label in now.labels if (one := explored.without(now, label)) is not None]
-        best = max(rest, key=lambda one: score(one, settings), default=None)
-        if best is None or score(best, settings) < score(now, settings) - settings.certain:
+        best = max(rest, key=explored.score, default=None)
+        if best is None or explored.score(best) < explored.score(now) - explored.settings.certain:
             return now
         now = best
     return now
@@ -212,7 +230,7 @@ def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitte
     """The best model with an additional unnamed function; None if the data do not support one."""
     settings, tried = explored.settings, []
     others = [one for one in effects if one.outside]
-    for c in candidates(now, explored.data, others, settings):
+    for c in candidates(now, explored.data, others):
         one = explored.with_effects(now, c.effects)
         if one is not None:
             tried.append(one)
@@ -238,38 +256,29 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
     if rest is None:
         return []
     own = next(one for one in best.model.effects if one.label == label)
-    found = candidates(rest, explored.data, [one for one in effects if not one.outside], settings)
+    found = candidates(rest, explored.data, [one for one in effects if not one.outside])
     mine = next((c for c in found if c.effects[0][0].label == label), None)
-    least = 0.5 * mine.fall if mine is not None else 0.0
+    least = 0.5 * mine.reduction if mine is not None else 0.0
     known: list[Rival] = []
     for c in found[:2 * settings.refits]:
         effect = c.effects[0][0]
-        if effect.key == own.key or c.fall < settings.not_far_behind * least:
+        if effect.key == own.key or c.reduction < settings.not_far_behind * least:
             continue
         one = explored.with_effects(rest, c.effects)
         if one is None or at_an_edge(one):
             continue
-        known.append(Rival(effect, one, odds_against_fit(best, one, settings), alike(best, one, settings)))
+        known.append(Rival(effect, one, explored.odds_against(best, one), alike(best, one, settings)))
     return sorted(known, key=lambda r: -r.odds)
 
 
 def alike(one: Fitted, other: Fitted, settings: AxisSettings) -> bool:
     """Whether two models predict the same within the data: if one were true, the log-likelihood of the other would be
     lower by less than `alike` [nats] on average."""
-    left = one.white.e - other.white.e
-    return bool(0.5 * left @ left < settings.alike)
+    residual = one.white.e - other.white.e
+    return bool(0.5 * residual @ residual < settings.alike)
 
 
-def odds_against_fit(one: Fitted, other: Fitted, settings: AxisSettings) -> float:
-    """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out data,
-    or by how evenly their difference is spread over segments and octaves, whichever is larger: the residual of a real
-    record is not white noise."""
-    mine, theirs = cells(one, False, settings), cells(other, False, settings)
-    beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
-    return larger_odds(mine | cells(one, True, settings), theirs | cells(other, True, settings), beside)
-
-
-def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int, int, bool], float]:
+def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> Cells:
     """Log-likelihood of the fitted data by segment and octave, or of the held-out data by segment. Each held-out
     segment may have a larger variance than the fitted data, so that a single disturbance decides nothing."""
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
@@ -281,8 +290,8 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> dict[tuple[int,
     places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
     count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))
     louder = np.maximum(e2 / count, 1.0) if held else np.ones(len(e2))
-    left = e2 / louder + count * np.log(louder)
-    return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (left + rest), strict=True)}
+    residual = e2 / louder + count * np.log(louder)
+    return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (residual + rest), strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,6 +305,7 @@ class Rows:
 
 
 def row_table(fitted: Fitted, data: Data) -> Rows:
+    """Frequency, segment, time and level of the residual of a fit to these data."""
     columns: list[list[np.ndarray]] = [[], [], [], []]
     for block, level in zip(data.blocks, data.levels, strict=True):
         segment, when = fitted.model.lines.of_lines(block.name)

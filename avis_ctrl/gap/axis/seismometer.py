@@ -11,15 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import Answer, AxisModel, Effect, Parameter, split
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, central_differences, split
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
+from avis_ctrl.identification.single_axis.identify import distinct, responses_of
 from avis_ctrl.identification.single_axis.seismometer import LARGEST_MODE_DAMPING, Responses, fit_seismometer, response
 from avis_ctrl.identification.single_axis.sine import SineRecord
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -73,17 +75,15 @@ class SensorModel(AxisModel):
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         return np.zeros((*block.Y.shape[:2], 1))  # an error that is constant over the band is a gain, which is free
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Answer:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         rows = self.lines.rows[block.name]
         Y = self._predicted(rows, self.values)
         if not derivative:
-            return Answer(Y[:, :, None], np.empty((0, *Y.shape, 1)))
-        low, dY = 1e-7 / float(self.lines.f[-1]), []
-        for k in range(len(self.values)):
-            h = np.zeros(len(self.values))
-            h[k] = max(1e-5 * abs(self.values[k]), low if k >= len(self.base) else 0.0)
-            dY.append((self._predicted(rows, self.values + h) - self._predicted(rows, self.values - h)) / (2 * h[k]))
-        return Answer(Y[:, :, None], np.array(dY)[..., None])
+            return Prediction(Y[:, :, None], np.empty((0, *Y.shape, 1)))
+        least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
+        dY = central_differences(partial(self._predicted, rows), self.values,
+                                 np.maximum(1e-5 * np.abs(self.values), least))
+        return Prediction(Y[:, :, None], np.array(dY)[..., None])
 
 
 def seismometer(responses: Responses, distortion: np.ndarray | None = None, ratio_variance: np.ndarray | None = None,
@@ -136,14 +136,16 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     units = dict(zip(start.names, start.information.units, strict=True))
     model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
     positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
-    notes = () if not np.any(h) else (
-        f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the mass itself "
-        "is nonlinear, which no effect of a channel holds.",)
+    notes = [f"The highest of the {len(f)} frequencies, {f[-1]:.4g} Hz, is not used: they are evaluated in pairs."
+             ] if n < len(f) else []
+    if np.any(h):
+        notes.append(f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the "
+                     "mass itself is nonlinear, which no effect of a channel holds.")
     outputs = " and ".join(names)
     power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
     return Problem("seismometer", model, positive, sensor_effects(f, names),
                    float(np.sum(measured_noise[rows["held out"]])) / power,
-                   {"F": "", "x": "", "input": "drive", "output": outputs}, notes=notes)
+                   {"F": "", "x": "", "input": "drive", "output": outputs}, notes=tuple(notes))
 
 
 HIGHER = "higher frequencies: the phase of a delay stays proportional to them, that of a pole bends"
@@ -197,19 +199,15 @@ def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str
     ------
     ComputationError : too few frequencies.
     """
-    used = [r for k, r in enumerate(records) if k == 0 or r.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+    used = distinct(records)
     if len(used) < SETTINGS.frequencies:
         raise ComputationError("too few sine records", measured=f"{len(used)} usable frequencies",
                                cause="records refused or columns mapped wrongly",
                                next_step=f"map the columns; give at least {SETTINGS.frequencies} frequencies")
-    pairs = {role: [record.ratio(role, driven) for record in used] for role in measured}
-    responses = Responses(np.array([record.frequency_Hz for record in used]),
-                          {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
-                          {role: np.array([v for _, v in pair]) for role, pair in pairs.items()})
     at = [used[0].channels.index(role) for role in measured]
     # Distortion in every channel is that of the motion; in one channel alone it is its own noise or hum.
-    seen = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
-    found: dict[str, Any] = {"responses": responses, "distortion": seen}
+    distortion = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])
+    found: dict[str, Any] = {"responses": responses_of(used, driven, measured), "distortion": distortion}
     if {"coil", "displacement"} <= set(measured):
         ratio = [record.ratio("displacement", "coil") for record in used]
         found["ratio_variance"] = np.array([v / abs(H) ** 2 for H, v in ratio])

@@ -40,11 +40,15 @@ def predicted(model: Mapping[str, Any], which: str, record: Signals, rate: float
     return _motion(own["base"], effects, record, rate, scale)
 
 
-def _filtered(x: np.ndarray, curve, rate: float) -> np.ndarray:
-    """Filter a signal by a response in s; its mirror image is appended to avoid a step from end to start."""
+def _lines(n: int, rate: float) -> np.ndarray:
+    """(n + 1,) j omega [rad/s] of the lines of n samples followed by their mirror image."""
+    return 2j * np.pi * np.fft.rfftfreq(2 * n, 1 / rate)
+
+
+def _filtered(x: np.ndarray, H: np.ndarray) -> np.ndarray:
+    """A signal (n,) after a filter with response H on `_lines`; the mirror image avoids a step from end to start."""
     n = len(x)
-    s = 2j * np.pi * np.fft.rfftfreq(2 * n, 1 / rate)
-    return np.fft.irfft(np.fft.rfft(np.r_[x, x[::-1]]) * curve(s), 2 * n)[:n]
+    return np.fft.irfft(np.fft.rfft(np.r_[x, x[::-1]]) * H, 2 * n)[:n]
 
 
 def _shaped(one: Effect, p: np.ndarray, motion: Motion) -> np.ndarray:
@@ -57,14 +61,15 @@ def _force(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray
            cutoff_Hz: float) -> np.ndarray:
     lines = Lines([record], rate, "force", (0.0, cutoff_Hz), cutoff_Hz, SETTINGS)
     motion, over = lines.motion[0], lines.over
+    s = _lines(len(motion.q), over * rate)
     found = base["M"] * np.gradient(motion.v, 1 / (over * rate)) + base["Fv"] * motion.v
     for one, p in effects:
         found = found + _shaped(one, p, motion)
         if one.dynamics:
-            found = found + _filtered(motion.q - motion.middle, lambda s, f=one.dynamics, p=p: f(s, p), over * rate)
+            found = found + _filtered(motion.q - motion.middle, one.dynamics(s, p))
     for one, p in effects:
         if one.path:
-            found = _filtered(found, lambda s, f=one.path, p=p: 1 / f(s, p), over * rate)
+            found = _filtered(found, 1 / one.path(s, p))
     low = signal.butter(4, 2 * cutoff_Hz / (over * rate), output="sos")
     return signal.sosfiltfilt(low, found)[::over]
 
@@ -77,7 +82,7 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
         if one.location == "input" and one.shapes:
             u = u - _shaped(one, p, Motion(0 * u, 0 * u, record.force, 0.0, 1.0, 1.0))
         if one.path:
-            u = _filtered(u, lambda s, f=one.path, p=p: f(s, p), rate)
+            u = _filtered(u, one.path(_lines(len(u), rate), p))
     fine = signal.resample_poly(np.r_[u, u[-1], u[-1]], 2 * over, 1, window=("kaiser", 8.0), padtype="line")
     reach, speed = 4 * scale.reach, 4 * max(scale.speed, 1e-300)
     q, v = np.meshgrid(*(np.linspace(-end, end, SETTINGS.table) for end in (reach, speed)), indexing="ij")
@@ -100,7 +105,9 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
 
 
 @numba.njit(cache=True)
-def _integrated(u, over, n, h, m, d, k, table, reach, speed, slip, sprung, start):  # pragma: no cover
+def _integrated(u: np.ndarray, over: int, n: int, h: float, m: float, d: float, k: float, table: np.ndarray,
+                reach: float, speed: float, slip: np.ndarray, sprung: np.ndarray, start: np.ndarray
+                ) -> np.ndarray:  # pragma: no cover
     x = np.zeros(5)  # q, v, displacement and velocity of the sprung mass, state of the friction
     x[0], x[1], x[2], x[3] = start[0], start[1], start[0], start[1]
     found = np.empty(n)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
-from avis_ctrl.gap.effects.line_of_action import best_direction, foot, told
+from avis_ctrl.gap.effects.line_of_action import along, best_direction, foot, reported_line
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.effects.sensors import second_order, sprung
 from avis_ctrl.gap.operators import Operators
@@ -49,10 +49,10 @@ class AttachedOscillator(AtPoint):
         variant = place.partition("/")[2]
         if variant == "oblique":
             most = float(np.sqrt(mass))
-            along = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
-                                     -most, most, 0.1 * most) for axis in "xyz"]
+            root = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
+                                    -most, most, 0.1 * most) for axis in "xyz"]
             # The position along the line of action has no effect, so it may end at a bound.
-            return (*along, frequency, damping, *(replace(one, optional=True) for one in self.position()))
+            return (*root, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant in THREE_AXES:
             each = [replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
                     for axis in "xyz"]
@@ -72,14 +72,14 @@ class AttachedOscillator(AtPoint):
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Seeds over frequencies, damping ratios, places and directions; the mass follows from the score test. Turned
-        axes start from axes along x, y and z (`richer`)."""
+        axes start from axes along x, y and z (`extended_models`)."""
         if place.endswith("turned"):
             return []
         parameters = self.parameters(score.model, place)
         found = _along_three_axes(score, parameters) if place.endswith("axes") else _along_one(score, parameters)
         return sorted(found, key=lambda seed: -seed.chi2)
 
-    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+    def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """From a fit along one direction: three axes, of which the nearest keeps its frequency; along the others, a
         resonance is searched at each frequency, anywhere on the line of action. From three axes: turned ones."""
         if one.place.endswith("axes"):
@@ -87,7 +87,7 @@ class AttachedOscillator(AtPoint):
         if not one.place.endswith("oblique"):
             return []
         values = one.by_name
-        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
+        a = along(values)
         mass, first = float(a @ a), int(np.argmax(np.abs(a)))
         parameters = self.parameters(score.model, "payload/axes")
         # A resonance with damping ratio zeta has a relative width of 2 zeta, so a step of zeta misses none.
@@ -98,9 +98,9 @@ class AttachedOscillator(AtPoint):
         points = place_of(values) + np.outer(np.linspace(-LIBRARY.reach_m, LIBRARY.reach_m, 25), a / np.sqrt(mass))
         pair, point = _along_the_others(score, values["damping"], frequencies, points,
                                         "".join("xyz"[k] for k in others))
-        along = np.full(3, values["frequency_Hz"])
-        along[others] = pair
-        return [("payload/axes", tuple(map(float, (mass, *along, values["damping"], *point))))]
+        frequency = np.full(3, values["frequency_Hz"])
+        frequency[others] = pair
+        return [("payload/axes", tuple(map(float, (mass, *frequency, values["damping"], *point))))]
 
     def implausible(self, values: Values, std: Values) -> str:
         names = [name for name in values if name.startswith("along_")] or ["mass_kg"]
@@ -114,10 +114,9 @@ class AttachedOscillator(AtPoint):
         """For one direction: mass, direction, and the point on the line of action nearest to the geometric centre,
         because the position along that line has no effect."""
         found = super().reported(model, place, values, covariance)
-        a = np.array([values.get(f"along_{axis}", 0.0) for axis in "xyz"])
-        if not np.any(a):
+        if not np.any(along(values)):
             return found
-        line = told(values, covariance, "mass_kg", "kg")
+        line = reported_line(values, covariance, "mass_kg", "kg")
         return {"mass_kg": line.pop("mass_kg"), "frequency_Hz": found["frequency_Hz"], "damping": found["damping"],
                 **line}
 
@@ -126,7 +125,7 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
     """(row over q (6,), mass, frequency [Hz]) for each direction in which the mass can move."""
     variant, rows = place.partition("/")[2], point_map(place_of(values))
     if variant == "oblique":
-        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
+        a = along(values)
         mass = float(a @ a)
         return [(a / np.sqrt(mass) @ rows, mass, values["frequency_Hz"])] if mass > 0 else []
     if variant == "turned":
@@ -139,13 +138,13 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
     """Best place and direction at each frequency of the grid and each peak of the residual, refined near the best."""
     every = positions(parameters)
-    most, looks = parameters[0].high, len(parameters[3].grid) * len(SETTINGS.dampings)
+    most, trials = parameters[0].high, len(parameters[3].grid) * len(SETTINGS.dampings)
 
     def at(f: float, zeta: float, points: np.ndarray = every) -> Seed | None:
         G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
         chi2, k, d, mass = best_direction(G, b, points)
         a = min(np.sqrt(max(mass, 0.0)), 0.7 * most) * d
-        return Seed((*a, f, zeta, *points[k]), chi2, 7, looks) if mass > 0 else None
+        return Seed((*a, f, zeta, *points[k]), chi2, 7, trials) if mass > 0 else None
 
     grid = parameters[3].grid
     found = [seed for f in grid for zeta in SETTINGS.dampings if (seed := at(f, zeta))]
@@ -197,9 +196,9 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
         one, other, both = np.diag(H[0, :, 0])[:, None], np.diag(H[1, :, 1]), H[0, :, 1]
         size = one * other - both ** 2
         masses = np.array([other * g[0][:, None] - both * g[1], one * g[1] - both * g[0][:, None]]) / size
-        fall = np.where(np.all(masses > 0, axis=0), masses[0] * g[0][:, None] + masses[1] * g[1], 0.0)
-        k, j = np.unravel_index(int(np.argmax(fall)), fall.shape)
-        best = max(best, (float(fall[k, j]), (int(k), int(j)), point), key=lambda found: found[0])
+        reduced = np.where(np.all(masses > 0, axis=0), masses[0] * g[0][:, None] + masses[1] * g[1], 0.0)
+        k, j = np.unravel_index(int(np.argmax(reduced)), reduced.shape)
+        best = max(best, (float(reduced[k, j]), (int(k), int(j)), point), key=lambda found: found[0])
     return (frequencies[best[1][0]], frequencies[best[1][1]]), best[2]
 
 

@@ -161,6 +161,7 @@ class Effect(ABC):
     name : as in the contract. title : in words, for a sentence. looks_like : its signature in the responses.
     at : where it can act, if its `places` do not depend on the table.
     nonlinear : depends on amplitude or time; acts through `volts`, `force` or `reading`.
+    time_varying : a nonlinear effect that depends on time alone: at any level it is the same fraction of the response.
     strength : parameter to which `force` is proportional; empty if there is none.
     holds_states : has states of its own; their values at the ends of a record are estimated with its transient.
     resonant : adds resonances with many parameters, which a mode of any shape describes approximately.
@@ -172,6 +173,7 @@ class Effect(ABC):
     looks_like: str
     at: tuple[str, ...] = ()
     nonlinear: bool = False
+    time_varying: bool = False
     strength: str = ""
     holds_states: bool = False
     resonant: bool = False
@@ -205,7 +207,7 @@ class Effect(ABC):
         """(samples, n_y) acceleration along the sensors, added to that of the payload; None for none."""
         return None
 
-    def said(self, place: str, values: Values) -> str:
+    def described(self, place: str, values: Values) -> str:
         """Description with its place, for a sentence."""
         return f"{self.title} ({place})"
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
 from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
-from avis_ctrl.gap.effects.line_of_action import best_direction, told
+from avis_ctrl.gap.effects.line_of_action import along, best_direction, reported_line
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Score, reduction
@@ -70,7 +70,7 @@ class CableStiffness(AtPoint):
         preceded by the largest."""
         found = super().reported(model, place, values, covariance)
         if "along_x" in values:
-            return {**told(values, covariance, "stiffness_N_per_m", "N/m"), "damping_s": found["damping_s"]}
+            return {**reported_line(values, covariance, "stiffness_N_per_m", "N/m"), "damping_s": found["damping_s"]}
         largest = max((found[f"k_{axis}_N_per_m"] for axis in "xyz"), key=lambda one: one.value)
         return {"stiffness_N_per_m": largest, **found}
 
@@ -94,6 +94,5 @@ def _along_axes(G: np.ndarray, b: np.ndarray, points: np.ndarray, most: float) -
 def tie(values: Values) -> np.ndarray:
     """(3, 3) stiffness of a cable [N/m] from its values by name."""
     if "along_x" in values:
-        a = np.array([values[f"along_{axis}"] for axis in "xyz"])
-        return np.outer(a, a)
+        return np.outer(along(values), along(values))
     return np.diag([values[f"k_{axis}_N_per_m"] for axis in "xyz"])

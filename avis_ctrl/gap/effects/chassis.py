@@ -25,7 +25,7 @@ from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import point_map
 
-WAYS = ("x", "y", "z", "rx", "ry", "rz")
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 # Coordinates that the low centre of mass of a frame couples, so that one can compensate for the other.
 TOGETHER = (("x", "ry"), ("y", "rx"), ("z",), ("rz",))
 
@@ -63,7 +63,7 @@ class ChassisSettings:
     converged : chi-square per degree of freedom up to which the fits with relative weights have reached the minimum.
     promising : fraction of the gap that may remain after a start or a step for it to be continued.
     followed : fraction of the gap up to which a fit is refined one coordinate after the other.
-    followed_fits : number of fits refined in this way, the best first.
+    followed_fits : number of fits refined in this coordinate, the best first.
     negligible : fraction of the gap below which relative weights have nothing more to explain.
     explained : chi-square per degree of freedom below which the measured noise explains the residual.
     elsewhere : other frequencies of a coordinate, over the median of all coordinates [1].
@@ -120,16 +120,16 @@ class BaseCompliance(OfMounts):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         m = model.rig.mounted_body().mass
 
-        def frequency(way: str) -> EffectParameter:
-            about = f"along {way}" if len(way) == 1 else f"about {way[1]}"
-            return EffectParameter(f"{way}_Hz", "Hz", f"of the chassis on its base, {about}", 0.0, 1.0, 300.0, 10.0,
-                                   False, (20.0,), True)
+        def frequency(coordinate: str) -> EffectParameter:
+            about = f"along {coordinate}" if len(coordinate) == 1 else f"about {coordinate[1]}"
+            return EffectParameter(f"{coordinate}_Hz", "Hz", f"of the chassis on its base, {about}", 0.0, 1.0, 300.0,
+                                   10.0, False, (20.0,), True)
         found = (EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 400 * m, m, False, (2 * m,)),
                  EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True),
-                 *(frequency(way) for way in WAYS[:3]))
+                 *(frequency(coordinate) for coordinate in COORDINATES[:3]))
         if place.endswith("translation"):
             return found
-        return (*found, *(frequency(way) for way in WAYS[3:]),
+        return (*found, *(frequency(coordinate) for coordinate in COORDINATES[3:]),
                 *(EffectParameter(f"gyration_{axis}_m", "m", f"radius of gyration about {axis}", 0.0, 0.03, 5.0, 0.3,
                                   False, (0.5,), True) for axis in "xyz"),
                 EffectParameter("centre_z_m", "m", "height of its mass over the table's centre", 0.0, -3.0, 1.0, 0.3,
@@ -170,10 +170,10 @@ class BaseCompliance(OfMounts):
         # The frequency of each coordinate was chosen from a grid: any combination could have been the best.
         values = _effect(reached).values
         found = Seed(values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2, len(values),
-                     SETTINGS.own_Hz[2] ** len(_ways(place)), few - reached.chi2)
+                     SETTINGS.own_Hz[2] ** len(_coordinates(place)), few - reached.chi2)
         return [found] if found.chi2 > 0 else own
 
-    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+    def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """The same law with other frequencies of coupled coordinates."""
         blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
         rest = score.model.without(one.label)
@@ -181,7 +181,7 @@ class BaseCompliance(OfMounts):
         if here.chi2 < SETTINGS.explained * here.dof:
             return []
         found = self._best_elsewhere(rest, one, blocks)[:SETTINGS.followed_groups]
-        return [(one.place, values) for left, values in found if left < np.inf]
+        return [(one.place, values) for chi2, values in found if chi2 < np.inf]
 
     def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
                   weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit[TableModel] | None:
@@ -192,8 +192,8 @@ class BaseCompliance(OfMounts):
         # Relative weights are not noise: all of chi-square counts as the gap.
         noise = 0 if later else start.dof
         gap = start.chi2 - noise
-        alike = [values for left, values in (self._alike(model, place, first) if wide else [])
-                 if left - noise < SETTINGS.promising * gap or not later]
+        alike = [values for chi2, values in (self._alike(model, place, first) if wide else [])
+                 if chi2 - noise < SETTINGS.promising * gap or not later]
         trials = [self._standing(model, place, values) for values in [*starts, *alike]]
         made: list[LikelihoodFit[TableModel]] = []
         for most, iterations in SETTINGS.tried_by_fractions if later else SETTINGS.tried:
@@ -213,9 +213,9 @@ class BaseCompliance(OfMounts):
                ) -> list[tuple[float, tuple[float, ...]]]:
         """(expected chi-square, values) of starts with one frequency for all coordinates, the best first."""
         payload = model.rig.mounted_body().mass
-        ways = _ways(place)
-        shape = SETTINGS.alike_shape if len(ways) > 3 else ()
-        starts = [(SETTINGS.alike_mass * payload, 0.05, *[f] * len(ways), *shape)
+        coordinates = _coordinates(place)
+        shape = SETTINGS.alike_shape if len(coordinates) > 3 else ()
+        starts = [(SETTINGS.alike_mass * payload, 0.05, *[f] * len(coordinates), *shape)
                   for f in np.geomspace(*SETTINGS.alike_Hz).tolist()]
         expected = [(self._expected(model, place, values, blocks), values) for values in starts]
         return sorted(one for one in expected if one[0] < np.inf)
@@ -229,8 +229,8 @@ class BaseCompliance(OfMounts):
                 return reached
             now = _effect(reached)
             rest = reached.model.without(now.label)
-            left, values = self._best_elsewhere(rest, now, blocks)[0]
-            if left - noise > SETTINGS.promising * (reached.chi2 - noise):
+            chi2, values = self._best_elsewhere(rest, now, blocks)[0]
+            if chi2 - noise > SETTINGS.promising * (reached.chi2 - noise):
                 return reached
             made = _short_fit(self._standing(rest, place, values), blocks, SETTINGS.later_iterations)
             if made is None or made.chi2 - noise > SETTINGS.promising * (reached.chi2 - noise):
@@ -259,37 +259,40 @@ class BaseCompliance(OfMounts):
 
     def _by_coordinate(self, score: Score, place: str) -> list[Seed]:
         """Seeds from the best resonance of each coordinate by itself; the masses are estimated together."""
-        ways = _ways(place)
+        coordinates = _coordinates(place)
         zeta, grid = SETTINGS.first_damping, np.geomspace(*SETTINGS.own_Hz)
         rows, labels = [], []
         for f in grid:
             key = ("recoil", float(f))
             if key not in score.kept:
                 score.kept[key] = recoils(score, partial(receptance, frequency_Hz=f, damping=zeta))
-            rows.append(score.kept[key][:len(ways)])
-            labels += [(way, float(f)) for way in ways]
+            rows.append(score.kept[key][:len(coordinates)])
+            labels += [(coordinate, float(f)) for coordinate in coordinates]
         A = np.concatenate(rows)
-        gram, fall = A @ A.T, A @ score.e
-        best = _greedy(gram, fall, labels)
-        moving = [way for way in best if len(way) == 1]
+        gram, product = A @ A.T, A @ score.e
+        best = _greedy(gram, product, labels)
+        moving = [coordinate for coordinate in best if len(coordinate) == 1]
         if not moving:
             return []
-        chosen = [labels.index((way, f)) for way, f in best.items()]
-        took = reduction(gram[np.ix_(chosen, chosen)], fall[chosen])
+        chosen = [labels.index((coordinate, f)) for coordinate, f in best.items()]
+        took = reduction(gram[np.ix_(chosen, chosen)], product[chosen])
         inverse = dict(zip(best, took.coefficients, strict=True))
         # The first coordinate found determines the mass best; one with a different mass is not a recoil of the chassis.
         leader = inverse[moving[0]]
         if leader <= 0:
             return []
         ratio = SETTINGS.mass_ratio
-        best = {way: f for way, f in best.items() if len(way) > 1 or leader / ratio < inverse[way] < ratio * leader}
+        best = {coordinate: f for coordinate, f in best.items()
+                if len(coordinate) > 1 or leader / ratio < inverse[coordinate] < ratio * leader}
         mass = self.parameters(score.model, place)[0]
         m = float(np.clip(1 / leader, 2 * mass.low, mass.high / 2))
-        at = {way: best.get(way, SETTINGS.stiff_Hz) for way in ways}
-        values = [m, zeta, *(at[way] for way in ways[:3])]
-        if len(ways) > 3:
-            radii = [np.sqrt(1 / (inverse[way] * m)) if inverse.get(way, 0.0) > 0 else 0.6 for way in ways[3:]]
-            values += [*(at[way] for way in ways[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3, 0.0]
+        at = {coordinate: best.get(coordinate, SETTINGS.stiff_Hz) for coordinate in coordinates}
+        values = [m, zeta, *(at[coordinate] for coordinate in coordinates[:3])]
+        if len(coordinates) > 3:
+            radii = [np.sqrt(1 / (inverse[coordinate] * m)) if inverse.get(coordinate, 0.0) > 0 else 0.6
+                     for coordinate in coordinates[3:]]
+            values += [*(at[coordinate] for coordinate in coordinates[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3,
+                       0.0]
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
     def implausible(self, values: Values, std: Values) -> str:
@@ -311,9 +314,9 @@ class BaseCompliance(OfMounts):
         ops.recoil, ops.follow = B, H
 
 
-def _ways(place: str) -> tuple[str, ...]:
+def _coordinates(place: str) -> tuple[str, ...]:
     """Coordinates in which a chassis moves."""
-    return WAYS[:3] if place.endswith("translation") else WAYS
+    return COORDINATES[:3] if place.endswith("translation") else COORDINATES
 
 
 def of_chassis(values: Values) -> np.ndarray:
@@ -321,7 +324,7 @@ def of_chassis(values: Values) -> np.ndarray:
     centre; zero in the coordinates in which it does not move."""
     radii = [1.0, 1.0, 1.0, *(values.get(f"gyration_{axis}_m", 0.0) for axis in "xyz")]
     inertia = values["mass_kg"] * np.square(radii)
-    w = 2 * np.pi * np.array([values.get(f"{way}_Hz", 0.0) for way in WAYS])
+    w = 2 * np.pi * np.array([values.get(f"{coordinate}_Hz", 0.0) for coordinate in COORDINATES])
     found = np.zeros((3, 6, 6))
     centre = np.array([0.0, 0.0, values.get("centre_z_m", 0.0)])
     G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values.get("base_z_m", 0.0)]))
@@ -343,23 +346,23 @@ def _elsewhere(one: ActiveEffect) -> list[list[tuple[float, ...]]]:
     """Values of a chassis with other frequencies, relative to the median of all coordinates; one list for each group of
     coupled coordinates."""
     names = [parameter.name for parameter in one.parameters]
-    free = [way for way in WAYS if f"{way}_Hz" in names]
-    middle = np.median([one.by_name[f"{way}_Hz"] for way in free])
+    free = [coordinate for coordinate in COORDINATES if f"{coordinate}_Hz" in names]
+    middle = np.median([one.by_name[f"{coordinate}_Hz"] for coordinate in free])
 
-    def moved(ways: Sequence[str], factors: Sequence[float | None]) -> tuple[float, ...]:
+    def moved(coordinates: Sequence[str], factors: Sequence[float | None]) -> tuple[float, ...]:
         values = list(one.values)
-        for way, factor in zip(ways, factors, strict=True):
+        for coordinate, factor in zip(coordinates, factors, strict=True):
             if factor is None:
                 continue
-            k = names.index(f"{way}_Hz")
+            k = names.index(f"{coordinate}_Hz")
             values[k] = float(min(factor * middle, 0.9 * one.parameters[k].high))
-            if len(way) > 1:
-                values[names.index(f"gyration_{way[1]}_m")] = SETTINGS.alike_shape[0]
+            if len(coordinate) > 1:
+                values[names.index(f"gyration_{coordinate[1]}_m")] = SETTINGS.alike_shape[0]
         return tuple(values)
-    groups = [[way for way in together if way in free] for together in TOGETHER]
+    groups = [[coordinate for coordinate in together if coordinate in free] for together in TOGETHER]
     # The frequency of one of two coordinates may be right.
-    return [[moved(ways, factors) for factors in product((None, *SETTINGS.elsewhere), repeat=len(ways)) if any(factors)]
-            for ways in groups if ways]
+    return [[moved(coordinates, factors) for factors in product((None, *SETTINGS.elsewhere), repeat=len(coordinates))
+             if any(factors)] for coordinates in groups if coordinates]
 
 
 def _effect(found: LikelihoodFit[TableModel]) -> ActiveEffect:
@@ -373,7 +376,7 @@ def _short_fit(model: TableModel, blocks: Sequence[SpectralBlock], iterations: i
         return None
 
 
-def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]]) -> dict[str, float]:
+def _greedy(gram: np.ndarray, product: np.ndarray, labels: list[tuple[str, float]]) -> dict[str, float]:
     """Greedy selection of coordinates and their frequencies; each adds the largest reduction to the previous ones.
 
     A coordinate that adds little, or would need a negative mass, counts as stiff.
@@ -381,12 +384,12 @@ def _greedy(gram: np.ndarray, fall: np.ndarray, labels: list[tuple[str, float]])
     best: dict[str, float] = {}
     took = 0.0
     while True:
-        rows = [labels.index((way, f)) for way, f in best.items()]
+        rows = [labels.index((coordinate, f)) for coordinate, f in best.items()]
         trials = []
-        for k, (way, _) in enumerate(labels):
-            if way not in best:
+        for k, (coordinate, _) in enumerate(labels):
+            if coordinate not in best:
                 own = [*rows, k]
-                one = reduction(gram[np.ix_(own, own)], fall[own])
+                one = reduction(gram[np.ix_(own, own)], product[own])
                 if np.all(one.coefficients > 0):
                     trials.append((one.chi2, k))
         if not trials or max(trials)[0] < SETTINGS.least_gain * took:

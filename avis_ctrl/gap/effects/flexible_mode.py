@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -75,10 +76,10 @@ class PayloadFlexibleMode(Effect):
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Residues over all paths at the frequencies that reduce chi-square most; the shape is their symmetric part of
-        rank one. Further modes start from the fitted ones (`richer`)."""
+        rank one. Further modes start from the fitted ones (`extended_models`)."""
         return _one_mode(score, ()) if COUNTS[place.partition("/")[2]] == 1 else []
 
-    def richer(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
+    def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """Add one mode where the residual of the fitted ones is largest."""
         more = {count: place for place in self.places(score.model) for count in [COUNTS[place.partition("/")[2]]]}
         place = more.get(COUNTS[one.place.partition("/")[2]] + 1)
@@ -105,7 +106,7 @@ def shape_points(model: Table) -> bool:
     return find is not None and all(find(name) for name in (*model.actuators, *model.sensors.names))
 
 
-def shape_rows(rig, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def shape_rows(rig: Any, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """(n_u, n_g) and (n_y, n_g): mount and axis of each motor and of each sensor, with its sign."""
     return _shape_rows(tuple(map(rig.nearest_mount, actuators)), tuple(map(rig.nearest_mount, sensors)),
                        mount_geometry(rig).names)
@@ -123,24 +124,24 @@ def _shape_rows(actuators: tuple[tuple[str, float], ...], sensors: tuple[tuple[s
 
 def resonance(score: Score) -> float:
     """Reduction of chi-square by one mode with free residues on every path."""
-    return max(reduction(G, b).chi2 for G, b in _looks(score)[1])
+    return max(reduction(G, b).chi2 for G, b in _searched_modes(score)[1])
 
 
-def _looks(score: Score) -> tuple[list[tuple[float, float]], list[tuple[np.ndarray, np.ndarray]]]:
+def _searched_modes(score: Score) -> tuple[list[tuple[float, float]], list[tuple[np.ndarray, np.ndarray]]]:
     """Frequency and damping ratio of every mode searched, with the Gram matrix of its paths and their product with the
     residual."""
-    if "looks" not in score.kept:
+    if "trials" not in score.kept:
         frequencies = np.geomspace(*SETTINGS.mode_Hz).tolist()
         tried = [(f, 0.02) for f in frequencies]
         tried += [(f, zeta) for f in peaks(score) if f > frequencies[0] for zeta in (0.005, 0.02)]
         kept = [paths(score, partial(receptance, frequency_Hz=f, damping=zeta)) for f, zeta in tried]
-        score.kept["looks"] = tried, [(A @ A.T, A @ score.e) for A in kept]
-    return score.kept["looks"]
+        score.kept["trials"] = tried, [(A @ A.T, A @ score.e) for A in kept]
+    return score.kept["trials"]
 
 
 def _one_mode(score: Score, beside: Sequence[float]) -> list[Seed]:
     """Single modes away from the given frequencies [Hz], the best first."""
-    at, products = _looks(score)
+    at, products = _searched_modes(score)
     found = []
     for (f, zeta), (G, b) in zip(at, products, strict=True):
         if all(abs(np.log(f / other)) > SETTINGS.modes_apart for other in beside):
@@ -150,7 +151,7 @@ def _one_mode(score: Score, beside: Sequence[float]) -> list[Seed]:
     return sorted(found, key=lambda seed: -seed.chi2)
 
 
-def _seed(model: TableModel, f: float, zeta: float, residues: np.ndarray, chi2: float, looks: int) -> Seed | None:
+def _seed(model: TableModel, f: float, zeta: float, residues: np.ndarray, chi2: float, trials: int) -> Seed | None:
     """Seed of a mode from residues (n_y n_u,); None if their sign allows no real shape."""
     at_actuators, at_sensors = shape_rows(model.rig, model.actuators, model.sensors.names)
     # Q = a_s a_u^T with both from one shape; its size is that of the best rank-one approximation.
@@ -161,4 +162,4 @@ def _seed(model: TableModel, f: float, zeta: float, residues: np.ndarray, chi2: 
         return None
     values = f, zeta, *(shape * np.sqrt(sigma[0] * sign / size))
     share = sigma[0] ** 2 / float(np.sum(sigma ** 2))
-    return Seed(tuple(float(v) for v in values), chi2 * float(share), len(residues), looks)
+    return Seed(tuple(float(v) for v in values), chi2 * float(share), len(residues), trials)

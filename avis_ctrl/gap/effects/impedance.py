@@ -90,9 +90,9 @@ def peaks(score: Score) -> tuple[float, ...]:
     step = np.floor(np.log(f) / SETTINGS.peak_step).astype(int)
     step -= step.min()
     count = np.bincount(step)
-    seen = count > 0
-    mean = np.bincount(step, P)[seen] / count[seen]
-    centre = np.exp(np.bincount(step, P * np.log(f))[seen] / np.maximum(np.bincount(step, P)[seen], 1e-300))
+    occupied = count > 0
+    mean = np.bincount(step, P)[occupied] / count[occupied]
+    centre = np.exp(np.bincount(step, P * np.log(f))[occupied] / np.maximum(np.bincount(step, P)[occupied], 1e-300))
     about = np.array([np.median(mean[max(k - reach, 0):k + reach + 1]) for k in range(len(mean))])
     found: list[float] = []
     for k in np.argsort(-mean / about):
@@ -110,8 +110,8 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
         made, response = part.made, part.response
         through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
         amount = part.s ** 2 * (made.M @ response.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
-        seen = response.left[:, :, :6] @ through
-        columns.append(-np.moveaxis(seen[:, :, :, None] * amount[:, None], 2, 0))
+        measured = response.left[:, :, :6] @ through
+        columns.append(-np.moveaxis(measured[:, :, :, None] * amount[:, None], 2, 0))
     return score.directions(columns)
 
 
@@ -122,9 +122,9 @@ def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.nd
         ops, response = part.made.ops, part.response
         force = np.linalg.norm(ops.base.matrices.T[:3], axis=0)[:, None] * response.volts
         n_y, n_u = len(ops.base.sensors.names), force.shape[1]
-        seen = (response.gain * response.sense)[:, :, 0] * receptance(part.s[:, 0, 0])[:, None]
+        measured = (response.gain * response.sense)[:, :, 0] * receptance(part.s[:, 0, 0])[:, None]
         out = np.zeros((n_y, n_u, *response.Y.shape), complex)
         for i in range(n_y):
-            out[i, :, :, i] = seen[:, i, None] * np.moveaxis(force, 1, 0)
+            out[i, :, :, i] = measured[:, i, None] * np.moveaxis(force, 1, 0)
         columns.append(out.reshape(n_y * n_u, *response.Y.shape))
     return score.directions(columns)

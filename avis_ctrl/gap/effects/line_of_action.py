@@ -40,7 +40,12 @@ def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[fl
     return float(chi2[k, v]), int(k), every[v], float(mass[k, v])
 
 
-def told(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
+def along(values: Values) -> np.ndarray:
+    """(3,) a = d sqrt(size); zero for an effect without this parameter."""
+    return np.array([values.get(f"along_{axis}", 0.0) for axis in "xyz"])
+
+
+def reported_line(values: Values, covariance: np.ndarray, size: str, unit: str) -> dict[str, Reported]:
     """Size, direction and foot of the line of action from the values along_x .. and x_m .., to first order."""
     names = list(values)
     first, last = names.index("along_x"), names.index("x_m")

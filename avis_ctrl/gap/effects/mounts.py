@@ -289,6 +289,7 @@ def largest_rms(model: Table) -> float:
 
 
 def median_rms(model: Table) -> float:
+    """Median over the records of the median r.m.s. deflection of the mounts [m]; 10 micrometres if none is known."""
     found = [float(np.median(one.rms_deflections)) for one in model.motion.values()]
     return float(np.median(found)) if found else 1e-5
 
@@ -374,6 +375,7 @@ class StiffnessDrift(OfMounts):
     looks_like = "resonances move from record to record, in the order of time and not of level"
     at = ("isolators/linear", "isolators/settling")
     nonlinear = True
+    time_varying = True
     strength = "relative_change"
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:

@@ -61,4 +61,5 @@ class AtPoint(Effect):
 
 
 def place_of(values: Values) -> np.ndarray:
+    """(3,) place of an effect at a point of the payload [m]."""
     return np.array([values.get(f"{axis}_m", 0.0) for axis in "xyz"])

@@ -48,14 +48,14 @@ def load_effects(path: str | Path) -> OwnEffects:
         restore(before)
         if isinstance(error, InputError):
             raise error.in_file(path) from None
-        raise InputError(f"expected a Python file that runs: {said(error, path)}", file=path) from None
+        raise InputError(f"expected a Python file that runs: {one_line(error, path)}", file=path) from None
     names = tuple(name for name, effect in library().items() if before.get(name) is not effect)
     if not names:
         raise InputError("expected a class with @register; it registers no effect", file=path)
     return OwnEffects(path, names, hashlib.sha256(source).hexdigest())
 
 
-def said(error: BaseException, path: Path | None = None) -> str:
+def one_line(error: BaseException, path: Path | None = None) -> str:
     """An error of a user's file in one line, with the line number if known."""
     line = getattr(error, "lineno", None) if isinstance(error, SyntaxError) else None
     for frame in traceback.extract_tb(error.__traceback__):
@@ -79,7 +79,7 @@ def try_out(own: OwnEffects, model: TableModel) -> None:
         except AvisError as error:
             raise InputError(str(error), file=own.path, field=name) from None
         except Exception as error:
-            raise InputError(f"expected an effect that runs: {said(error, own.path)}", file=own.path,
+            raise InputError(f"expected an effect that runs: {one_line(error, own.path)}", file=own.path,
                              field=name) from None
 
 

@@ -47,7 +47,7 @@ class ConverterSettings:
         offset.
     nominal_margin : distance of a clip level from the nominal limit below which it is the nominal one [lsb]: offsets of
         converters.
-    longest : maximum number of samples of a record that are inspected: more add nothing new and take memory.
+    longest : maximum number of samples of a record that are inspected: more add nothing new.
     """
 
     false_alarm: float = 1e-3
@@ -83,12 +83,28 @@ class ConverterFinding:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Samples of one channel in one record; codes are the nominal codes nearest to samples inside the nominal range."""
+    """Distinct values of one channel in one record, and how often each occurs.
+
+    codes : nominal codes nearest to the `inside` samples in the nominal range; spread : their standard deviation;
+    travelled : sum of their changes from sample to sample.
+    """
 
     record: str
-    y: np.ndarray
-    codes: np.ndarray
     periods: int
+    values: np.ndarray
+    value_counts: np.ndarray
+    codes: np.ndarray
+    code_counts: np.ndarray
+    inside: int
+    spread: float
+    travelled: int
+
+    @staticmethod
+    def of(record: str, periods: int, y: np.ndarray, nominal: Converter) -> _Samples:
+        within = (y > nominal.limits_V[0] + nominal.lsb_V) & (y < nominal.limits_V[1] - nominal.lsb_V)
+        codes = np.rint(y[within] / nominal.lsb_V).astype(np.int64)
+        return _Samples(record, periods, *np.unique(y, return_counts=True), *np.unique(codes, return_counts=True),
+                        len(codes), float(codes.std()) if len(codes) else 0.0, int(np.abs(np.diff(codes)).sum()))
 
 
 def nominal_converter(rig: Rig) -> Converter:
@@ -108,7 +124,7 @@ def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, .
     """Properties of each sensor's converter that are worse than stated in the rig file; empty if there are none.
 
     A step is detected from 1.9 nominal lsb on, a clip level if about 40 samples reach it (8 per period of a periodic
-    record). Up to `longest` samples of every record are held in memory.
+    record). One record is in memory at a time.
 
     Raises
     ------
@@ -123,10 +139,7 @@ def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, .
         h = source.header
         record = source.load(0, min(h.samples, SETTINGS.longest))
         for k, name in enumerate(h.y_names):
-            y = record.y[:, k]
-            inside = (y > nominal.limits_V[0] + nominal.lsb_V) & (y < nominal.limits_V[1] - nominal.lsb_V)
-            codes = np.rint(y[inside] / nominal.lsb_V).astype(np.int64)
-            of_channel[name].append(_Samples(h.name, y, codes, max(1, record.header.periods)))
+            of_channel[name].append(_Samples.of(h.name, max(1, record.header.periods), record.y[:, k], nominal))
     tests = len(of_channel)
     found: list[ConverterFinding | None] = []
     for name, of in of_channel.items():
@@ -146,8 +159,8 @@ class _Step:
 
 
 def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: float) -> ConverterFinding | None:
-    seen = [one for one in of if one.codes.size > 1]
-    step = (_gaps(seen) or _comb(seen)) if seen else None
+    varying = [one for one in of if one.inside > 1]
+    step = (_gaps(varying) or _comb(varying)) if varying else None
     if step is None or step.p > level:
         return None
     lsb = nominal.lsb_V
@@ -166,17 +179,15 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
     nu = np.arange(size // 2 + 1) / size
     total, weight, travelled = np.zeros(len(nu)), np.zeros(len(nu)), np.zeros(len(nu))
     for one in of:
-        spread = float(one.codes.std())
-        if spread * nu[-1] < SETTINGS.free_of_signal:
+        if one.spread * nu[-1] < SETTINGS.free_of_signal:
             continue
-        counts = np.bincount(one.codes - low, minlength=1).astype(float)
-        phi = np.abs(scipy.fft.rfft(counts, size)) / len(one.codes)
-        free = nu >= SETTINGS.free_of_signal / spread
-        n = float(len(one.codes))
+        phi = np.abs(scipy.fft.rfft(np.bincount(one.codes - low, one.code_counts), size)) / one.inside
+        free = nu >= SETTINGS.free_of_signal / one.spread
+        n = float(one.inside)
         total[free] += n * phi[free]
         weight[free] += n
         # Each step that the signal crosses is one independent sample of where the values lie within a step.
-        travelled += free * np.minimum(n, np.abs(np.diff(one.codes)).sum() * nu)
+        travelled += free * np.minimum(n, one.travelled * nu)
     usable = (weight > 0) & (nu <= 1 / SETTINGS.least_step)
     if not usable.any():
         return None
@@ -195,12 +206,18 @@ def _comb(of: Sequence[_Samples]) -> _Step | None:
     return _Step(q, std, float(np.exp(min(bound, 0.0))))
 
 
+def _all_codes(of: Sequence[_Samples]) -> tuple[np.ndarray, np.ndarray]:
+    """Codes in use in any record, and how often each occurs in all of them."""
+    codes, at = np.unique(np.concatenate([one.codes for one in of]), return_inverse=True)
+    return codes, np.bincount(at, np.concatenate([one.code_counts for one in of])).astype(int)
+
+
 def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float] | None:
     """q by least squares of the distinct codes over their numbers k, widening from the middle, where k is certain.
 
     None if the codes in use do not lie on the comb: samples concentrated at a few levels have a large phi, too.
     """
-    codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
+    codes, counts = _all_codes(of)
     middle = float(codes[np.argmax(counts)])
     x = codes - middle
     b = 0.0
@@ -220,7 +237,7 @@ def _fitted(of: Sequence[_Samples], q: float) -> tuple[float, float] | None:
 
 def _gaps(of: Sequence[_Samples]) -> _Step | None:
     """The step of a signal with only a few values, from the unused codes between them."""
-    codes, counts = np.unique(np.concatenate([one.codes for one in of]), return_counts=True)
+    codes, counts = _all_codes(of)
     off = int(counts.sum() - counts.max())
     if not 2 <= len(codes) <= SETTINGS.few_codes or off < SETTINGS.off_the_mode:
         return None
@@ -264,16 +281,16 @@ def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float,
 def _plateau(of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: float, lsb: float, level: float
              ) -> tuple[float, float, float, dict[str, int]] | None:
     """Level, width, p-value and samples by record of a flat end that no record exceeds."""
-    top = max(float(np.max(sign * one.y)) for one in of)
+    top = max(float(np.max(sign * one.values)) for one in of)
     if top <= 0 or top > bound - max(SETTINGS.nominal_margin * nominal_lsb, lsb):
         return None
     best, widest = 1.0, 0.0
-    near = [one for one in of if float(np.max(sign * one.y)) >= top - max(2 * lsb, top / 256)]
+    near = [one for one in of if float(np.max(sign * one.values)) >= top - max(2 * lsb, top / 256)]
     for one in near:
-        _, p, width = repeated_extreme(sign * one.y, one.periods)
+        _, p, width = repeated_extreme(sign * np.repeat(one.values, one.value_counts), one.periods)
         if p * len(of) < best:
             best, widest = p * len(of), width
     if best > level:
         return None
-    at = {one.record: int(np.count_nonzero(sign * one.y >= top - max(widest, lsb / 2))) for one in near}
+    at = {one.record: int(one.value_counts[sign * one.values >= top - max(widest, lsb / 2)].sum()) for one in near}
     return top, widest, best, at

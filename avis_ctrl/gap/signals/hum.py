@@ -83,10 +83,12 @@ class HumFinding:
 
     @property
     def channels(self) -> tuple[str, ...]:
+        """Channels with hum."""
         return tuple(sorted({line.channel for line in self.lines}))
 
     @property
     def harmonics(self) -> tuple[int, ...]:
+        """Harmonics found in any channel."""
         return tuple(sorted({line.harmonic for line in self.lines}))
 
 
@@ -108,13 +110,13 @@ class _Score:
         return np.where(tested, stats.gamma.sf(self.score, np.maximum(self.tests, 1)), 1.0)
 
 
-def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
+def find_hum(residuals: Sequence[RecordResidual]) -> HumFinding | None:
     """The hum in the residual of a model, None if no line is significant.
 
     Tests the residual at every harmonic below 0.98 of half the sample rate, driven or not; a driven line whose
     neighbours are not driven is skipped. Takes a transform of each record and about 10 ms.
     """
-    scores = [_scores(left, nominal) for nominal in MAINS_HZ]
+    scores = [_scores(residuals, nominal) for nominal in MAINS_HZ]
     trials = sum(int(np.count_nonzero(one.tests)) for one in scores)
     each = [one.p for one in scores]
     chance = min(1.0, min(float(p.min()) for p in each) * trials)
@@ -126,14 +128,14 @@ def find_hum(left: Sequence[RecordResidual]) -> HumFinding | None:
     strength = [np.sum(np.where(sure, one.score, 0.0), axis=(1, 2)) for one, sure in zip(scores, surest, strict=True)]
     which = int(np.argmax([sums.max() for sums in strength]))
     best, sure, at = scores[which], surest[which], int(np.argmax(strength[which]))
-    frequency = _refined(left, float(best.f0[at]), np.argwhere(sure[at]))
+    frequency = _refined(residuals, float(best.f0[at]), np.argwhere(sure[at]))
     # With the frequency known, further lines are tested at its harmonics only.
-    there = _scores(left, best.nominal_Hz, np.array([frequency.value]))
+    there = _scores(residuals, best.nominal_Hz, np.array([frequency.value]))
     own = there.p[0]
     hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
-    frequency = _refined(left, frequency.value, hits)
-    lines = _lines(left, frequency.value, hits, there.ratio[0])
-    return _finding(left, best.nominal_Hz, frequency, lines, chance, left[0].header.y_unit)
+    frequency = _refined(residuals, frequency.value, hits)
+    lines = _lines(residuals, frequency.value, hits, there.ratio[0])
+    return _finding(residuals, best.nominal_Hz, frequency, lines, chance, residuals[0].header.y_unit)
 
 
 def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
@@ -167,17 +169,17 @@ def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: 
     return cleaned
 
 
-def _scores(left: Sequence[RecordResidual], nominal: float, f0: np.ndarray | None = None) -> _Score:
+def _scores(residuals: Sequence[RecordResidual], nominal: float, f0: np.ndarray | None = None) -> _Score:
     """Scores at f0 (n,), by default on a grid within `search_Hz` of the nominal frequency."""
-    h = left[0].header
-    duration = max(one.header.duration_s for one in left)
+    h = residuals[0].header
+    duration = max(one.header.duration_s for one in residuals)
     top = int(0.49 * h.sample_rate_Hz / (nominal + SETTINGS.search_Hz))
     if f0 is None:
         n = int(np.ceil(2 * SETTINGS.search_Hz * 2 * duration * max(top, 1))) + 1
         f0 = np.linspace(nominal - SETTINGS.search_Hz, nominal + SETTINGS.search_Hz, n)
     shape = (len(f0), top, len(h.y_names))
     score, tests, ratio = np.zeros(shape), np.zeros(shape, int), np.zeros(shape)
-    for one in left:
+    for one in residuals:
         _add(one, f0, score, tests, ratio)
     return _Score(nominal, f0, score, ratio / np.maximum(tests, 1), tests)
 
@@ -229,15 +231,15 @@ def _spread(one: RecordResidual, f: float) -> np.ndarray:
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
-def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
+def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
     """f0 by least squares over all significant lines, with free amplitudes and phases in each record.
 
     Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
     of the cosine or sine amplitude (Rife and Boorstyn 1974), times the cost of the window, for all lines together.
     """
-    rate = left[0].header.sample_rate_Hz
+    rate = residuals[0].header.sample_rate_Hz
     pieces = []
-    for one in left:
+    for one in residuals:
         n = one.header.samples
         window = hann(n, sym=False)
         for k, j in hits:
@@ -251,7 +253,7 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
 
     def power(shift: float) -> float:
         return -sum(abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t))) ** 2 / s for k, t, c, s, _ in pieces)
-    reach = 1.0 / max(one.header.duration_s for one in left)
+    reach = 1.0 / max(one.header.duration_s for one in residuals)
     shift = float(optimize.minimize_scalar(power, bounds=(-reach, reach), method="bounded",
                                            options={"xatol": 1e-5 * reach}).x)
     information = 0.0
@@ -262,12 +264,12 @@ def _refined(left: Sequence[RecordResidual], start: float, hits: np.ndarray) -> 
     return Reported(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
 
 
-def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
-    names, unit, rate = left[0].header.y_names, left[0].header.y_unit, left[0].header.sample_rate_Hz
+def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
+    names, unit, rate = residuals[0].header.y_names, residuals[0].header.y_unit, residuals[0].header.sample_rate_Hz
     found = []
     ks = sorted({int(k) + 1 for k, _ in hits})
     power, weight = np.zeros((len(ks), len(names))), np.zeros((len(ks), len(names)))
-    for one in left:
+    for one in residuals:
         A = _sines(f0, ks, one.header.samples, rate)
         c = _fitted(A, one.e)
         v = np.maximum(np.array([_spread(one, k * f0) for k in ks]), 1e-300)
@@ -281,10 +283,10 @@ def _lines(left: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: n
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 
 
-def _finding(left: Sequence[RecordResidual], nominal: float, frequency: Reported, lines: tuple[HumLine, ...],
+def _finding(residuals: Sequence[RecordResidual], nominal: float, frequency: Reported, lines: tuple[HumLine, ...],
              chance: float, unit: str) -> HumFinding:
     largest = lines[0]
-    names = left[0].header.y_names
+    names = residuals[0].header.y_names
     at = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
     channels = sorted({line.channel for line in lines}, key=names.index)
     A = largest.amplitude

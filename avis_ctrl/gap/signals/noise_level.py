@@ -33,6 +33,8 @@ from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual
 from avis_ctrl.rigs.rig import Rig
 
 FloorResponse = Callable[[np.ndarray], np.ndarray]
+# What `_floor_lines` returns.
+FloorLines = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class FloorLevel:
 
     @property
     def sentence(self) -> str:
+        """The finding in one sentence."""
         m, seen = self.mean_rms, self.mean_seen
         each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in self.rms.items())
         return (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
@@ -138,13 +141,13 @@ class NoiseLevels:
         return floor if floor and floor.significant and floor.clear and floor.foreign <= SETTINGS.foreign else None
 
 
-def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig, hum: HumFinding | None = None,
-                 steps_V: dict[str, float] | None = None) -> NoiseLevels:
+def noise_levels(residuals: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig,
+                 hum: HumFinding | None = None, steps_V: dict[str, float] | None = None) -> NoiseLevels:
     """Levels of floor motion and sensor noise, and which of them are above the rig's [ambient].
 
     Parameters
     ----------
-    left : y minus the prediction, which should include the floor of records that have it measured.
+    residuals : y minus the prediction, which should include the floor of records that have it measured.
     floor_response : omega (n,) rad/s -> (n, n_y, 3), unit of y per m/s; for a ResponseModel the last three columns of
         `response`.
     hum : lines to leave out. steps_V : resolution of channels whose converter was found coarser.
@@ -153,13 +156,14 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
     ------
     InputError : a rig file without [ambient], or too few quiet lines for the sensor noise.
     """
-    first = left[0].header
+    first = residuals[0].header
     ambient = getattr(rig, "ambient", None)
     if ambient is None:
         raise InputError("the rig file does not say what is normal on site", field="ambient")
-    masks = None if hum is None else [polluted(hum, one.header.samples, one.header.sample_rate_Hz, 4) for one in left]
+    masks = None if hum is None else [polluted(hum, one.header.samples, one.header.sample_rate_Hz, 4)
+                                      for one in residuals]
     rate = first.sample_rate_Hz
-    high = quiet_lines(left, (SETTINGS.sensor_band[0] * rate, SETTINGS.sensor_band[1] * rate), False, masks)
+    high = quiet_lines(residuals, (SETTINGS.sensor_band[0] * rate, SETTINGS.sensor_band[1] * rate), False, masks)
     if not any(len(one.left) for one in high):
         raise InputError("expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
                          " to estimate the noise", field="residuals")
@@ -169,10 +173,10 @@ def noise_levels(left: Sequence[RecordResidual], floor_response: FloorResponse, 
     raised = tuple(name for name in first.y_names
                    if sensors[name].value > SETTINGS.sensor_factor * expected[name]
                    and sensors[name].value - SETTINGS.significant * sensors[name].std > expected[name])
-    unknown = [k for k, one in enumerate(left) if not one.header.floor_names]
+    unknown = [k for k, one in enumerate(residuals) if not one.header.floor_names]
     floor = None
     if unknown:
-        low = quiet_lines([left[k] for k in unknown], SETTINGS.floor_band_Hz, True,
+        low = quiet_lines([residuals[k] for k in unknown], SETTINGS.floor_band_Hz, True,
                           None if masks is None else [masks[k] for k in unknown])
         D = np.array([sensors[name].value ** 2 for name in first.y_names])
         floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
@@ -212,7 +216,7 @@ def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarr
     return _level(S, std, visible, edges, ambient, foreign)
 
 
-def _foreign(estimated: Sequence[tuple], edges: np.ndarray, n_out: int) -> tuple[np.ndarray, float]:
+def _foreign(estimated: Sequence[FloorLines], edges: np.ndarray, n_out: int) -> tuple[np.ndarray, float]:
     """Noise outside the range of G over sensor noise (bands,), at least 1, and the fraction of the excess that it is.
 
     The fraction is the mean over bands that contain more than noise. The median in each band is robust against the few
@@ -240,7 +244,7 @@ def _edges() -> np.ndarray:
     return np.array([*edges[:-1], SETTINGS.floor_band_Hz[1]])
 
 
-def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) -> tuple:
+def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) -> FloorLines:
     """frequency, |v_hat|^2 and its noise (n, 3), e^H D^-1 e inside and outside the range of G (n,); left, level."""
     G = floor_response(2 * np.pi * one.frequency_Hz)
     W = np.conj(G.swapaxes(1, 2)) / D
@@ -254,17 +258,17 @@ def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) 
     return one.frequency_Hz, np.abs(v) ** 2 / one.left[:, None], noise, inside, outside, one.left, one.level
 
 
-def _band(one: tuple, low: float, high: float, white: float, louder: float
+def _band(one: FloorLines, low: float, high: float, white: float, louder: float
           ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """S (3,), its variance, and the record's level; None with fewer than four lines."""
-    f, power, noise, _, outside, left, level = one
+    f, power, noise, _, outside, fraction, level = one
     inside = (f >= low) & (f < high)
     if np.count_nonzero(inside) < 4:
         return None
     # Machine or mains lines in the sensor signals stand out in the part that is not floor motion.
     inside &= outside <= SETTINGS.line * np.median(outside[inside])
     # Noise from other sources is assumed as large inside the range of G as outside it, relative to sensor noise.
-    P, N, h = power[inside], louder * noise[inside], left[inside][:, None]
+    P, N, h = power[inside], louder * noise[inside], fraction[inside][:, None]
     S = np.full(3, white)
     for _ in range(3):
         w = h / (S + N) ** 2

@@ -66,7 +66,7 @@ class QuietLines:
         return np.abs(self.e) ** 2 / self.left[:, None]
 
 
-def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], narrow: bool,
+def quiet_lines(residuals: Sequence[RecordResidual], band_Hz: tuple[float, float], narrow: bool,
                 polluted: Sequence[np.ndarray] | None = None) -> tuple[QuietLines, ...]:
     """Quiet lines of each record, in a band.
 
@@ -76,7 +76,7 @@ def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], na
     found: dict[int, QuietLines] = {}
     regressed: dict[tuple[int, float], list[int]] = {}
     inside = []
-    for k, one in enumerate(left):
+    for k, one in enumerate(residuals):
         keep = (one.frequency_Hz >= band_Hz[0]) & (one.frequency_Hz <= band_Hz[1])
         if polluted is not None:
             keep &= ~polluted[k]
@@ -89,9 +89,9 @@ def quiet_lines(left: Sequence[RecordResidual], band_Hz: tuple[float, float], na
         else:
             regressed.setdefault((len(keep), one.header.sample_rate_Hz), []).append(k)
     for ks in regressed.values():
-        for k, made in zip(ks, _regression([left[k] for k in ks], [inside[k] for k in ks], narrow), strict=True):
+        for k, made in zip(ks, _regression([residuals[k] for k in ks], [inside[k] for k in ks], narrow), strict=True):
             found[k] = made
-    return tuple(found[k] for k in range(len(left)))
+    return tuple(found[k] for k in range(len(residuals)))
 
 
 def _plain(one: RecordResidual, keep: np.ndarray) -> QuietLines:
@@ -102,25 +102,25 @@ def _level(one: RecordResidual) -> float:
     return float(np.sqrt(np.mean(one.u ** 2)))
 
 
-def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
+def _regression(residuals: Sequence[RecordResidual], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
     """Residuals of e after regression on (1, x, x^2) u over each window of lines common to the records, and the
     fraction of noise that remains in them."""
     lines = np.flatnonzero(np.any(keep, axis=0))
-    n_u, R = left[0].u.shape[1], len(left)
+    n_u, R = residuals[0].u.shape[1], len(residuals)
     order = SETTINGS.order if narrow else 1
     width = SETTINGS.narrow if narrow else SETTINGS.wide
     # At most one parameter for two data, so that noise remains.
     width = max(width, int(np.ceil(2 * (order + 1) * n_u / R)))
     blocks = len(lines) // width
     if not blocks:
-        return [_plain(one, np.zeros(len(one.E), bool)) for one in left]
+        return [_plain(one, np.zeros(len(one.E), bool)) for one in residuals]
     at = lines[:blocks * width].reshape(blocks, width)
     x = np.linspace(-1, 1, width)[:, None] ** np.arange(order + 1)
-    U = np.stack([one.U[at] for one in left], axis=1)
+    U = np.stack([one.U[at] for one in residuals], axis=1)
     # Columns are normalised over all records together; columns of silent bands stay harmless.
     A = (U[:, :, :, None, :] * x[None, None, :, :, None]).reshape(blocks, R * width, -1)
     A = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
-    E = np.stack([one.E[at] for one in left], axis=1).reshape(blocks, R * width, -1)
+    E = np.stack([one.E[at] for one in residuals], axis=1).reshape(blocks, R * width, -1)
     size, lines_of_noise = np.ones((blocks, R)), np.ones((blocks, R, width), bool)
     # Records that clip or distort are louder: weighted by their residual, they do not spoil the others.
     for _ in range(SETTINGS.rounds):
@@ -132,7 +132,7 @@ def _regression(left: Sequence[RecordResidual], keep: Sequence[np.ndarray], narr
         power = np.sum(line * lines_of_noise, axis=2) / np.maximum(np.sum(share * lines_of_noise, axis=2), 1e-3 * width)
         size = np.sqrt(uniform_filter1d(power, SETTINGS.smoothed, axis=0, mode="nearest")) + 1e-300
     made = []
-    for k, one in enumerate(left):
+    for k, one in enumerate(residuals):
         good = (share[:, k] > SETTINGS.least_left) & keep[k][at] & lines_of_noise[:, k]
         made.append(QuietLines(_level(one), one.frequency_Hz[at[good]], rest[:, k][good], share[:, k][good]))
     return made

@@ -68,14 +68,17 @@ class SingleAxisFit(Shown):
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
         return self.information.names
 
     @property
     def values(self) -> np.ndarray:
+        """(n_p,) values of the parameters."""
         return self.information.values
 
     @property
     def chi2_per_dof(self) -> float:
+        """Chi-square over degrees of freedom."""
         return self.chi2 / self.dof
 
     @property
@@ -188,11 +191,11 @@ def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: n
     if lags is not None:
         covariance = not_below(covariance, plain)
     abscissa, measured, predicted = drawn
-    seen, left = (measured, measured - predicted) if relative is None else (measured / np.abs(measured), relative)
+    reference, left = (measured, measured - predicted) if relative is None else (measured / np.abs(measured), relative)
     flat = np.abs(left) ** 2
     tiny, honest, white = np.finfo(float).tiny, np.sqrt(np.diag(covariance)), np.sqrt(np.abs(np.diag(plain)))
     residual = ResidualStatistics(
-        float(np.sqrt(np.mean(flat))), float(np.linalg.norm(left) / max(float(np.linalg.norm(seen)), tiny)),
+        float(np.sqrt(np.mean(flat))), float(np.linalg.norm(left) / max(float(np.linalg.norm(reference)), tiny)),
         float(np.sum(np.real(np.conj(left[1:]) * left[:-1])) / max(float(np.sum(flat)), tiny)),
         float(np.max(honest / np.maximum(white, tiny))), used)
     how = method or (f"Newey-West, {used} lags by Andrews' rule; {residual.inflation:.1f} times those of a white "

@@ -79,8 +79,8 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
     for name, value in options.items():
         _check_option(kind, name, value)
     scale = dict(scale or {})
-    driven, measured = _roles(kind, columns, scale)
-    campaign = _read(path, columns, driven, measured, sample_rate_Hz)
+    driven, measured = roles_of(kind, columns, scale)
+    campaign = read_columns(path, columns, driven, measured, sample_rate_Hz)
     if kind == "seismometer":
         responses, refused = stepped_sine(campaign, driven, measured, scale)
         fit = fit_seismometer(responses, **options)
@@ -124,16 +124,26 @@ def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale
     ComputationError : fewer than four usable frequencies.
     """
     records, refused = sine_records(campaign, driven, measured, scale)
-    records = [record for k, record in enumerate(records)
-               if k == 0 or record.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+    records = distinct(records)
     if len(records) < 4:
         raise ComputationError("too few sine records", measured=f"{len(records)} usable of {len(campaign.records)}",
                                cause=refused[0] if refused else "repeated frequencies",
                                next_step="map the columns, and give at least four frequencies about the corner")
+    return responses_of(records, driven, measured), refused
+
+
+def distinct(records: Sequence[SineRecord]) -> list[SineRecord]:
+    """Records in order of frequency, without repeated frequencies."""
+    return [record for k, record in enumerate(records)
+            if k == 0 or record.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+
+
+def responses_of(records: Sequence[SineRecord], driven: str, measured: Sequence[str]) -> Responses:
+    """Responses to the drive with their variances."""
     pairs = {role: [record.ratio(role, driven) for record in records] for role in measured}
     return Responses(np.array([record.frequency_Hz for record in records]),
                      {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
-                     {role: np.array([v for _, v in pair]) for role, pair in pairs.items()}), refused
+                     {role: np.array([v for _, v in pair]) for role, pair in pairs.items()})
 
 
 def _check_option(kind: str, name: str, value: Any) -> None:
@@ -147,8 +157,17 @@ def _check_option(kind: str, name: str, value: Any) -> None:
         raise InputError(f"expected {wanted}", field=name, value=value)
 
 
-def _roles(kind: str, columns: Mapping[str, str], scale: Mapping[str, float]) -> tuple[str, list[str]]:
+def roles_of(kind: str, columns: Mapping[str, str], scale: Mapping[str, float], without: Sequence[str] = ()
+             ) -> tuple[str, list[str]]:
+    """Role of the input (empty if there is none) and roles of the outputs that are mapped; `without` some of the
+    optional ones.
+
+    Raises
+    ------
+    InputError : unknown or missing roles, a factor that is zero, not finite, or of a role that is not mapped.
+    """
     driven, needed, optional = ROLES[kind]
+    optional = tuple(role for role in optional if role not in without)
     known = {"t", *needed, *optional, *([driven] if driven else [])}
     for role in [*columns, *scale]:
         if role not in known:
@@ -166,8 +185,9 @@ def _roles(kind: str, columns: Mapping[str, str], scale: Mapping[str, float]) ->
     return driven, measured
 
 
-def _read(path: str | Path, columns: Mapping[str, str], driven: str, measured: Sequence[str],
-          sample_rate_Hz: float | None) -> Campaign:
+def read_columns(path: str | Path, columns: Mapping[str, str], driven: str, measured: Sequence[str],
+                 sample_rate_Hz: float | None) -> Campaign:
+    """Records of a file, with the columns of these roles. Raises InputError."""
     mapping = {"y": [columns[role] for role in measured]}
     hints: dict[str, Any] = {} if sample_rate_Hz is None else {"sample_rate_Hz": sample_rate_Hz}
     if driven:

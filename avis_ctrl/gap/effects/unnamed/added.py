@@ -31,6 +31,7 @@ class AddedSignal(UnnamedFault):
     parameter: Callable[[Table], EffectParameter]
     signal: Callable[[RecordMotion], np.ndarray] | None = None
     to: Literal["volts", "output"] = "volts"
+    time_varying: bool = False
     nonlinear = True
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -142,7 +143,7 @@ ADDED: dict[str, AddedSignal] = {one.name: one for one in (
                 "outputs sampled by a clock of another rate than the inputs'",
                 lambda model: ("loop",) if _read(model) else (),
                 lambda model: EffectParameter("relative", "1", "rate of one clock over the other's, less one", 0.0,
-                                              -0.01, 0.01, 1e-6), _other_clock, "output"),
+                                              -0.01, 0.01, 1e-6), _other_clock, "output", True),
     DriveCrosstalk("drive_crosstalk", "a fraction of one motor's voltage on another",
                    "a fraction of {source}'s voltage on {into}", lambda model: pairs(model.actuators),
                    lambda model: EffectParameter("share", "1", "fraction of the other's "
@@ -159,7 +160,7 @@ ADDED: dict[str, AddedSignal] = {one.name: one for one in (
     AddedSignal("force_drift", "force constants that drift over the campaign",
                "force constants that drift over the campaign", lambda model: (ALL,),
                lambda model: EffectParameter("relative_change", "1", "of every force constant over the campaign", 0.0,
-                                             -0.9, 0.9, 0.01), _drift))}
+                                             -0.9, 0.9, 0.01), _drift, time_varying=True))}
 
 
 def _row(name: str) -> AddedSignal:

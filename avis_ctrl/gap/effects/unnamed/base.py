@@ -17,7 +17,7 @@ class UnnamedFault(Effect):
     looks_like = "not in the library"
     words: str
 
-    def said(self, place: str, values: Values) -> str:
+    def described(self, place: str, values: Values) -> str:
         into, _, source = place.partition("/")
         return self.words.format(place=place, into=into, source=source, **values)
 
@@ -43,4 +43,5 @@ class Late(UnnamedFault):
 
 
 def pairs(names: tuple[str, ...]) -> tuple[str, ...]:
+    """All ordered pairs of channels, as "into/source"."""
     return tuple(f"{a}/{b}" for a in names for b in names if a != b)
