@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
@@ -36,6 +38,7 @@ from avis_ctrl.gap.search import (
     forbidden,
     implausible,
     is_weak,
+    next_effect,
     outliers,
     search,
     without_effect,
@@ -43,7 +46,7 @@ from avis_ctrl.gap.search import (
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.tolerances import BEYOND, moved, of_effect, with_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, credible, moved, of_effect, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
@@ -131,7 +134,12 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
                     nominal=replace(nominal, names=tolerances.names), corners_differ=True)
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings)
+    starts: list[ActiveEffect] = []
+    if not credible(tolerant, settings):
+        progress("search with all values as in the rig file: tolerances stand in for an effect")
+        step = next_effect(base, data, [*effects, *unnamed_faults().values()], settings, each)
+        starts = [one.model.effects[-1] for one in step.tried.values()] if step else []
+    return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings, starts)
 
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper,
@@ -143,8 +151,8 @@ def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progres
     return _searched(replace(fits, best=best), data, effects, progress, each, settings)
 
 
-def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
-              ) -> Fits:
+def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Mapper,
+              settings: GapSettings, starts: Sequence[ActiveEffect] = ()) -> Fits:
     """Add the effects that the search finds in addition to those of the best fit."""
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
 
@@ -152,7 +160,8 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
         """Whether the effect found last explains a negligible part of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
-    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
+    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough,
+                   starts)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
@@ -268,7 +277,8 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     verdict = _verdict(reported, closed, closed or small, remainder, settings)
     where, remaining = places(before), places(after)
     onward = separating_measurement(reported, fits)
-    if onward is None and verdict in ("unexplained", "partly explained"):
+    imitated = "" if credible(updated, settings) else _far(_moved(updated, settings), settings)
+    if onward is None and (imitated or verdict in ("unexplained", "partly explained")):
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
     if verdict == "none":
@@ -348,6 +358,15 @@ def separating_measurement(reported: Sequence[NamedEffect], fits: Fits) -> str |
                         key=lambda fit: odds_against_fit(mine, fit))
             return between(one.name, other, mine.model, rival.model)
     return None
+
+
+def _far(shifts: Sequence[Tolerance], settings: GapSettings) -> str:
+    """Values of the rig file that moved further, as a whole, than their tolerances allow."""
+    far = [one for one in shifts if abs(one.moved) > settings.beyond_least]
+    size = float(np.sqrt(np.mean([one.moved ** 2 for one in shifts])))
+    return (f"the fit moves {len(far)} of {len(shifts)} values of the rig file by more than {settings.beyond_least:g} "
+            f"tolerances, {shifts[0].parameter} by {abs(shifts[0].moved):.3g}, all by {size:.2g} r.m.s.: the rig file "
+            "is wrong there, its tolerances are too small, or an effect is missing that these values imitate")
 
 
 def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSettings) -> tuple[Considered, ...]:

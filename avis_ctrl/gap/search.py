@@ -153,12 +153,12 @@ def _try(fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data:
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
            progress: Progress = lambda text: None, each: Mapper = sequential_map,
-           enough: Callable[[Step], bool] = lambda step: False) -> list[Step]:
+           enough: Callable[[Step], bool] = lambda step: False, starts: Sequence[ActiveEffect] = ()) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
     they show in how far one of them had to move, hardly in the residual.
 
     base : the initial fit, which may already contain effects. enough : whether the search may end after a step because
-        its effect explains next to nothing.
+        its effect explains next to nothing. starts : effects with further values at which fits of the first step start.
     The last step has the fit with all effects found.
     """
     steps: list[Step] = []
@@ -167,7 +167,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
         while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(base.labels) + len(steps) + 1}")
-            step = _step(now, data, effects, settings, each)
+            step = next_effect(now, data, effects, settings, each, () if steps else starts)
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -200,7 +200,8 @@ def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSe
     progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
     narrow, beyond = _with_spread(now, rows, size, data, settings), [one for one in effects if one.name in BEYOND]
-    while len(narrow.labels) < settings.longest and (step := _step(narrow, data, beyond, settings, each)) is not None:
+    while len(narrow.labels) < settings.longest and (
+            step := next_effect(narrow, data, beyond, settings, each)) is not None:
         steps.append(step)
         narrow = step.fitted
     return steps, _with_spread(narrow, rows, 1 / size, data, settings) if steps else now
@@ -279,11 +280,16 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
-def _step(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper) -> Step | None:
-    """The effect with the largest evidence; None if no effect improves the current model enough."""
+def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper,
+                starts: Sequence[ActiveEffect] = ()) -> Step | None:
+    """The effect with the largest evidence; None if no effect improves the current model enough.
+
+    starts : effects with values at which fits start in addition to those of the score test.
+    """
     begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, settings, each)
     tried = _tried(begun, shortlist(found, settings), data, settings, each)
+    tried = _likelier([*tried.values(), *_joint_fits(begun, starts, data, settings, each)])
     if not tried:
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)
@@ -314,8 +320,7 @@ class _Begun:
 def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Mapper
            ) -> dict[str, Fitted]:
     """Fits of candidates by label. First the parameters of each effect alone are fitted, the others following to first
-    order; then, for candidates that are not far behind, all parameters. Excluded are fits that fail, that end at values
-    which physics forbids, or that end within a tolerance."""
+    order; then, for candidates that are not far behind, all parameters."""
     if not chosen:
         return {}
     profile = Profile(now, data, settings)
@@ -339,8 +344,6 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
             starts = [max(ends, key=lambda end: end.gain).effect] if ends else []
         return one, fitted(starts[0], settings.rough_iterations) if starts else None
 
-    def ended(one: ActiveEffect) -> Fitted | None:
-        return _small(with_effect(now, one, data, settings.quick))
     made = each(begun, chosen)
     most = max((end.gain for _, end in made if end is not None), default=0.0)
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
@@ -349,10 +352,19 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     near += [one.effect for one, end in made if at_full_strength(one.effect)
              or (one.reduction >= 2 * settings.not_far_behind * most
                  and (end is None or end.reduction < settings.least_promised * one.reduction))]
-    further = [_whole(one, now) for one in each(ended, near) if one is not None]
+    return _likelier(_joint_fits(now, near, data, settings, each))
+
+
+def _joint_fits(now: Fitted, effects: Sequence[ActiveEffect], data: Data, settings: GapSettings, each: Mapper
+                ) -> list[Fitted]:
+    """Fits of all parameters with one more effect each. Excluded are fits that fail, that end at values which physics
+    forbids, or that end within a tolerance."""
+    def ended(one: ActiveEffect) -> Fitted | None:
+        return _small(with_effect(now, one, data, settings.quick))
+    found = [_whole(one, now) for one in each(ended, effects) if one is not None]
     stated = tolerances_of(now.model.rig)
-    return _likelier([one for one in further if not implausible(one)
-                      and not within_tolerance(one.model.effects[-1], stated, settings)])
+    return [one for one in found if not implausible(one)
+            and not within_tolerance(one.model.effects[-1], stated, settings)]
 
 
 def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:

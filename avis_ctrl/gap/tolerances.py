@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.payload import PRODUCTS
@@ -51,6 +52,15 @@ def with_tolerance(fitted: Fitted) -> list[str]:
     """Names of the free values of the rig file that have a tolerance."""
     theta = set(re_identified(fitted.model.rig).names)
     return [name for name in fitted.priors.names if "@" not in name and name not in theta]
+
+
+def credible(fitted: Fitted, settings: GapSettings) -> bool:
+    """Whether values of the rig file moved no further, as a whole, than their tolerances allow (chi-square test).
+
+    Otherwise they represent something that the model lacks, at wrong values of everything else.
+    """
+    z = fitted.z[[fitted.priors.names.index(name) for name in with_tolerance(fitted)]]
+    return bool(chi2.sf(float(z @ z), z.size) >= settings.credible)
 
 
 def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:

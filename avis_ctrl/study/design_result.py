@@ -140,12 +140,15 @@ class SixDofCheck:
     omega : (n,) rad/s; kept : (n,) largest singular value from floor to payload on the kept axes, rotations at the
         edge;
     others : (n,) the same from the other coordinates of the floor, which the design model does not contain.
+    alone : (n, 6) gain from each coordinate of the floor to the same coordinate of the payload, in the order of
+        `COORDINATES`.
     deviation_dB : largest difference between `kept` and the design model inside the design's band.
     """
 
     omega: np.ndarray
     kept: np.ndarray
     others: np.ndarray
+    alone: np.ndarray
     deviation_dB: float
 
 

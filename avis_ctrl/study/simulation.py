@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -74,36 +74,50 @@ def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | N
     return replace(bare, loops=companions.systems())
 
 
+@dataclass(frozen=True)
+class SixDofSettings:
+    """slowest_Hz : lowest frequency of the check [Hz]: below it geophones measure little but their own noise.
+    points : frequencies from there to the lowest one of the design model."""
+
+    slowest_Hz: float = 0.01
+    points: int = 60
+
+
+SETTINGS = SixDofSettings()
+
+
 def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
                   companions: Companions) -> SixDofCheck:
     """Compare the transmissibility of the sampled loop in six degrees of freedom with that of the design model.
 
-    The frequencies are those of the design model, the ends of the band, and points around the peaks, over all
-    frequencies and in the band: a lightly damped mode is narrower than the grid.
+    The frequencies are those of the design model, lower ones, the ends of the band, and points around the peaks, over
+    all frequencies and in the band: a lightly damped mode is narrower than the grid.
     """
     T2, loop = result.transmissibility, nominal_loop(design, rig, plant, result.K, companions)
     kept = [COORDINATES.index(name) for name in design.keep]
     others = [k for k in range(6) if k not in kept]
     known: dict[float, np.ndarray] = {}
 
-    def kept_rows(omega: np.ndarray) -> np.ndarray:
+    def every(omega: np.ndarray) -> np.ndarray:
         new = np.array([w for w in omega.tolist() if w not in known])
         if new.size:
-            known.update(zip(new.tolist(), predict_transmissibility_6dof(loop, new)[:, kept], strict=True))
+            known.update(zip(new.tolist(), predict_transmissibility_6dof(loop, new), strict=True))
         return np.array([known[w] for w in omega.tolist()])
 
     def sigma(omega: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(kept_rows(omega)[:, :, kept], ord=2, axis=(1, 2))
+        return np.linalg.norm(every(omega)[:, kept][:, :, kept], ord=2, axis=(1, 2))
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     inside = (T2.omega >= low) & (T2.omega <= high)
-    whole = np.unique(np.concatenate([T2.omega, [low, high]]))
+    slow = np.geomspace(2 * np.pi * SETTINGS.slowest_Hz, T2.omega[0], SETTINGS.points, endpoint=False)
+    whole = np.unique(np.concatenate([slow, T2.omega, [low, high]]))
     band = whole[(whole >= low) & (whole <= high)]
     omega = np.unique(np.concatenate([refine_maxima(sigma, part, sigma(part))[0] for part in (whole, band)]))
     if not np.any(inside):  # a band between two of the design model's frequencies
         inside = np.arange(T2.omega.size) == np.argmin(np.abs(np.log(T2.omega ** 2 / (low * high))))
     deviation = 20 * np.max(np.abs(np.log10(sigma(T2.omega[inside]) / T2.sigma[inside])))
-    return SixDofCheck(omega, sigma(omega), np.linalg.norm(kept_rows(omega)[:, :, others], ord=2, axis=(1, 2)),
-                       float(deviation))
+    response = every(omega)
+    return SixDofCheck(omega, sigma(omega), np.linalg.norm(response[:, kept][:, :, others], ord=2, axis=(1, 2)),
+                       np.abs(np.einsum("nii->ni", response)), float(deviation))
 
 
 def sensor_bank(design: Design, rig: Rig) -> SensorBank:

@@ -7,6 +7,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.lti.norms import decibels
+from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_result import DesignResult
 
 
@@ -39,14 +40,26 @@ def all_axes(result: DesignResult) -> str:
     beyond = [f"{value:+.1f} dB {where} (bound {decibels(bound.upper):+.1f} dB)"
               for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
               if np.isfinite(bound.upper) and value > decibels(bound.upper)]
+    outside = _outside(result, six.alone[inside].max(axis=0), inside_band)
     locked = f"The worst-case bounds hold for {listed(result.design.keep)} with the other coordinates locked"
     if beyond:
-        return f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
+        return (f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
+                f"{outside}")
     reached = ("With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
                f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}")
     if not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
-        return f"{reached}. For the other plants of the uncertainty set there is no bound."
-    return f"{locked}. {reached}."
+        return f"{reached}. For the other plants of the uncertainty set there is no bound.{outside}"
+    return f"{locked}. {reached}.{outside}"
+
+
+def _outside(result: DesignResult, most: np.ndarray, inside_band: str) -> str:
+    """What the axes outside the design do: most (6,), largest gain of each axis in the band."""
+    rows = [f"{name} {decibels(most[k]):+.1f} dB" for k, name in enumerate(COORDINATES)
+            if name not in result.design.keep]
+    if not rows:
+        return ""
+    return (f" The axes outside the design have skyhook loops or remain passive: {inside_band} each transmits its own "
+            f"floor motion with at most {listed(rows)} (nominal).")
 
 
 def requirement_rows(result: DesignResult) -> list[tuple[str, str, str, bool]]:

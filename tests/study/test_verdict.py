@@ -62,16 +62,20 @@ def test_stable_loops_count_and_nothing_is_raised():
 def test_all_six_degrees_of_freedom_stand_beside_the_bounds_of_the_design_model(band_bound, said):
     """The band is 1 to 10 Hz; 2 at 0.5 Hz is outside, 0.4 at 2 Hz inside."""
     mu = SimpleNamespace(worst_peak=SimpleNamespace(upper=2.5), worst_band=SimpleNamespace(upper=band_bound))
-    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]))
+    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]),
+                          alone=np.array([[9.0] * 6, [2.0, 1.0, 0.4, 0.3, 0.5, 4.0], [9.0] * 6]))
     design = SimpleNamespace(transmissibility=SimpleNamespace(band_Hz=[1.0, 10.0]), keep=["z", "phi_x"])
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))
     assert said in found and "z and phi_x" in found and "locked" in found
+    # Of the band only, and of the axes that the design leaves out.
+    assert "with at most x +6.0 dB, y +0.0 dB, phi_y -6.0 dB and phi_z +12.0 dB" in found
 
 
 def test_without_bounds_none_are_said_to_hold():
     """Robust stability is not proved: the worst cases are infinite, and the nominal loop alone can be told."""
     nothing = SimpleNamespace(upper=np.inf)
-    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]))
+    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]),
+                          alone=np.array([[9.0] * 6, [2.0, 1.0, 0.4, 0.3, 0.5, 4.0], [9.0] * 6]))
     design = SimpleNamespace(transmissibility=SimpleNamespace(band_Hz=[1.0, 10.0]), keep=["z", "phi_x"])
     mu = SimpleNamespace(worst_peak=nothing, worst_band=nothing)
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))

@@ -36,7 +36,7 @@ def places(found: GapFinding) -> Section:
 
 def _nowhere(gap: Gap) -> str:
     if gap.verdict == "none":
-        return ("As a whole the residual does not exceed the noise. Single bands that do are listed in the section on "
+        return ("No effect is named. The bands in which the residual exceeds the noise are listed in the section on "
                 "the residual." if gap.remaining else "No band of any channel exceeds the noise significantly.")
     return "The places of the gap were not stated."
 
