@@ -40,7 +40,7 @@ class PathSettings(NamedTuple):
 SETTINGS = PathSettings()
 
 
-class FormEntries(NamedTuple):
+class Entries(NamedTuple):
     """Non-zero entries of the matrices K_k: indices, value, parameter k, and whether lambda multiplies the entry."""
 
     row: np.ndarray
@@ -52,7 +52,7 @@ class FormEntries(NamedTuple):
 
 
 @njit(cache=True)
-def _matrix(theta: Array, entries: FormEntries, lam: float) -> Array:
+def _matrix(theta: Array, entries: Entries, lam: float) -> Array:
     K = np.zeros((entries.size, entries.size), np.complex128)
     for e in range(entries.row.size):
         weight = lam if entries.on_level[e] else 1.0
@@ -124,7 +124,7 @@ def _residual(M: Array, K: Array) -> Array:
 
 
 @njit(cache=True)
-def _add_derivatives(T: Array, entries: FormEntries, lam: float, gradient: Array, hessian: Array) -> None:
+def _add_derivatives(T: Array, entries: Entries, lam: float, gradient: Array, hessian: Array) -> None:
     """Subtract tr(T K_k) from the gradient and add tr(T K_k T K_l), l <= k, to the Hessian's lower triangle.
 
     The entries are sorted by parameter. All matrices are Hermitian, so that only entries on and above the diagonal of
@@ -160,7 +160,7 @@ def _gram(M: Array, S: Array) -> Array:
 
 
 @njit(cache=True)
-def _add_slope(T: Array, K: Array, entries: FormEntries, lam: float, slope: Array) -> None:
+def _add_slope(T: Array, K: Array, entries: Entries, lam: float, slope: Array) -> None:
     """Derivative of the gradient by lambda, from dT = -T Xp T with Xp = dK / d lambda, and from entries with lambda."""
     n = entries.size
     W = np.zeros((n, n), np.complex128)
@@ -207,7 +207,7 @@ def _newton(hessian: Array, right: Array, is_g: Array) -> Array:
 
 
 @njit(cache=True)
-def _to_centre(M: Array, x: Array, lam: float, form: FormEntries, core: FormEntries, trace: Array, is_g: Array,
+def _to_centre(M: Array, x: Array, lam: float, form: Entries, core: Entries, trace: Array, is_g: Array,
                settings: PathSettings) -> Array:
     """Move x (p,) to the analytic centre at lam and return d x / d lambda, the direction of the path of centres.
 
@@ -247,7 +247,7 @@ def _positive(A: Array) -> bool:
 
 
 @njit(cache=True)
-def _inside(M: Array, x: Array, lam: float, form: FormEntries, core: FormEntries) -> bool:
+def _inside(M: Array, x: Array, lam: float, form: Entries, core: Entries) -> bool:
     """Whether F > 0 and X > 0."""
     if not np.all(np.isfinite(x)) or not np.isfinite(_inverse(_matrix(x, core, 1.0))[0, 0].real):
         return False
@@ -258,7 +258,7 @@ def _inside(M: Array, x: Array, lam: float, form: FormEntries, core: FormEntries
 
 
 @njit(cache=True)
-def _speed(M: Array, x: Array, lam: float, direction: Array, form: FormEntries, core: FormEntries) -> float:
+def _speed(M: Array, x: Array, lam: float, direction: Array, form: Entries, core: Entries) -> float:
     """Frobenius norm of d (F, X) / d lambda along the path, in the metric of F and X. It is an upper bound of the
     largest eigenvalue, whose inverse is the distance to the boundary."""
     K, moved = _matrix(x, form, lam), _matrix(direction, form, lam)
@@ -274,7 +274,7 @@ def _speed(M: Array, x: Array, lam: float, direction: Array, form: FormEntries, 
 
 
 @njit(cache=True)
-def follow_path(M: Array, theta: Array, lam: Array, floor: Array, form: FormEntries, core: FormEntries, trace: Array,
+def follow_path(M: Array, theta: Array, lam: Array, floor: Array, form: Entries, core: Entries, trace: Array,
                 is_g: Array, tolerance: float, settings: PathSettings) -> None:
     """Move scalings theta (B, p) and levels lam (B,) in place along the path of centres down to the minimum level or to
     `floor` (B,); each pair remains feasible.

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.robust.mu_kernel import SETTINGS, FormEntries, follow_path
+from avis_ctrl.robust.mu_kernel import SETTINGS, Entries, follow_path
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Array = np.ndarray
@@ -57,9 +57,9 @@ class LinearForm:
         flat = T.reshape(T.shape[0], -1)
         return (flat[:, self.col * self.size + self.row] * (self.value * weight)).real @ self.incidence.T
 
-    def entries(self, on_level: Array) -> FormEntries:
+    def entries(self, on_level: Array) -> Entries:
         """The entries in the form of the compiled code; `on_level` marks the entries multiplied by lambda."""
-        return FormEntries(self.row, self.col, self.value, self.parameter, on_level, self.size)
+        return Entries(self.row, self.col, self.value, self.parameter, on_level, self.size)
 
 
 @dataclass(frozen=True)
