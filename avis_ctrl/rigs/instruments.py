@@ -18,7 +18,7 @@ from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
-from avis_ctrl.rigs.floor_motion import DERIVATIVES as ORDER
+from avis_ctrl.rigs.floor_motion import DERIVATIVES
 from avis_ctrl.rigs.floor_motion import Quantity
 
 Triple = tuple[float, float, float]
@@ -128,7 +128,7 @@ class Sensor(Channel):
     def as_velocity(self, omega: np.ndarray) -> np.ndarray:
         """Response (n,) of the chain from velocity with unit passband gain, at omega > 0 [rad/s]."""
         s = 1j * np.asarray(omega, float)
-        chain = self.leading * s ** (ORDER[self.quantity] - 1)
+        chain = self.leading * s ** (DERIVATIVES[self.quantity] - 1)
         for zero in self.zeros:
             chain = chain * (s - zero)
         for pole in self.poles:

@@ -23,7 +23,7 @@ from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
-from avis_ctrl.rigs.instruments import ORDER
+from avis_ctrl.rigs.floor_motion import DERIVATIVES
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import conditioning
@@ -63,7 +63,7 @@ class SensorBank:
 
     def __post_init__(self) -> None:
         n = len(self.chains)
-        if len(self.quantities) != n or not set(self.quantities) <= set(ORDER):
+        if len(self.quantities) != n or not set(self.quantities) <= set(DERIVATIVES):
             raise InputError(f"velocity, acceleration or displacement for each of {n} sensors", field="quantity",
                              value=self.quantity)
         if len(self.filters) != n:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.rigs.instruments import ORDER
+from avis_ctrl.rigs.floor_motion import DERIVATIVES
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
@@ -130,7 +130,7 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
         moved = moved + loop.plant.tilt_rows() @ velocity / s ** 2
     against = np.array([kind == "displacement" for kind in loop.sensors.quantities])
     moved[:, against, :n] -= H[against] * (sinc ** 2)[:, None, None]
-    power = np.array([ORDER[kind] - 1 for kind in loop.sensors.quantities])
+    power = np.array([DERIVATIVES[kind] - 1 for kind in loop.sensors.quantities])
     sensed = moved * s ** power[:, None] * _diagonal(loop.sensors.chains, image)[:, :, None]
     return [velocity[:, :, :n], velocity[:, :, n:], sensed[:, :, :n], sensed[:, :, n:]]
 

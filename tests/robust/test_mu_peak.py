@@ -485,3 +485,16 @@ def test_worst_case_gain_where_mu_is_exactly_one():
     loop = StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
     found = worst_case_gain(loop, [R()])
     assert found.upper == found.lower == np.inf
+
+
+def test_a_hidden_mode_at_the_limit_of_stability_is_an_error():
+    """Two masses and a spring, angles as states, the speed fed back: the common angle has a pole at zero, which
+    eigenvalue computation moves to about -1e-13."""
+    k, c, J = 800.0, 0.05, (0.02, 0.05)
+    A = np.array([[0, 1, 0, 0], [-k / J[0], -c / J[0], k / J[0], c / J[0]],
+                  [0, 0, 0, 1], [k / J[1], c / J[1], -k / J[1], -c / J[1]]])
+    A[1, 1] -= 0.8 / J[0]
+    for shift in (0.0, 1e-15):
+        loop = StateSpace(A - shift * np.eye(4), [[0], [1 / J[0]], [0], [0]], [[0, 1, 0, 0]], [[0.0]])
+        with pytest.raises(ComputationError, match=r"need a stable system.*at the limit of stability"):
+            mu_peak(loop, [ComplexScalar(1)])
