@@ -18,8 +18,7 @@ from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
-from avis_ctrl.rigs.floor_motion import DERIVATIVES
-from avis_ctrl.rigs.floor_motion import Quantity
+from avis_ctrl.rigs.floor_motion import DERIVATIVES, Quantity
 
 Triple = tuple[float, float, float]
 

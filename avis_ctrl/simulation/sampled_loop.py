@@ -22,8 +22,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.rigs.floor_spectrum import SpectrumModel
 from avis_ctrl.rigs.floor_motion import DERIVATIVES
+from avis_ctrl.rigs.floor_spectrum import SpectrumModel
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import conditioning
