@@ -19,6 +19,7 @@ install: $(BIN)/.installed
 
 lint: $(BIN)/.installed
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 # By file, so that what the tests of a file share is computed once.

@@ -11,8 +11,11 @@ from avis_ctrl.errors import InputError
 
 def is_number(value: object) -> bool:
     """Whether a value is a finite real number."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(
-        np.isfinite(value))
+    return (
+        isinstance(value, (int, float, np.integer, np.floating))
+        and not isinstance(value, bool)
+        and bool(np.isfinite(value))
+    )
 
 
 def require(value: float, field: str, low: float = 0.0, high: float = np.inf) -> None:
@@ -25,8 +28,11 @@ def require(value: float, field: str, low: float = 0.0, high: float = np.inf) ->
 def require_positive(value: float, field: str, *, zero_allowed: bool = False) -> None:
     """Raise InputError naming the field unless the value is finite and positive (or zero if allowed)."""
     if not (is_number(value) and (value > 0 or (zero_allowed and value == 0))):
-        raise InputError(f"expected a finite number, {'zero or positive' if zero_allowed else 'greater than zero'}",
-                         field=field, value=value)
+        raise InputError(
+            f"expected a finite number, {'zero or positive' if zero_allowed else 'greater than zero'}",
+            field=field,
+            value=value,
+        )
 
 
 def require_whole(value: int, field: str, least: int) -> None:

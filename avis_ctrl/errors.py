@@ -53,8 +53,12 @@ class ComputationError(AvisError, ArithmeticError):
     exit_code = 3
 
     def __init__(self, failed: str, *, measured: str = "", cause: str = "", next_step: str = ""):
-        parts = [failed, measured and f"measured: {measured}", cause and f"likely cause: {cause}",
-                 next_step and f"next: {next_step}"]
+        parts = [
+            failed,
+            measured and f"measured: {measured}",
+            cause and f"likely cause: {cause}",
+            next_step and f"next: {next_step}",
+        ]
         super().__init__("; ".join(part for part in parts if part))
         self.failed, self.measured, self.cause, self.next_step = failed, measured, cause, next_step
 

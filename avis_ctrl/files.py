@@ -94,28 +94,42 @@ def write_together(folder: Path, contents: Mapping[str, bytes], old: Iterable[Pa
             raise _incomplete(folder, [folder / name for name in contents], removed, placed, error) from None
         raise not_written(folder, error) from None
     except ComputationError as error:
-        raise ComputationError(f"{folder} was not written; what was there before is untouched", cause=error.cause,
-                               next_step=error.next_step) from None
+        raise ComputationError(
+            f"{folder} was not written; what was there before is untouched",
+            cause=error.cause,
+            next_step=error.next_step,
+        ) from None
     return placed
 
 
-def _incomplete(folder: Path, asked: list[Path], removed: list[Path], placed: list[Path], error: OSError
-                ) -> ComputationError:
+def _incomplete(
+    folder: Path, asked: list[Path], removed: list[Path], placed: list[Path], error: OSError
+) -> ComputationError:
     rest = [path for path in dict.fromkeys((*asked, *removed)) if path not in placed]
-    states = {"missing": [path for path in rest if not os.path.lexists(path)], "new": placed,
-              "of an earlier run": [path for path in rest if os.path.lexists(path)]}
-    said = "; ".join(f"{state}: {', '.join(os.path.relpath(path, folder) for path in paths)}"
-                     for state, paths in states.items() if paths)
-    return ComputationError(f"{folder} is incomplete, do not use what is in it ({said})",
-                            cause=str(error.strerror or error),
-                            next_step="run the command again, or choose another place with --out")
+    states = {
+        "missing": [path for path in rest if not os.path.lexists(path)],
+        "new": placed,
+        "of an earlier run": [path for path in rest if os.path.lexists(path)],
+    }
+    said = "; ".join(
+        f"{state}: {', '.join(os.path.relpath(path, folder) for path in paths)}"
+        for state, paths in states.items()
+        if paths
+    )
+    return ComputationError(
+        f"{folder} is incomplete, do not use what is in it ({said})",
+        cause=str(error.strerror or error),
+        next_step="run the command again, or choose another place with --out",
+    )
 
 
 def not_written(path: Path, error: OSError) -> ComputationError:
     """The error of a disk that is full or fails."""
-    return ComputationError(f"{path} was not written; what was there before is untouched",
-                            cause=str(error.strerror or error),
-                            next_step="free some space or choose another place with --out")
+    return ComputationError(
+        f"{path} was not written; what was there before is untouched",
+        cause=str(error.strerror or error),
+        next_step="free some space or choose another place with --out",
+    )
 
 
 def _refused(path: Path, error: OSError) -> AvisError:

@@ -42,18 +42,20 @@ def in_short(value: Any) -> str:
     if isinstance(value, Enum):
         return value.name
     text = repr(value)
-    return text if len(text) <= SETTINGS.longest else f"{text[:SETTINGS.longest - 3]}..."
+    return text if len(text) <= SETTINGS.longest else f"{text[: SETTINGS.longest - 3]}..."
 
 
 def count_of(number: int, noun: str) -> str:
-    """"1 state", "2 states"."""
+    """ "1 state", "2 states"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), title: str = "") -> str:
     """A plain HTML table; everything is escaped."""
+
     def line(cells: Sequence[str], tag: str) -> str:
         return "".join(["<tr>", *(f"<{tag} style='text-align:left'>{escape(str(c))}</{tag}>" for c in cells), "</tr>"])
+
     caption = f"<caption><b>{escape(title)}</b></caption>" if title else ""
     return f"<table>{caption}{line(head, 'th') if head else ''}{''.join(line(row, 'td') for row in rows)}</table>"
 

@@ -17,7 +17,7 @@ def rounded(value: float, std: float) -> tuple[str, str]:
     if -4 <= places <= 9 and abs(value) < 1e7:
         return f"{round(value, places):.{max(places, 0)}f}", f"{round(std, places):.{max(places, 0)}f}"
     power = math.floor(math.log10(abs(value) or std))
-    first, second = (f"{v / 10.0 ** power:.{max(places + power, 0)}f}e{power}" for v in (value, std))
+    first, second = (f"{v / 10.0**power:.{max(places + power, 0)}f}e{power}" for v in (value, std))
     return first, second
 
 

@@ -31,8 +31,9 @@ def main() -> None:
     arguments = parser.parse_args()
     script = runpy.run_path(str(DESIGN))
     print(f"{os.cpu_count()} processors, load average {os.getloadavg()[0]:.1f}")
-    print(f"{'axes':>4s} {'plant order':>11s} {'blocks':>6s} {'controller order':>16s} {'mu upper':>8s} "
-          f"{'time [s]':>8s}")
+    print(
+        f"{'axes':>4s} {'plant order':>11s} {'blocks':>6s} {'controller order':>16s} {'mu upper':>8s} {'time [s]':>8s}"
+    )
     orders, seconds = [], []
     for count in arguments.axes:
         began = time.perf_counter()
@@ -41,8 +42,11 @@ def main() -> None:
         plant, mu = study.result.plant.synthesis, study.result.controller("mu")
         orders.append(plant.P.nstates)
         seconds.append(elapsed)
-        print(f"{count:4d} {orders[-1]:11d} {len(plant.blocks.blocks):6d} {mu.order:16d} {mu.mu.upper:8.3f} "
-              f"{elapsed:8.1f}", flush=True)
+        print(
+            f"{count:4d} {orders[-1]:11d} {len(plant.blocks.blocks):6d} {mu.order:16d} {mu.mu.upper:8.3f} "
+            f"{elapsed:8.1f}",
+            flush=True,
+        )
     if len(orders) > 1:
         print(f"exponent {np.polyfit(np.log(orders), np.log(seconds), 1)[0]:.2f}")
 

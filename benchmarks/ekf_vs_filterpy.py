@@ -34,12 +34,14 @@ PERIOD_s, SETS = 1e-3, 10
 def wrong_rig(rig: Rig, seed: int = 5) -> Rig:
     """The source's 26 parameters off by up to 25 %."""
     draw = np.random.default_rng(seed)
-    return rig.with_parameters({name: rig.parameters()[name].value * (1 + draw.uniform(-0.25, 0.25))
-                                for name in source_parameters(rig)})
+    return rig.with_parameters(
+        {name: rig.parameters()[name].value * (1 + draw.uniform(-0.25, 0.25)) for name in source_parameters(rig)}
+    )
 
 
-def flow(model: LinearModel, x: np.ndarray, s: np.ndarray, u: np.ndarray, h: float
-         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flow(
+    model: LinearModel, x: np.ndarray, s: np.ndarray, u: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x after a sample, Phi and Psi: terms (A h)^k / k! of state and sensitivities together."""
     theta, n = model.values * s, model.n_q
     M, C, K = model.matrices(theta)
@@ -96,14 +98,16 @@ def compare(rig: Rig, start: Rig, samples: int) -> None:
         began = time.process_time()
         ours.filter(u[:count], y[:count], count)
         seconds = time.process_time() - began
-    variance = np.diag(ours.covariance)[:len(ours.state.s)]
+    variance = np.diag(ours.covariance)[: len(ours.state.s)]
     print(f"{samples} samples, 12 + 26 states, 6 measurements")
     print(f"{'':<30}{'us per sample':>14}{'ratio':>8}")
     print(f"{'filterpy and numpy':<30}{theirs / samples * 1e6:>14.1f}{theirs / seconds:>8.1f}")
     print(f"{'  of which filterpy.update':<30}{updating / samples * 1e6:>14.1f}{updating / seconds:>8.1f}")
     print(f"{'ours':<30}{seconds / samples * 1e6:>14.1f}{1.0:>8.1f}")
-    print("largest difference of estimates, in their standard deviations: "
-          f"{np.max(np.abs(ours.state.s - theirs_s) / np.sqrt(variance)):.2e}")
+    print(
+        "largest difference of estimates, in their standard deviations: "
+        f"{np.max(np.abs(ours.state.s - theirs_s) / np.sqrt(variance)):.2e}"
+    )
     print(f"largest relative difference of variances: {np.max(np.abs(theirs_variance / variance - 1)):.2e}")
 
 
@@ -117,8 +121,10 @@ def campaign(rig: Rig, start: Rig, samples: int) -> None:
     seconds, wall = time.process_time() - began, time.perf_counter() - wall
     found = dict(zip(result.names, result.values, strict=True))
     error = max(abs(found[name] / rig.parameters()[name].value - 1) for name in ("mass", "J1", "J2", "J3"))
-    print(f"{SETS} records of {duration:g} s: {seconds:.1f} s of processor ({wall:.1f} s of clock), "
-          f"{seconds / samples * 1e6:.1f} us per sample; mass and inertias to {error:.1e}")
+    print(
+        f"{SETS} records of {duration:g} s: {seconds:.1f} s of processor ({wall:.1f} s of clock), "
+        f"{seconds / samples * 1e6:.1f} us per sample; mass and inertias to {error:.1e}"
+    )
     print(f"peak memory of the process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 

@@ -85,12 +85,13 @@ def with_tolerances(plant: table.Plant, rng: np.random.Generator) -> None:
     plant.J = plant.J - np.array([[0, products[0], products[1]], [products[0], 0, products[2]], [*products[1:], 0]])
 
 
-def hidden_effects(plant: table.Plant, rng: np.random.Generator, band: tuple[float, float], level: float,
-                   span_s: float) -> tuple[Hidden, ...]:
+def hidden_effects(
+    plant: table.Plant, rng: np.random.Generator, band: tuple[float, float], level: float, span_s: float
+) -> tuple[Hidden, ...]:
     """None, one, two, or one from outside the library."""
     kind = str(rng.choice(["none", "one", "two", "outside"], p=[0.25, 0.4, 0.15, 0.2]))
     library = cases.OUTSIDE_LIBRARY if kind == "outside" else cases.LIBRARY
-    names = rng.permutation(list(library))[:{"none": 0, "one": 1, "two": 2, "outside": 1}[kind]]
+    names = rng.permutation(list(library))[: {"none": 0, "one": 1, "two": 2, "outside": 1}[kind]]
     found = []
     for name in map(str, names):
         strength = str(rng.choice(["faint", "clear", "gross"], p=[0.25, 0.45, 0.3]))
@@ -101,8 +102,9 @@ def hidden_effects(plant: table.Plant, rng: np.random.Generator, band: tuple[flo
     return tuple(found)
 
 
-def voltages(form: str, rng: np.random.Generator, rate: float, band: tuple[float, float], inputs: np.ndarray
-             ) -> tuple[list[np.ndarray], str, float | None]:
+def voltages(
+    form: str, rng: np.random.Generator, rate: float, band: tuple[float, float], inputs: np.ndarray
+) -> tuple[list[np.ndarray], str, float | None]:
     """Voltages of each record (samples, 8) of r.m.s. about 1, the excitation's name, its period [s].
 
     inputs : (6, 8) forces and moments of one volt, by which the logical axes are dealt to the drives.
@@ -154,8 +156,16 @@ def truth_campaign(seed: int) -> tuple[Campaign, str, bool]:
     slope, measured, before = float(rng.uniform(0, 1)), bool(rng.random() < 0.5), round(SETTLE_S * rate)
     records, start = [], 0.0
     for k, (shape, level) in enumerate(zip(shapes, levels, strict=True)):
-        floor = floor_motion(np.random.default_rng((seed, 2, k)), before + len(shape) + 1, rate,
-                             rig.ambient.floor_velocity_rms_m_per_s, slope) * plant.floor_factor
+        floor = (
+            floor_motion(
+                np.random.default_rng((seed, 2, k)),
+                before + len(shape) + 1,
+                rate,
+                rig.ambient.floor_velocity_rms_m_per_s,
+                slope,
+            )
+            * plant.floor_factor
+        )
         while True:
             u, draw = level * shape, np.random.default_rng((seed, 3, k))
             y = cases.run(plant, u, floor, before, start, draw)[0]
@@ -163,8 +173,18 @@ def truth_campaign(seed: int) -> tuple[Campaign, str, bool]:
                 break
             level *= 0.6
         rms = float(np.sqrt(np.mean(u[:, u.any(axis=0)] ** 2)))
-        header = RecordHeader(f"{k:02d}", rate, len(u), plant.motors, plant.sensors, excitation, rms, start, period_s,
-                              floor_names=FLOOR_NAMES if measured else ())
+        header = RecordHeader(
+            f"{k:02d}",
+            rate,
+            len(u),
+            plant.motors,
+            plant.sensors,
+            excitation,
+            rms,
+            start,
+            period_s,
+            floor_names=FLOOR_NAMES if measured else (),
+        )
         y = cases.convert(plant, y, start, draw)
         records.append(Record(header, u, y, floor[before:-1, 3:6] if measured else None))
         start += len(u) / rate + float(round(rng.uniform(10, 300)))
@@ -180,12 +200,21 @@ def own_campaign(seed: int) -> tuple[Campaign, str, bool]:
     scheme = str(rng.choice(["zippered", "orthogonal"]))
     lag = float(rng.uniform(30, 300)) if rng.random() < 0.5 else None
     short = kind == "multisine" and scheme == "orthogonal"
-    plan = CampaignPlan.model_validate({
-        "duration_s": 6.0 if short else 12.0, "settle_s": 3.0, "amplifier_corner_Hz": lag, "band_Hz": [0.5, 60.0],
-        "ambient": {"velocity_rms_m_per_s": 2e-6}, "multisine": {"period_s": 2.0, "scheme": scheme, "low_crest": False},
-        "floor_sensor": {"recorded": bool(rng.random() < 0.5)},
-        "record": [{"excitation": kind, "level_percent": percent, "records": 1 if short else 2}
-                   for percent in ((50.0,) if short else (40.0, 15.0))]})
+    plan = CampaignPlan.model_validate(
+        {
+            "duration_s": 6.0 if short else 12.0,
+            "settle_s": 3.0,
+            "amplifier_corner_Hz": lag,
+            "band_Hz": [0.5, 60.0],
+            "ambient": {"velocity_rms_m_per_s": 2e-6},
+            "multisine": {"period_s": 2.0, "scheme": scheme, "low_crest": False},
+            "floor_sensor": {"recorded": bool(rng.random() < 0.5)},
+            "record": [
+                {"excitation": kind, "level_percent": percent, "records": 1 if short else 2}
+                for percent in ((50.0,) if short else (40.0, 15.0))
+            ],
+        }
+    )
     campaign = simulate_campaign(rig, plan, seed, truth=perturbed_truth(rig, seed=seed))
     return replace(campaign, rig=name), f"{name}, {kind} {scheme if kind == 'multisine' else ''}: lag {lag}", False
 
@@ -202,8 +231,13 @@ def _pair(of: Signals, which: int, rng: np.random.Generator, names: tuple[str, .
     return {names[i], names[k]}
 
 
-def _each(of: Signals, which: int, rng: np.random.Generator, names: tuple[str, ...],
-          change: Callable[[np.ndarray], np.ndarray]) -> set[str]:
+def _each(
+    of: Signals,
+    which: int,
+    rng: np.random.Generator,
+    names: tuple[str, ...],
+    change: Callable[[np.ndarray], np.ndarray],
+) -> set[str]:
     j = int(rng.integers(len(names)))
     for one in of:
         one[which][:, j] = change(one[which][:, j])
@@ -220,7 +254,7 @@ def _lost(of: Signals, rng: np.random.Generator) -> set[str]:
 def _repeated(of: Signals, rng: np.random.Generator) -> set[str]:
     one, rows = of[int(rng.integers(len(of)))], 256
     at = int(rng.uniform(0.3, 0.7) * len(one[1]))
-    one[1][at:at + rows] = one[1][at - rows:at]
+    one[1][at : at + rows] = one[1][at - rows : at]
     return set()
 
 
@@ -252,15 +286,19 @@ FAULTS: dict[str, tuple[tuple[str, ...], Fault]] = {
     "drive reversed": (("polarity",), lambda of, rng, u, y: _each(of, 0, rng, u, lambda x: -x)),
     "sensor constant": (("dead channel",), lambda of, rng, u, y: _each(of, 1, rng, y, lambda x: 0.3 + 0 * x)),
     "sensor noise alone": (("dead channel",), lambda of, rng, u, y: _each(of, 1, rng, y, _noise)),
-    "sensor clipped": (("clipping",), lambda of, rng, u, y: _each(
-        of, 1, rng, y, lambda x: np.clip(x, -0.6 * np.abs(x).max(), 0.6 * np.abs(x).max()))),
+    "sensor clipped": (
+        ("clipping",),
+        lambda of, rng, u, y: _each(of, 1, rng, y, lambda x: np.clip(x, -0.6 * np.abs(x).max(), 0.6 * np.abs(x).max())),
+    ),
     "samples lost": (("missing samples",), lambda of, rng, u, y: _lost(of, rng)),
     "block repeated": (("missing samples",), lambda of, rng, u, y: _repeated(of, rng)),
     "hum": (("hum",), lambda of, rng, u, y: _each(of, 1, rng, y, _hum)),
     "drift within records": (("periodicity",), lambda of, rng, u, y: _drift(of)),
     "spike": (("spikes",), lambda of, rng, u, y: _spike(of, rng, y)),
-    "one sensor 30 ms late": (("missing samples", "channel order", "polarity"), lambda of, rng, u, y: _each(
-        of, 1, rng, y, lambda x: np.concatenate([np.zeros(30), x[:-30]]))),
+    "one sensor 30 ms late": (
+        ("missing samples", "channel order", "polarity"),
+        lambda of, rng, u, y: _each(of, 1, rng, y, lambda x: np.concatenate([np.zeros(30), x[:-30]])),
+    ),
 }
 
 
@@ -272,8 +310,9 @@ def with_fault(campaign: Campaign, name: str, seed: int) -> tuple[Campaign, set[
     records = []
     for one, (u, y) in zip(loaded, signals, strict=True):
         n = min(len(u), len(y))
-        records.append(Record(replace(one.header, samples=n), u[:n], y[:n], None if one.floor is None else
-                              one.floor[:n]))
+        records.append(
+            Record(replace(one.header, samples=n), u[:n], y[:n], None if one.floor is None else one.floor[:n])
+        )
     return replace(campaign, records=tuple(records)), channels
 
 
@@ -306,8 +345,10 @@ def judge(seed: int, faults: tuple[str, ...], keep: Path | None) -> Outcome | No
         fault = faults[seed % len(faults)]
         broken, channels = with_fault(campaign, fault, seed)
         findings = examine(broken, known)
-        found = any(f.gate in FAULTS[fault][0] and f.severity in ("warning", "stop") and channels <= set(f.channels)
-                    for f in findings)
+        found = any(
+            f.gate in FAULTS[fault][0] and f.severity in ("warning", "stop") and channels <= set(f.channels)
+            for f in findings
+        )
         return Outcome(seed, words, faulty, sound, fault, found, grave(findings))
 
 
@@ -332,8 +373,10 @@ def report(outcomes: list[Outcome]) -> str:
     plain = [o for o in outcomes if not o.faulty]
     stopped = [o for o in plain if any(s == "stop" for s, _, _ in o.sound)]
     share, most = len(stopped) / max(len(plain), 1), bound(len(stopped), len(plain))
-    lines.append(f"  any gate          {len(stopped):4d} of {len(plain)} = {100 * share:.2f} %,"
-                 f" surely (95 %) below {100 * most:.2f} %")
+    lines.append(
+        f"  any gate          {len(stopped):4d} of {len(plain)} = {100 * share:.2f} %,"
+        f" surely (95 %) below {100 * most:.2f} %"
+    )
     for severity in ("stop", "warning"):
         count = Counter(gate for o in plain for gate in {g for s, g, _ in o.sound if s == severity})
         lines += [f"  {severity:8s} {gate:18s} {k:4d}" for gate, k in sorted(count.items())]
@@ -360,8 +403,9 @@ def main() -> None:
     faults = tuple(given.faults.split(","))
     with ProcessPoolExecutor(given.processes, mp_context=get_context("spawn")) as pool:
         outcomes = []
-        for o in pool.map(partial(judge, faults=faults, keep=given.keep),
-                          range(given.first, given.first + given.count)):
+        for o in pool.map(
+            partial(judge, faults=faults, keep=given.keep), range(given.first, given.first + given.count)
+        ):
             if o is None:
                 print("one campaign is left out: its table is unstable", flush=True)
                 continue

@@ -26,13 +26,26 @@ TWO_PI = 2 * np.pi
 def disturbance_process() -> tuple[StateSpace, int, int]:
     """S/KS problem of Skogestad and Postlethwaite, example 2.17 (4 states)."""
     G = tf([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])), ["u"], ["g"])
-    return connect([G, summing_junction("e", ["r", "-g"]), tf([1 / 1.5, 10], [1, 1e-3], ["e"], ["wp"]),
-                    gain([[1.0]], ["u"], ["wu"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["wp", "wu", "y"]), 1, 1
+    return (
+        connect(
+            [
+                G,
+                summing_junction("e", ["r", "-g"]),
+                tf([1 / 1.5, 10], [1, 1e-3], ["e"], ["wp"]),
+                gain([[1.0]], ["u"], ["wu"]),
+                gain([[1.0]], ["e"], ["y"]),
+            ],
+            ["r", "u"],
+            ["wp", "wu", "y"],
+        ),
+        1,
+        1,
+    )
 
 
 def mounted_axis(axis: str, w0: float, zeta: float) -> StateSpace:
     """x = (2 zeta w0 s + w0^2) / d floor + w0^2 / d force, d = s^2 + 2 zeta w0 s + w0^2, in observer form."""
-    A, B = [[0.0, -w0 ** 2], [1.0, -2 * zeta * w0]], [[w0 ** 2, w0 ** 2], [2 * zeta * w0, 0.0]]
+    A, B = [[0.0, -(w0**2)], [1.0, -2 * zeta * w0]], [[w0**2, w0**2], [2 * zeta * w0, 0.0]]
     return StateSpace(A, B, [[0.0, 1.0]], [[0.0, 0.0]], 0.0, [f"floor_{axis}", f"force_{axis}"], [f"x_{axis}"])
 
 
@@ -44,12 +57,13 @@ def isolation_table() -> tuple[StateSpace, int, int]:
         parts[f"lag_{axis}"] = tf([TWO_PI * 150], [1, TWO_PI * 150], [f"drive_{axis}"], [f"lagged_{axis}"])
         parts[f"sum_{axis}"] = summing_junction(f"force_{axis}", [f"lagged_{axis}", f"wd_{axis}"])
         parts[f"unc_{axis}"] = tf([1, TWO_PI * 8], [0.1, TWO_PI * 80], [f"drive_{axis}"], [f"zd_{axis}"])
-        parts[f"geo_{axis}"] = tf([1, 0, 0], [1, 1.4 * TWO_PI, TWO_PI ** 2], [f"x_{axis}"], [f"seen_{axis}"])
+        parts[f"geo_{axis}"] = tf([1, 0, 0], [1, 1.4 * TWO_PI, TWO_PI**2], [f"x_{axis}"], [f"seen_{axis}"])
         parts[f"mix_{axis}"] = summing_junction(f"y_{axis}", [f"seen_{axis}", f"n_{axis}"])
         parts[f"noise_{axis}"] = gain([[0.01]], [f"wn_{axis}"], [f"n_{axis}"])
         parts[f"floor_{axis}"] = gain([[1.0]], [f"w_{axis}"], [f"floor_{axis}"])
-        parts[f"wp_{axis}"] = tf([0.5, 0, TWO_PI ** 2 * 4], [1, TWO_PI * 1.0, TWO_PI ** 2 * 0.5], [f"x_{axis}"],
-                                 [f"zp_{axis}"])
+        parts[f"wp_{axis}"] = tf(
+            [0.5, 0, TWO_PI**2 * 4], [1, TWO_PI * 1.0, TWO_PI**2 * 0.5], [f"x_{axis}"], [f"zp_{axis}"]
+        )
         parts[f"wu_{axis}"] = tf([1, TWO_PI * 10], [1, TWO_PI * 1000], [f"u_{axis}"], [f"zu_{axis}"])
         parts[f"in_{axis}"] = gain([[1.0]], [f"u_{axis}"], [f"drive_{axis}"])
     axes = ("z", "phi")
@@ -64,13 +78,13 @@ def random_modes(n: int, n_w: int, ncon: int, seed: int) -> tuple[StateSpace, in
     w0, zeta = TWO_PI * 10.0 ** rng.uniform(-0.5, 2, n // 2), rng.uniform(0.005, 0.2, n // 2)
     A = np.zeros((n, n))
     for k, (w, d) in enumerate(zip(w0, zeta, strict=True)):
-        A[2 * k:2 * k + 2, 2 * k:2 * k + 2] = [[0, w], [-w, -2 * d * w]]
+        A[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = [[0, w], [-w, -2 * d * w]]
     root = np.sqrt(np.repeat(w0, 2))
     B, C = rng.standard_normal((n, n_w + ncon)) * root[:, None], rng.standard_normal((n_w + ncon, n)) * root / 10
     B[::2] = 0
     D = np.zeros((n_w + ncon, n_w + ncon))
-    D[n_w - ncon:n_w, n_w:] = np.eye(ncon)
-    D[n_w:, n_w - ncon:n_w] = np.eye(ncon)
+    D[n_w - ncon : n_w, n_w:] = np.eye(ncon)
+    D[n_w:, n_w - ncon : n_w] = np.eye(ncon)
     D[:n_w, :n_w] = 0.2 * rng.standard_normal((n_w, n_w))
     return StateSpace(A, B, C, D), ncon, ncon
 
@@ -107,8 +121,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--limit", type=float, default=60.0, help="seconds allowed to SB10AD on each plant")
     limit = parser.parse_args().limit
-    print(f"{'plant':26s} {'states':>6s} | {'avis s':>7s} {'optimum':>9s} {'claimed':>9s} {'measured':>9s} "
-          f"{'fastest rad/s':>13s} | {'sb10ad s':>8s} {'claimed':>9s} {'measured':>9s} | {'time ratio':>10s}")
+    print(
+        f"{'plant':26s} {'states':>6s} | {'avis s':>7s} {'optimum':>9s} {'claimed':>9s} {'measured':>9s} "
+        f"{'fastest rad/s':>13s} | {'sb10ad s':>8s} {'claimed':>9s} {'measured':>9s} | {'time ratio':>10s}"
+    )
     for name, build in PLANTS.items():
         P, nmeas, ncon = build()
         with threadpool_limits(1):
@@ -125,9 +141,11 @@ def main() -> None:
             theirs = (limit, np.nan, np.nan, "time limit")
             process.terminate()
         process.join()
-        print(f"{name:26s} {P.nstates:6d} | {seconds:7.3f} {ours.gamma_optimal_bounds[1]:9.5g} {ours.gamma:9.5g} "
-              f"{measured(P, ours.K):9.5g} {ours.fastest_pole:13.4g} | {theirs[0]:8.3f} {theirs[1]:9.5g} "
-              f"{theirs[2]:9.5g} | {theirs[0] / seconds:10.3g} {theirs[3]}")
+        print(
+            f"{name:26s} {P.nstates:6d} | {seconds:7.3f} {ours.gamma_optimal_bounds[1]:9.5g} {ours.gamma:9.5g} "
+            f"{measured(P, ours.K):9.5g} {ours.fastest_pole:13.4g} | {theirs[0]:8.3f} {theirs[1]:9.5g} "
+            f"{theirs[2]:9.5g} | {theirs[0] / seconds:10.3g} {theirs[3]}"
+        )
 
 
 if __name__ == "__main__":

@@ -52,10 +52,15 @@ class Settings:
     band_Hz: tuple[float, float] = (0.5, 40.0)
 
     def plan(self) -> CampaignPlan:
-        return CampaignPlan.model_validate({
-            "duration_s": self.duration_s, "band_Hz": list(self.band_Hz), "floor_sensor": {"recorded": False},
-            "multisine": {"period_s": 10.0, "low_crest": False},
-            "record": [{"excitation": "multisine", "level_V": self.level_V, "records": self.records}]})
+        return CampaignPlan.model_validate(
+            {
+                "duration_s": self.duration_s,
+                "band_Hz": list(self.band_Hz),
+                "floor_sensor": {"recorded": False},
+                "multisine": {"period_s": 10.0, "low_crest": False},
+                "record": [{"excitation": "multisine", "level_V": self.level_V, "records": self.records}],
+            }
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +84,11 @@ def combinations(rig: AvisTable, names: Sequence[str]) -> dict[str, np.ndarray]:
     """What payload motion determines, from the geometry alone: body, and sums of stiffness and damping over mounts."""
     found = {name: np.eye(len(names))[names.index(name)] for name in ("mass", "J1", "J2", "J3")}
     x, y = (np.array([one.position[k] for one in rig.isolators]) for k in (0, 1))
-    sums = {"x": {"": 1 + 0 * x, "y ": y}, "y": {"": 1 + 0 * x, "x ": x},
-            "z": {"": 1 + 0 * x, "x ": x, "y ": y, "xy ": x * y}}
+    sums = {
+        "x": {"": 1 + 0 * x, "y ": y},
+        "y": {"": 1 + 0 * x, "x ": x},
+        "z": {"": 1 + 0 * x, "x ": x, "y ": y, "xy ": x * y},
+    }
     for kind in "kc":
         for axis, weights in sums.items():
             for word, weight in weights.items():
@@ -94,20 +102,22 @@ def combinations(rig: AvisTable, names: Sequence[str]) -> dict[str, np.ndarray]:
 def truth_of(rig: AvisTable, names: Sequence[str], rng: np.random.Generator) -> AvisTable:
     """5 % about the file's values, damping 20 %."""
     known = rig.parameters()
-    return rig.with_parameters({name: known[name].value * (1 + (0.2 if ".c_" in name else 0.05) * rng.uniform(-1, 1))
-                                for name in names})
+    return rig.with_parameters(
+        {name: known[name].value * (1 + (0.2 if ".c_" in name else 0.05) * rng.uniform(-1, 1)) for name in names}
+    )
 
 
 def true_noise(model: ResponseModel, omega: np.ndarray, plan: CampaignPlan) -> np.ndarray:
     """(n, n_y, n_y) covariance of a line of a transform over sqrt(samples): floor, sensors, rounding."""
     rig = model.rig
     assert rig.ambient is not None and rig.acquisition is not None
-    floor = shipped_spectrum(plan.ambient.spectrum).scaled_to_rms(rig.ambient.floor_velocity_rms_m_per_s,
-                                                                  *plan.ambient.band_Hz)
-    G = model.response(omega)[:, :, len(model.actuators):]
+    floor = shipped_spectrum(plan.ambient.spectrum).scaled_to_rms(
+        rig.ambient.floor_velocity_rms_m_per_s, *plan.ambient.band_Hz
+    )
+    G = model.response(omega)[:, :, len(model.actuators) :]
     line = floor.asd(omega / (2 * np.pi), "velocity") ** 2 * rig.sample_rate_Hz / 2
-    lsb = 2 * rig.acquisition.adc_range_V / 2 ** rig.acquisition.adc_bits
-    white = rig.ambient.sensor_noise_rms_V ** 2 + lsb ** 2 / 12
+    lsb = 2 * rig.acquisition.adc_range_V / 2**rig.acquisition.adc_bits
+    white = rig.ambient.sensor_noise_rms_V**2 + lsb**2 / 12
     return G @ np.conj(G.swapaxes(1, 2)) * line[:, None, None] + white * np.eye(G.shape[1])
 
 
@@ -134,10 +144,15 @@ def trial(settings: Settings, seed: int) -> Trial:
         information, best = found.fit.information, bound(true, campaign, settings)
         error = found.fit.values - true.values
         rows = combinations(rig, names).values()
-        return Trial(_directions(information, error), _directions(best, error),
-                     np.array([row @ error / information.of(row)[1] for row in rows]),
-                     np.array([row @ error / best.of(row)[1] for row in rows]),
-                     information.rank, found.first.chi2_per_dof, seconds)
+        return Trial(
+            _directions(information, error),
+            _directions(best, error),
+            np.array([row @ error / information.of(row)[1] for row in rows]),
+            np.array([row @ error / best.of(row)[1] for row in rows]),
+            information.rank,
+            found.first.chi2_per_dof,
+            seconds,
+        )
 
 
 def _directions(information: Information, error: np.ndarray) -> np.ndarray:
@@ -149,8 +164,8 @@ def _directions(information: Information, error: np.ndarray) -> np.ndarray:
 def wilson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Wilson's interval of a share (JASA 22, 1927, p. 209)."""
     z, p = float(norm.ppf((1 + level) / 2)), hits / trials
-    middle, half = p + z ** 2 / (2 * trials), z * np.sqrt(p * (1 - p) / trials + z ** 2 / (4 * trials ** 2))
-    return float((middle - half) / (1 + z ** 2 / trials)), float((middle + half) / (1 + z ** 2 / trials))
+    middle, half = p + z**2 / (2 * trials), z * np.sqrt(p * (1 - p) / trials + z**2 / (4 * trials**2))
+    return float((middle - half) / (1 + z**2 / trials)), float((middle + half) / (1 + z**2 / trials))
 
 
 def run(settings: Settings, seeds: Sequence[int], processes: int = 2) -> list[Trial]:
@@ -162,27 +177,37 @@ def run(settings: Settings, seeds: Sequence[int], processes: int = 2) -> list[Tr
 
 def print_report(trials: Sequence[Trial], names: Sequence[str]) -> None:
     ranks = sorted({one.rank for one in trials})
-    print(f"{len(trials)} campaigns; determined directions: {', '.join(map(str, ranks))}; chi-square per degree of "
-          f"freedom with measured noise {np.mean([one.chi2 for one in trials]):.3f}; "
-          f"{np.mean([one.seconds for one in trials]):.2f} s of processor time a fit")
+    print(
+        f"{len(trials)} campaigns; determined directions: {', '.join(map(str, ranks))}; chi-square per degree of "
+        f"freedom with measured noise {np.mean([one.chi2 for one in trials]):.3f}; "
+        f"{np.mean([one.seconds for one in trials]):.2f} s of processor time a fit"
+    )
     n = min(ranks)
-    z = {"direction": np.array([one.directions[:n] for one in trials]),
-         "combination": np.array([one.combinations for one in trials])}
-    b = {"direction": np.array([one.bound_directions[:n] for one in trials]),
-         "combination": np.array([one.bound_combinations for one in trials])}
+    z = {
+        "direction": np.array([one.directions[:n] for one in trials]),
+        "combination": np.array([one.combinations for one in trials]),
+    }
+    b = {
+        "direction": np.array([one.bound_directions[:n] for one in trials]),
+        "combination": np.array([one.bound_combinations for one in trials]),
+    }
     labels = {"direction": [f"direction {k + 1}" for k in range(n)], "combination": list(names)}
     for kind in z:
         inside = np.abs(z[kind]) <= QUANTILE
         low, high = wilson(int(inside.sum()), inside.size)
-        print(f"\nall {kind}s: {100 * inside.mean():.1f} % inside (Wilson {100 * low:.1f} to {100 * high:.1f} %), "
-              f"r.m.s. error {np.sqrt(np.mean(z[kind] ** 2)):.3f} of the claimed and "
-              f"{np.sqrt(np.mean(b[kind] ** 2)):.3f} of the Cramer-Rao bound")
+        print(
+            f"\nall {kind}s: {100 * inside.mean():.1f} % inside (Wilson {100 * low:.1f} to {100 * high:.1f} %), "
+            f"r.m.s. error {np.sqrt(np.mean(z[kind] ** 2)):.3f} of the claimed and "
+            f"{np.sqrt(np.mean(b[kind] ** 2)):.3f} of the Cramer-Rao bound"
+        )
         for k, label in enumerate(labels[kind]):
             hits = int(inside[:, k].sum())
             low, high = wilson(hits, len(trials))
-            print(f"  {label:>14s}: {100 * hits / len(trials):5.1f} % inside ({100 * low:5.1f} to {100 * high:5.1f} "
-                  f"%), r.m.s. error {np.sqrt(np.mean(z[kind][:, k] ** 2)):.3f} of the claimed, "
-                  f"{np.sqrt(np.mean(b[kind][:, k] ** 2)):.3f} of the bound, mean {np.mean(z[kind][:, k]):+.2f}")
+            print(
+                f"  {label:>14s}: {100 * hits / len(trials):5.1f} % inside ({100 * low:5.1f} to {100 * high:5.1f} "
+                f"%), r.m.s. error {np.sqrt(np.mean(z[kind][:, k] ** 2)):.3f} of the claimed, "
+                f"{np.sqrt(np.mean(b[kind][:, k] ** 2)):.3f} of the bound, mean {np.mean(z[kind][:, k]):+.2f}"
+            )
 
 
 def main() -> None:

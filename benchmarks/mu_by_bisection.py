@@ -37,13 +37,16 @@ def mu_upper_by_bisection(M: Array, blocks: BlockStructure | Sequence[Block], to
     margin = cp.Variable()
     left = matrix.conj().T @ X_z @ matrix + 1j * (G @ matrix - (G @ matrix).H) - beta2 * X_w
     hermitian = (left + left.H) / 2
-    constraints = [hermitian << margin * np.eye(structure.n_w), cp.real(cp.trace(X_w)) == structure.n_w,
-                   X_w >> 1e-9 * np.eye(structure.n_w)]
+    constraints = [
+        hermitian << margin * np.eye(structure.n_w),
+        cp.real(cp.trace(X_w)) == structure.n_w,
+        X_w >> 1e-9 * np.eye(structure.n_w),
+    ]
     problem = cp.Problem(cp.Minimize(margin), constraints)
     low, high = 0.0, 1.0
     while high - low > tolerance * high and high > 1e-6:
         beta = (low + high) / 2
-        beta2.value = beta ** 2
+        beta2.value = beta**2
         with warnings.catch_warnings():
             # The margin tends to zero as the bisection closes in: its sign is what is asked, not its digits.
             warnings.simplefilter("ignore", UserWarning)

@@ -1,6 +1,6 @@
 """Bounds of mu: time and value against LMI bisection (cvxpy, Clarabel) and SLICOT's AB13MD.
 
-    python -m benchmarks.mu_upper
+python -m benchmarks.mu_upper
 """
 
 from __future__ import annotations
@@ -31,20 +31,29 @@ SCALARS = (4, 8, 16, 24)
 
 def both_bounds(batch: int = 20, repeats: int = 5) -> None:
     """Both bounds for complex scalar blocks beside AB13MD, which gives the upper one: the least of some times, ms."""
-    print(f"{'complex scalars':>15s} {'one':>8s} {'its upper':>9s} {'of a batch':>10s} {'AB13MD':>8s} "
-          f"{'ratio one':>9s} {'batch':>6s} {'upper / AB13MD - 1':>24s} {'lower / upper':>16s}")
+    print(
+        f"{'complex scalars':>15s} {'one':>8s} {'its upper':>9s} {'of a batch':>10s} {'AB13MD':>8s} "
+        f"{'ratio one':>9s} {'batch':>6s} {'upper / AB13MD - 1':>24s} {'lower / upper':>16s}"
+    )
     rng = np.random.default_rng(0)
     for n in SCALARS:
         blocks = [ComplexScalar()] * n
         M = rng.standard_normal((batch, n, n)) + 1j * rng.standard_normal((batch, n, n))
-        one, upper, many, slicot = (min(_seconds(call) for _ in range(repeats)) * 1e3 / batch for call in (
-            lambda M=M, blocks=blocks: [mu(m, blocks) for m in M],
-            lambda M=M, blocks=blocks: [mu_upper(m, blocks) for m in M], lambda M=M, blocks=blocks: mu(M, blocks),
-            lambda M=M, blocks=blocks: [mu_upper_slicot(m, blocks) for m in M]))
+        one, upper, many, slicot = (
+            min(_seconds(call) for _ in range(repeats)) * 1e3 / batch
+            for call in (
+                lambda M=M, blocks=blocks: [mu(m, blocks) for m in M],
+                lambda M=M, blocks=blocks: [mu_upper(m, blocks) for m in M],
+                lambda M=M, blocks=blocks: mu(M, blocks),
+                lambda M=M, blocks=blocks: [mu_upper_slicot(m, blocks) for m in M],
+            )
+        )
         found, peer = mu(M, blocks), np.array([mu_upper_slicot(m, blocks) for m in M])
         above, ratio = np.asarray(found.upper) / peer - 1, np.asarray(found.lower) / found.upper
-        print(f"{n:15d} {one:8.2f} {upper:9.2f} {many:10.2f} {slicot:8.2f} {slicot / one:9.1f} {slicot / many:6.1f} "
-              f"{above.min():11.1e} .. {above.max():8.1e} {ratio.min():7.4f} .. {ratio.max():6.4f}")
+        print(
+            f"{n:15d} {one:8.2f} {upper:9.2f} {many:10.2f} {slicot:8.2f} {slicot / one:9.1f} {slicot / many:6.1f} "
+            f"{above.min():11.1e} .. {above.max():8.1e} {ratio.min():7.4f} .. {ratio.max():6.4f}"
+        )
 
 
 def _seconds(call: Callable[[], object]) -> float:
@@ -77,8 +86,9 @@ def main(frequencies: int = 60, compared: int = 3) -> None:
                     mu_upper_slicot(m, blocks)
                 slicot = f"{(time.perf_counter() - start) / compared * 1e3:.1f} ms"
             difference = np.max(np.abs(lmi / upper[:compared] - 1))
-            print(f"{name:38s} {own * 1e3:6.1f} ms {slow * 1e3:6.0f} ms {slow / own:7.0f} {slicot:>9s} "
-                  f"{difference:19.1e}")
+            print(
+                f"{name:38s} {own * 1e3:6.1f} ms {slow * 1e3:6.0f} ms {slow / own:7.0f} {slicot:>9s} {difference:19.1e}"
+            )
         both_bounds()
 
 

@@ -38,8 +38,11 @@ def peak_mu(N: StateSpace) -> float:
 def by_dkpy(example: dict[str, Any], iterations: int) -> tuple[StateSpace, float]:
     """K and the mu that dkpy reports, with the settings of its own example, in one process."""
     iteration = dkpy.DkIterListOrder(
-        controller_synthesis=dkpy.HinfSynSlicot(), structured_singular_value=dkpy.SsvLmiBisection(n_jobs=1),
-        d_scale_fit=dkpy.DScaleFitSlicot(), fit_orders=[4] * iterations)
+        controller_synthesis=dkpy.HinfSynSlicot(),
+        structured_singular_value=dkpy.SsvLmiBisection(n_jobs=1),
+        d_scale_fit=dkpy.DScaleFitSlicot(),
+        fit_orders=[4] * iterations,
+    )
     blocks = [dkpy.ComplexFullBlock(1, 1), dkpy.ComplexFullBlock(1, 1), dkpy.ComplexFullBlock(2, 2)]
     K, _, mu, *_ = iteration.synthesize(example["P"], example["n_y"], example["n_u"], np.logspace(-3, 3, 61), blocks)
     return StateSpace.from_control(K), mu
@@ -56,9 +59,12 @@ def main() -> None:
     example = dkpy.example_skogestad2006_p325()
     P = StateSpace.from_control(example["P"])
     runs: dict[str, Callable[[], tuple[StateSpace, float]]] = {
-        "dkpy, 3 iterations": lambda: by_dkpy(example, 3), "dkpy, 1 iteration": lambda: by_dkpy(example, 1),
-        "musyn": lambda: by_musyn(P), "musyn, D-K alone": lambda: by_musyn(P, polish=False),
-        "musyn, target 1.036": lambda: by_musyn(P, target=1.036)}
+        "dkpy, 3 iterations": lambda: by_dkpy(example, 3),
+        "dkpy, 1 iteration": lambda: by_dkpy(example, 1),
+        "musyn": lambda: by_musyn(P),
+        "musyn, D-K alone": lambda: by_musyn(P, polish=False),
+        "musyn, target 1.036": lambda: by_musyn(P, target=1.036),
+    }
     print(f"{'':<22}{'CPU s':>8}{'ratio':>8}{'reported mu':>13}{'measured mu':>13}{'stable':>8}{'order':>7}")
     first = 0.0
     for name, run in runs.items():
@@ -68,8 +74,11 @@ def main() -> None:
             seconds = time.process_time() - began
         first = first or seconds
         N = lft_lower(P, K)
-        print(f"{name:<22}{seconds:>8.2f}{first / seconds:>8.1f}{reported:>13.4f}{peak_mu(N):>13.4f}"
-              f"{'yes' if N.is_stable() else 'no':>8}{K.nstates:>7d}", flush=True)
+        print(
+            f"{name:<22}{seconds:>8.2f}{first / seconds:>8.1f}{reported:>13.4f}{peak_mu(N):>13.4f}"
+            f"{'yes' if N.is_stable() else 'no':>8}{K.nstates:>7d}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -30,13 +30,34 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("robust", "uncertainty", "rigs", "identification", "simulation", "measurement")
 # One replacement a kind of place: an operator by its opposite, a comparison by its neighbour or its negation.
-OPERATORS = (*(f"ReplaceBinaryOperator_{pair}" for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul",
-                                                              "FloorDiv_Mul", "Mod_Mul")),
-             *(f"ReplaceComparisonOperator_{pair}" for pair in (
-                 "Lt_GtE", "Lt_LtE", "LtE_Gt", "LtE_Lt", "Gt_LtE", "Gt_GtE", "GtE_Lt", "GtE_Gt", "Eq_NotEq", "NotEq_Eq",
-                 "Is_IsNot", "IsNot_Is")),
-             "ReplaceUnaryOperator_Delete_USub", "ReplaceUnaryOperator_Delete_Not", "AddNot", "ReplaceAndWithOr",
-             "ReplaceOrWithAnd")
+OPERATORS = (
+    *(
+        f"ReplaceBinaryOperator_{pair}"
+        for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul", "FloorDiv_Mul", "Mod_Mul")
+    ),
+    *(
+        f"ReplaceComparisonOperator_{pair}"
+        for pair in (
+            "Lt_GtE",
+            "Lt_LtE",
+            "LtE_Gt",
+            "LtE_Lt",
+            "Gt_LtE",
+            "Gt_GtE",
+            "GtE_Lt",
+            "GtE_Gt",
+            "Eq_NotEq",
+            "NotEq_Eq",
+            "Is_IsNot",
+            "IsNot_Is",
+        )
+    ),
+    "ReplaceUnaryOperator_Delete_USub",
+    "ReplaceUnaryOperator_Delete_Not",
+    "AddNot",
+    "ReplaceAndWithOr",
+    "ReplaceOrWithAnd",
+)
 SLOWER = 4.0  # times the unchanged run, and a minute: an endless loop is noticed, a busy machine is not
 
 
@@ -91,8 +112,11 @@ class FolderTests:
 
     def whole_s(self, names: list[str]) -> float:
         """Seconds that these tests together take on the unchanged code."""
-        return sum(self.seconds.values() if len(names) == 1 and "::" not in names[0]
-                   else (self.seconds[name] for name in names))
+        return sum(
+            self.seconds.values()
+            if len(names) == 1 and "::" not in names[0]
+            else (self.seconds[name] for name in names)
+        )
 
 
 def folder_tests(tree: Path, folder: str) -> FolderTests:
@@ -100,8 +124,11 @@ def folder_tests(tree: Path, folder: str) -> FolderTests:
     from coverage import CoverageData
 
     report, data = tree / "report.xml", tree / ".coverage"
-    failed, said = pytest(tree, [f"tests/{folder}", f"--junitxml={report}", "--cov=avis_ctrl", "--cov-context=test",
-                                 "--cov-report="], 7200.0)
+    failed, said = pytest(
+        tree,
+        [f"tests/{folder}", f"--junitxml={report}", "--cov=avis_ctrl", "--cov-context=test", "--cov-report="],
+        7200.0,
+    )
     if failed:
         raise SystemExit(f"the tests of {folder} fail without a change: {said}")
     measured = CoverageData(str(data))
@@ -114,8 +141,9 @@ def folder_tests(tree: Path, folder: str) -> FolderTests:
     by_line = {}
     for file in measured.measured_files():
         lines = measured.contexts_by_lineno(file)
-        by_line[str(Path(file).relative_to(tree))] = {line: {c.rsplit("|", 1)[0] for c in contexts} - {""}
-                                                      for line, contexts in lines.items()}
+        by_line[str(Path(file).relative_to(tree))] = {
+            line: {c.rsplit("|", 1)[0] for c in contexts} - {""} for line, contexts in lines.items()
+        }
     return FolderTests(folder, {name: short.get(name, 0.0) for name in sorted(names)}, by_line)
 
 
@@ -125,8 +153,14 @@ def pytest(tree: Path, words: list[str], limit_s: float) -> tuple[bool, str]:
     (tree / "words").write_text("\n".join(words))
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "@words"]
     try:
-        done = subprocess.run(command, cwd=tree, capture_output=True, text=True, timeout=limit_s,
-                              env={**os.environ, **single, "PYTHONPATH": str(tree)})
+        done = subprocess.run(
+            command,
+            cwd=tree,
+            capture_output=True,
+            text=True,
+            timeout=limit_s,
+            env={**os.environ, **single, "PYTHONPATH": str(tree)},
+        )
     except subprocess.TimeoutExpired:
         return True, "took too long"
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.M)
@@ -172,11 +206,20 @@ def run(count: int, seed: int, out: Path, jobs: int) -> None:
             finally:
                 path.write_text(before)
                 trees.append(tree)
-            row = {"file": file, "operator": operator, "occurrence": occurrence, "line": f"{number}: {line}",
-                   "noticed": noticed, "by": by, "tests": len(names), "seconds": seconds}
+            row = {
+                "file": file,
+                "operator": operator,
+                "occurrence": occurrence,
+                "line": f"{number}: {line}",
+                "noticed": noticed,
+                "by": by,
+                "tests": len(names),
+                "seconds": seconds,
+            }
             with out.open("a") as file_out:
                 file_out.write(json.dumps(row) + "\n")
             print(f"{'noticed' if noticed else 'PASSED '} {file}: {line}", flush=True)
+
         list(pool.map(one, todo))
 
 

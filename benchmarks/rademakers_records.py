@@ -21,8 +21,15 @@ TRANSLATION_V2, ROTATION_V2 = 0.25, 0.1
 FLOOR_BAND_Hz = (0.5, 60.0)
 
 
-def source_campaign(rig: Rig, sets: int = 10, duration_s: float = 100.0, *, seed: int = 1, noise: bool = True,
-                    floor_rms_m_per_s: float = 0.0) -> Campaign:
+def source_campaign(
+    rig: Rig,
+    sets: int = 10,
+    duration_s: float = 100.0,
+    *,
+    seed: int = 1,
+    noise: bool = True,
+    floor_rms_m_per_s: float = 0.0,
+) -> Campaign:
     """Records of section 3.4: white noise of 0.25 V^2 on x, y, z and 0.1 V^2 on the rotations, held at the sample rate.
 
     One volt on a logical axis is one volt at the motor that this axis uses most. Each record starts at rest.
@@ -41,10 +48,11 @@ def source_campaign(rig: Rig, sets: int = 10, duration_s: float = 100.0, *, seed
     rate = rig.sample_rate_Hz
     samples = round(duration_s * rate)
     if sets < 1 or samples < 2:
-        raise InputError("expected at least one set of two samples", field="sets, duration_s",
-                         value=(sets, duration_s))
-    records = tuple(_record(rig, f"{k:02d}", samples, np.random.default_rng((seed, k)), noise, floor_rms_m_per_s)
-                    for k in range(sets))
+        raise InputError("expected at least one set of two samples", field="sets, duration_s", value=(sets, duration_s))
+    records = tuple(
+        _record(rig, f"{k:02d}", samples, np.random.default_rng((seed, k)), noise, floor_rms_m_per_s)
+        for k in range(sets)
+    )
     return Campaign(rig.name, records, notes=("simulated linearly, records from rest",))
 
 
@@ -74,8 +82,15 @@ def _record(rig: Rig, name: str, samples: int, rng: np.random.Generator, noise: 
         assert rig.ambient is not None
         converter = Converter(rig.acquisition.adc_bits, rig.acquisition.adc_range_V, rig.sample_rate_Hz)
         y = converter.convert(y + rng.normal(size=y.shape) * rig.ambient.sensor_noise_rms_V)
-    header = RecordHeader(name, rig.sample_rate_Hz, samples, rig.equations_of_motion().actuators,
-                          rig.geophones.names, "noise", float(np.sqrt(np.mean(u ** 2))))
+    header = RecordHeader(
+        name,
+        rig.sample_rate_Hz,
+        samples,
+        rig.equations_of_motion().actuators,
+        rig.geophones.names,
+        "noise",
+        float(np.sqrt(np.mean(u**2))),
+    )
     return Record(header, u, y)
 
 

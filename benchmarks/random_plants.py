@@ -60,6 +60,7 @@ LIMIT_S = 120  # seconds after which a problem counts as hung
 
 # -- problems -------------------------------------------------------------------------------------
 
+
 def order(rng: np.random.Generator) -> int:
     """Most are small, some have up to 60 states."""
     return int(np.clip(np.round(2 * 30 ** (rng.uniform() ** 3)), 2, 60))
@@ -196,14 +197,20 @@ def loop(rng: np.random.Generator, n_out: int, n_in: int, sampled: bool = False)
     A = sampled_dynamics(rng, n, True) if sampled else dynamics(rng, n, True)
     dt = 10.0 ** rng.uniform(-4, 1) if sampled else 0.0
     root = np.sqrt(np.abs(la.eigvals(A)).mean())
-    N = StateSpace(A, root * rng.standard_normal((n, n_in)), root * rng.standard_normal((n_out, n)),
-                   rng.standard_normal((n_out, n_in)) * rng.choice([0, 0.1, 1]), dt)
+    N = StateSpace(
+        A,
+        root * rng.standard_normal((n, n_in)),
+        root * rng.standard_normal((n_out, n)),
+        rng.standard_normal((n_out, n_in)) * rng.choice([0, 0.1, 1]),
+        dt,
+    )
     omega = np.abs(np.angle(N.poles())) / dt if dt else np.abs(N.poles())
     size = float(np.max(np.linalg.norm(N.frequency_response(omega), 2, axis=(1, 2))))
     return N.scaled(left=10.0 ** rng.uniform(-1, 0.5) / size)
 
 
 # -- the other route ------------------------------------------------------------------------------
+
 
 def closed(P: StateSpace, K: StateSpace) -> StateSpace:
     """F_l(P, K), formed here."""
@@ -225,8 +232,9 @@ def at(system: StateSpace, omega: float) -> np.ndarray:
         return system.D.astype(complex)
     point = np.exp(1j * omega * system.dt) if system.dt else 1j * omega
     A, (d, _) = la.matrix_balance(system.A, permute=False, separate=True)
-    return (system.C * d) @ np.linalg.solve(point * np.eye(system.nstates) - A,
-                                            (system.B / d[:, None]).astype(complex)) + system.D
+    return (system.C * d) @ np.linalg.solve(
+        point * np.eye(system.nstates) - A, (system.B / d[:, None]).astype(complex)
+    ) + system.D
 
 
 def pointwise(P: StateSpace, K: StateSpace, omegas: np.ndarray) -> float:
@@ -361,13 +369,16 @@ def passed_by_a_sample(M: np.ndarray, blocks: BlockStructure, rng: np.random.Gen
 
 # -- one problem ----------------------------------------------------------------------------------
 
+
 def solve(seed: int, index: int, sampled: bool = False) -> dict[str, Any]:
     """Pose, answer and judge problem `index`, of those in discrete time where `sampled`."""
     rng = np.random.default_rng([seed, index, 1] if sampled else [seed, index])
     # Matrices have no clock; their part goes to mu synthesis.
     second = "musyn" if sampled else "mu"
-    kind = rng.choice(["hinfsyn", second, "mu_peak", "worst_case_gain"],
-                      p=[0.6, 0.05, 0.21, 0.14] if sampled else [0.6, 0.2, 0.12, 0.08])
+    kind = rng.choice(
+        ["hinfsyn", second, "mu_peak", "worst_case_gain"],
+        p=[0.6, 0.05, 0.21, 0.14] if sampled else [0.6, 0.2, 0.12, 0.08],
+    )
     out: dict[str, Any] = {"index": index, "kind": str(kind), "wrong": []}
     began = time.perf_counter()
     try:
@@ -376,15 +387,25 @@ def solve(seed: int, index: int, sampled: bool = False) -> dict[str, Any]:
             out |= {"n": P.nstates, "tags": tags}
             r = hinfsyn(P, y, u, far_poles="gain" if index % 2 else "kept")
             said = ", gamma said to be round-off" if in_doubt(r) else ""
-            out |= {"status": r.status.name + said, "gamma": r.gamma, "bounds": list(r.gamma_optimal_bounds),
-                    "fastest": r.fastest_pole, "plant_fastest": float(np.max(np.abs(base.poles()))),
-                    "seconds": time.perf_counter() - began}
+            out |= {
+                "status": r.status.name + said,
+                "gamma": r.gamma,
+                "bounds": list(r.gamma_optimal_bounds),
+                "fastest": r.fastest_pole,
+                "plant_fastest": float(np.max(np.abs(base.poles()))),
+                "seconds": time.perf_counter() - began,
+            }
             out["wrong"] = judge_synthesis(P, base, u, y, r, index % 4 == 0)
         elif kind == "musyn":
             P, blocks = uncertain_plant(rng)
             r = musyn(P, blocks, 1, 1, max_iterations=4)
-            out |= {"n": P.nstates, "status": "proved" if r.guaranteed else "not proved", "gamma": r.mu_upper,
-                    "bounds": [r.mu_lower, r.mu_upper], "seconds": time.perf_counter() - began}
+            out |= {
+                "n": P.nstates,
+                "status": "proved" if r.guaranteed else "not proved",
+                "gamma": r.mu_upper,
+                "bounds": [r.mu_lower, r.mu_upper],
+                "seconds": time.perf_counter() - began,
+            }
             out["wrong"] = judge_mu_synthesis(P, r)
         elif kind == "mu":
             blocks = structure(rng)
@@ -393,18 +414,22 @@ def solve(seed: int, index: int, sampled: bool = False) -> dict[str, Any]:
                 M = M.real
             M = M * 10.0 ** rng.uniform(-8, 8)
             b = mu(M, blocks)
-            out |= {"n": M.shape[0], "status": "tight" if b.lower > 0.99 * b.upper else "gap",
-                    "gamma": float(b.upper), "bounds": [float(b.lower), float(b.upper)],
-                    "seconds": time.perf_counter() - began}
+            out |= {
+                "n": M.shape[0],
+                "status": "tight" if b.lower > 0.99 * b.upper else "gap",
+                "gamma": float(b.upper),
+                "bounds": [float(b.lower), float(b.upper)],
+                "seconds": time.perf_counter() - began,
+            }
             wrong = judge_delta(M, blocks, float(b.lower), b.delta)
             if b.lower > b.upper * (1 + 1e-6):
                 wrong.append(f"bounds {b.lower:.6g} > {b.upper:.6g}")
             low = passed_by_a_sample(M, blocks, rng)
             if low > b.upper * (1 + 1e-9):
                 wrong.append(f"a perturbation of norm {1 / low:.6g} passes the upper bound {b.upper:.6g}")
-            left = b.upper ** 2 * b.D_w @ b.D_w.conj().T - M.conj().T @ b.D.conj().T @ b.D @ M
+            left = b.upper**2 * b.D_w @ b.D_w.conj().T - M.conj().T @ b.D.conj().T @ b.D @ M
             left = left - 1j * (b.G @ M - M.conj().T @ b.G.conj().T)
-            size = b.upper ** 2 * la.norm(b.D_w, 2) ** 2 + la.norm(b.G @ M, 2)
+            size = b.upper**2 * la.norm(b.D_w, 2) ** 2 + la.norm(b.G @ M, 2)
             if la.eigvalsh((left + left.conj().T) / 2)[0] < -1e-7 * size:
                 wrong.append("the scalings do not prove the upper bound")
             out["wrong"] = wrong
@@ -416,12 +441,18 @@ def solve(seed: int, index: int, sampled: bool = False) -> dict[str, Any]:
                 N = discretise(N, float(0.1 / np.max(np.abs(N.poles()))), "tustin")
             out |= {"n": N.nstates}
             p = mu_peak(N, blocks) if kind == "mu_peak" else worst_case_gain(N, blocks)
-            out |= {"status": ("proved" if p.guaranteed else "not proved") if np.isfinite(p.upper) else "not robust",
-                    "gamma": p.upper, "bounds": [p.lower, p.upper], "seconds": time.perf_counter() - began}
+            out |= {
+                "status": ("proved" if p.guaranteed else "not proved") if np.isfinite(p.upper) else "not robust",
+                "gamma": p.upper,
+                "bounds": [p.lower, p.upper],
+                "seconds": time.perf_counter() - began,
+            }
             out["wrong"] = judge_peak(N, blocks, p, rng)
     except (ComputationError, InputError) as error:
-        out |= {"status": f"{type(error).__name__}: {str(error).split(':')[0].split('(')[0][:60].strip()}",
-                "said": str(error)[:300]}
+        out |= {
+            "status": f"{type(error).__name__}: {str(error).split(':')[0].split('(')[0][:60].strip()}",
+            "said": str(error)[:300],
+        }
     out.setdefault("seconds", time.perf_counter() - began)
     return out
 
@@ -434,8 +465,10 @@ def uncertain_plant(rng: np.random.Generator) -> tuple[StateSpace, list[Block]]:
     D = 0.1 * rng.standard_normal((k + 3, k + 3))
     D[:k], D[:, :k], C[:k] = 0.1 * D[:k], 0.1 * D[:, :k], 0.1 * C[:k]
     D[k + 1, k + 2], D[k + 2, k + 1] = 1.0, 0.3
-    return (StateSpace(A, B, C, D, 10.0 ** rng.uniform(-4, 1)),
-            [RealScalar() if rng.uniform() < 0.5 else ComplexScalar() for _ in range(k)])
+    return (
+        StateSpace(A, B, C, D, 10.0 ** rng.uniform(-4, 1)),
+        [RealScalar() if rng.uniform() < 0.5 else ComplexScalar() for _ in range(k)],
+    )
 
 
 def judge_mu_synthesis(P: StateSpace, r: Any) -> list[str]:
@@ -527,6 +560,7 @@ def timed(seed: int, index: int, sampled: bool) -> dict[str, Any]:
 
 # -- SLICOT beside it -----------------------------------------------------------------------------
 
+
 def _sb10ad(seed: int, index: int, queue: Any) -> None:
     import control
 
@@ -551,8 +585,13 @@ def sb10ad(seed: int, index: int, limit: float = 20.0) -> dict[str, Any]:
     process.start()
     try:
         gamma, norm, said = queue.get(timeout=limit)
-        end = said or ("unstable" if np.isinf(norm) else "wrong gamma" if abs(norm / gamma - 1) > 10 * SAME
-                       and norm > gamma else "right")
+        end = said or (
+            "unstable"
+            if np.isinf(norm)
+            else "wrong gamma"
+            if abs(norm / gamma - 1) > 10 * SAME and norm > gamma
+            else "right"
+        )
     except Exception:  # queue.Empty
         gamma = norm = np.nan
         end = "crash" if process.exitcode not in (None, 0) else "time limit"
@@ -562,6 +601,7 @@ def sb10ad(seed: int, index: int, limit: float = 20.0) -> dict[str, Any]:
 
 
 # -- run ------------------------------------------------------------------------------------------
+
 
 def _work(task: tuple[int, int, bool]) -> dict[str, Any]:
     return timed(*task)
@@ -585,8 +625,10 @@ def table(rows: list[dict[str, Any]]) -> str:
         groups[row["kind"], row["status"]].append(row)
     for (kind, status), found in sorted(groups.items()):
         seconds = [row.get("seconds", np.nan) for row in found]
-        lines.append(f"{kind:16s} {status:64s} {len(found):6d} {sum(bool(row['wrong']) for row in found):6d} "
-                     f"{np.median(seconds):9.3f} {np.max(seconds):9.2f}")
+        lines.append(
+            f"{kind:16s} {status:64s} {len(found):6d} {sum(bool(row['wrong']) for row in found):6d} "
+            f"{np.median(seconds):9.3f} {np.max(seconds):9.2f}"
+        )
     lines.append(f"{'all':16s} {'':64s} {len(rows):6d} {sum(bool(row['wrong']) for row in rows):6d}")
     ends = collections.Counter(row["sb10ad"]["end"] for row in rows if "sb10ad" in row)
     if ends:
@@ -611,14 +653,27 @@ def main() -> None:
     todo = [(asked.seed, k, asked.sampled) for k in range(asked.first, asked.first + asked.count) if k not in done]
     with asked.out.open("a") as file, multiprocessing.Pool(asked.jobs) as pool:
         for row in pool.imap_unordered(_work, todo):
-            if (asked.sb10ad and row["kind"] == "hinfsyn" and row["index"] % asked.sb10ad == 0
-                    and row["n"] <= SB10AD_ORDER and not asked.sampled and "sampled" not in row["tags"]):
+            if (
+                asked.sb10ad
+                and row["kind"] == "hinfsyn"
+                and row["index"] % asked.sb10ad == 0
+                and row["n"] <= SB10AD_ORDER
+                and not asked.sampled
+                and "sampled" not in row["tags"]
+            ):
                 row["sb10ad"] = sb10ad(asked.seed, row["index"])
             file.write(json.dumps(row) + "\n")
             file.flush()
             if row["wrong"]:
-                print(row["index"], row["kind"], row["status"], row.get("n"), row.get("tags", ""), row["wrong"],
-                      flush=True)
+                print(
+                    row["index"],
+                    row["kind"],
+                    row["status"],
+                    row.get("n"),
+                    row.get("tags", ""),
+                    row["wrong"],
+                    flush=True,
+                )
     print(table(list(read(asked.out))))
 
 

@@ -133,7 +133,7 @@ def _voltages(rig: Rig, form: Form, samples: int, rng: np.random.Generator) -> I
     for one in np.split(V, len(V)) if form.apart else [V]:
         for _ in range(form.records):
             u = _signal(form.signal, samples, len(one), fs, rng) @ one
-            yield u / np.sqrt(np.mean(u ** 2, axis=0).max())
+            yield u / np.sqrt(np.mean(u**2, axis=0).max())
 
 
 class _Bench:
@@ -156,8 +156,9 @@ class _Bench:
         seen = np.max(np.abs(self._run(quiet, u, 0, np.zeros((len(u) + 1, 6)), 0, False, False).sensed))
         return u * percent / 100 * min(1.0, RANGE_SHARE * limit / seen)
 
-    def record(self, name: str, kind: str, u: np.ndarray, start_s: float, seed: tuple[int, ...], from_rest: bool = False
-               ) -> tuple[Record, np.ndarray]:
+    def record(
+        self, name: str, kind: str, u: np.ndarray, start_s: float, seed: tuple[int, ...], from_rest: bool = False
+    ) -> tuple[Record, np.ndarray]:
         """A record, and (samples, n_y) what the true table reads from rest of what was recorded of it.
 
         from_rest : the floor lies still until the record begins.
@@ -170,30 +171,47 @@ class _Bench:
         floor[-1] = floor[-2]
         if from_rest:
             floor[:settle] = 0
-        run = self._run(self.loop, u, settle, floor, int(rng.integers(2 ** 31)), True, True)
+        run = self._run(self.loop, u, settle, floor, int(rng.integers(2**31)), True, True)
         assert not run.diverged
         converter = self.loop.sensors.converter
         y = converter.convert(run.sensed) if converter else run.sensed
         known = floor[settle:] if self.measured else np.zeros((len(u) + 1, 6))
         ideal = self._run(self.loop, u, 0, known, 0, True, False).sensed
-        h = RecordHeader(name, self.fs, len(u), self.rig.equations_of_motion().actuators, self.rig.sensor_rows()[0],
-                         "multisine" if kind == "multisine" else "noise",
-                         float(np.sqrt(np.mean(u[:, np.any(u, axis=0)] ** 2))), start_s,
-                         PERIOD_s if kind == "multisine" else None, floor_names=FLOOR_NAMES if self.measured else ())
+        h = RecordHeader(
+            name,
+            self.fs,
+            len(u),
+            self.rig.equations_of_motion().actuators,
+            self.rig.sensor_rows()[0],
+            "multisine" if kind == "multisine" else "noise",
+            float(np.sqrt(np.mean(u[:, np.any(u, axis=0)] ** 2))),
+            start_s,
+            PERIOD_s if kind == "multisine" else None,
+            floor_names=FLOOR_NAMES if self.measured else (),
+        )
         return Record(h, u, y, floor[settle:-1, :3] if self.measured else None), ideal
 
     @staticmethod
-    def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray, seed: int, nonlinear: bool,
-             noisy: bool) -> SimulationRecord:
+    def _run(
+        loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray, seed: int, nonlinear: bool, noisy: bool
+    ) -> SimulationRecord:
         if not noisy:
             loop = replace(loop, sensors=replace(loop.sensors, noise_rms_V=np.zeros(len(loop.sensors.chains))))
         drive = np.concatenate([np.zeros((settle, u.shape[1])), u])
-        return simulate(loop, len(u) / loop.sample_rate_Hz, seed, settle_s=settle / loop.sample_rate_Hz,
-                        nonlinear=nonlinear, floor=floor, drive=drive)
+        return simulate(
+            loop,
+            len(u) / loop.sample_rate_Hz,
+            seed,
+            settle_s=settle / loop.sample_rate_Hz,
+            nonlinear=nonlinear,
+            floor=floor,
+            drive=drive,
+        )
 
 
-def campaign(rig_name: str, form: Form, measured: bool, seed: int, duration_s: float, percent: float
-             ) -> tuple[Campaign, Record, np.ndarray]:
+def campaign(
+    rig_name: str, form: Form, measured: bool, seed: int, duration_s: float, percent: float
+) -> tuple[Campaign, Record, np.ndarray]:
     """A campaign of a form, a record of noise in all drives beside it, and what the truth reads of that from rest."""
     rig = load_rig(rig_name)
     bench = _Bench(rig, perturbed_truth(rig, seed=seed), measured)
@@ -208,8 +226,16 @@ def campaign(rig_name: str, form: Form, measured: bool, seed: int, duration_s: f
     return Campaign(rig.name, tuple(records), "sound campaign"), other, ideal
 
 
-def run(rig_name: str, form: str, floor: str, seed: int, duration_s: float, percent: float, folder: Path,
-        command: Callable[[list[str]], subprocess.CompletedProcess[str]]) -> Result:
+def run(
+    rig_name: str,
+    form: str,
+    floor: str,
+    seed: int,
+    duration_s: float,
+    percent: float,
+    folder: Path,
+    command: Callable[[list[str]], subprocess.CompletedProcess[str]],
+) -> Result:
     """One case, end to end."""
     made, other, ideal = campaign(rig_name, FORMS[form], floor == "measured", seed, duration_s, percent)
     case = folder / f"{rig_name}_{form.replace(' ', '_')}_{floor}_{seed}"
@@ -261,9 +287,17 @@ def main() -> None:
                 for floor in asked.floor:
                     one = run(rig, form, floor, asked.seed, asked.duration, asked.level, folder, _command)
                     worst = max(one.ratio, key=lambda name: one.ratio[name], default="")
-                    print(f"{rig:18s} {form:18s} {floor:11s} {one.code:4d} {one.seconds:5.0f}  "
-                          + (f"{one.ratio[worst]:6.2f} {worst:4s} {100 * one.relative[worst]:5.2f} %" if worst
-                             else " " * 19) + "   " + " | ".join(line[:90] for line in one.said[:2]), flush=True)
+                    print(
+                        f"{rig:18s} {form:18s} {floor:11s} {one.code:4d} {one.seconds:5.0f}  "
+                        + (
+                            f"{one.ratio[worst]:6.2f} {worst:4s} {100 * one.relative[worst]:5.2f} %"
+                            if worst
+                            else " " * 19
+                        )
+                        + "   "
+                        + " | ".join(line[:90] for line in one.said[:2]),
+                        flush=True,
+                    )
                     if asked.out:
                         with asked.out.open("a", encoding="utf-8") as file:
                             file.write(json.dumps(asdict(one)) + "\n")

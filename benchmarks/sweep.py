@@ -70,15 +70,20 @@ def cases() -> Iterator[tuple[str, int, Backend]]:
 def table(title: str, points: Path) -> None:
     """Times and ratios of a file of points."""
     print(f"{title}; {available()} processors, load {os.getloadavg()[0]:.1f}")
-    print(f"{'':8s} {'processes':>9s} {'s':>7s} {'ratio to one':>12s} {'points per min, later':>21s} "
-          f"{'ratio to one':>12s} {'load':>5s}")
+    print(
+        f"{'':8s} {'processes':>9s} {'s':>7s} {'ratio to one':>12s} {'points per min, later':>21s} "
+        f"{'ratio to one':>12s} {'load':>5s}"
+    )
     one: dict[str, tuple[float, float]] = {}
     for name, n, backend in cases():
         ends = ends_of(points, backend)
         whole, rate = ends[-1], 60 * (len(ends) - n) / (ends[-1] - ends[n - 1])
         first, slow = one.setdefault(name, (whole, rate))
-        print(f"{name:8s} {n:9d} {whole:7.1f} {first / whole:12.2f} {rate:21.1f} {rate / slow:12.2f} "
-              f"{os.getloadavg()[0]:5.1f}", flush=True)
+        print(
+            f"{name:8s} {n:9d} {whole:7.1f} {first / whole:12.2f} {rate:21.1f} {rate / slow:12.2f} "
+            f"{os.getloadavg()[0]:5.1f}",
+            flush=True,
+        )
 
 
 def main() -> None:

@@ -16,5 +16,5 @@ def transfer(rig, point, direction, volts, omega, reference):
     place = rig.points()[point].position if isinstance(point, str) else np.asarray(point, float)
     s = np.eye(3)["xyz".index(direction)] if isinstance(direction, str) else np.asarray(direction, float)
     eom, w = rig.equations_of_motion(), np.asarray(omega, float)[:, None, None]
-    W = np.linalg.solve(-w**2 * eom.M + 1j * w * eom.C + eom.K, (eom.T @ volts)[:, None])[:, :, 0]
+    W = np.linalg.solve(-(w**2) * eom.M + 1j * w * eom.C + eom.K, (eom.T @ volts)[:, None])[:, :, 0]
     return W @ point_map(place).T @ s / (np.linalg.norm(s) * rig.e[reference])

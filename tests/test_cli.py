@@ -22,8 +22,14 @@ ONE_THREAD = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
 
 
 def avis(*arguments: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", "from avis_ctrl.cli import main; main()", *arguments],
-                          capture_output=True, text=True, timeout=timeout, env=ONE_THREAD, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", "from avis_ctrl.cli import main; main()", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env=ONE_THREAD,
+        check=False,
+    )
 
 
 def of_compiled_code() -> SystemError:
@@ -34,9 +40,11 @@ def of_compiled_code() -> SystemError:
 
 
 def test_help_names_the_commands_and_loads_no_arrays():
-    code = ("import sys\nsys.argv = ['avis', '--help']\nfrom avis_ctrl.cli import main\ntry:\n    main()\n"
-            "except SystemExit as stop:\n    assert not stop.code, stop.code\n"
-            "print('loaded:', *{'numpy', 'scipy', 'pydantic', 'matplotlib'} & set(sys.modules))")
+    code = (
+        "import sys\nsys.argv = ['avis', '--help']\nfrom avis_ctrl.cli import main\ntry:\n    main()\n"
+        "except SystemExit as stop:\n    assert not stop.code, stop.code\n"
+        "print('loaded:', *{'numpy', 'scipy', 'pydantic', 'matplotlib'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=ONE_THREAD)
     assert "design" in done.stdout
     assert "doctor" in done.stdout
@@ -59,16 +67,27 @@ def test_help_of_a_command():
     assert "DESIGN.toml" in done.stdout
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (("design", "missing.toml", "--out", "OUT"), "missing.toml"),
-    (("design",), "DESIGN.toml"),
-    (("design", str(DESIGNS / "avis_z_phix.toml")), "--out"),
-    (("desing",), "desing"),
-    (("design", "x.toml", "--out", "OUT", "--fast"), "--fast"),
-    (("doctor", "now"), "now"),
-    (("gap", "missing.h5", "--rig", "avis", "--out", "OUT", "--design-file", "other.toml"), "other.toml"),
-], ids=["no such file", "no file given", "no folder given", "unknown command", "unknown option", "too many words",
-        "no such design, before the measurement is read"])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("design", "missing.toml", "--out", "OUT"), "missing.toml"),
+        (("design",), "DESIGN.toml"),
+        (("design", str(DESIGNS / "avis_z_phix.toml")), "--out"),
+        (("desing",), "desing"),
+        (("design", "x.toml", "--out", "OUT", "--fast"), "--fast"),
+        (("doctor", "now"), "now"),
+        (("gap", "missing.h5", "--rig", "avis", "--out", "OUT", "--design-file", "other.toml"), "other.toml"),
+    ],
+    ids=[
+        "no such file",
+        "no file given",
+        "no folder given",
+        "unknown command",
+        "unknown option",
+        "too many words",
+        "no such design, before the measurement is read",
+    ],
+)
 def test_wrong_usage_is_one_line_and_code_2(arguments, words, tmp_path):
     arguments = tuple(str(tmp_path / "out") if one == "OUT" else one for one in arguments)
     done = avis(*arguments)
@@ -96,16 +115,27 @@ def test_a_folder_that_cannot_be_written_is_code_2(tmp_path):
     assert "--out" in done.stderr
 
 
-@pytest.mark.parametrize(("raised", "code", "words"), [
-    (InputError("expected a positive number", file="d.toml", field="mass", value=-1), 2,
-     "avis: d.toml: mass = -1: expected a positive number\n"),
-    (ComputationError("no controller found", measured="gamma 7", cause="too much asked", next_step="ask less"), 3,
-     "avis: no controller found; measured: gamma 7; likely cause: too much asked; next: ask less\n"),
-    (KeyboardInterrupt(), 130, "avis: interrupted; no partial results were written\n"),
-    (of_compiled_code(), 130, "avis: interrupted; no partial results were written\n")])
+@pytest.mark.parametrize(
+    ("raised", "code", "words"),
+    [
+        (
+            InputError("expected a positive number", file="d.toml", field="mass", value=-1),
+            2,
+            "avis: d.toml: mass = -1: expected a positive number\n",
+        ),
+        (
+            ComputationError("no controller found", measured="gamma 7", cause="too much asked", next_step="ask less"),
+            3,
+            "avis: no controller found; measured: gamma 7; likely cause: too much asked; next: ask less\n",
+        ),
+        (KeyboardInterrupt(), 130, "avis: interrupted; no partial results were written\n"),
+        (of_compiled_code(), 130, "avis: interrupted; no partial results were written\n"),
+    ],
+)
 def test_errors_end_in_their_line_and_code(raised, code, words, monkeypatch, capsys):
     def stop(*args, **kwargs):
         raise raised
+
     monkeypatch.setattr(cli, "app", stop)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
@@ -116,6 +146,7 @@ def test_errors_end_in_their_line_and_code(raised, code, words, monkeypatch, cap
 def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch):
     def stop(*args, **kwargs):
         raise ZeroDivisionError
+
     monkeypatch.setattr(cli, "app", stop)
     with pytest.raises(ZeroDivisionError):
         cli.main()
@@ -143,10 +174,22 @@ def test_doctor_that_finds_something_broken_is_code_3(monkeypatch, capsys):
 def test_interrupt_leaves_nothing_half_written(tmp_path):
     """Ctrl-C while the study computes."""
     out = tmp_path / "out"
-    child = subprocess.Popen([sys.executable, "-c", "from avis_ctrl.cli import main; main()", "design",
-                              str(DESIGNS / "avis_z_phix.toml"), "--out", str(out)],
-                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ONE_THREAD,
-                             start_new_session=True)
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "from avis_ctrl.cli import main; main()",
+            "design",
+            str(DESIGNS / "avis_z_phix.toml"),
+            "--out",
+            str(out),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ONE_THREAD,
+        start_new_session=True,
+    )
     try:
         for _ in range(300):
             time.sleep(0.1)
@@ -166,9 +209,22 @@ def test_interrupt_leaves_nothing_half_written(tmp_path):
 @pytest.mark.slow
 def test_an_interrupt_of_the_iteration_keeps_the_best_controller(tmp_path):
     out = tmp_path / "out"
-    child = subprocess.Popen([sys.executable, "-u", "-c", "from avis_ctrl.cli import main; main()", "design",
-                              str(DESIGNS / "avis_z_phix.toml"), "--out", str(out)], stdout=subprocess.PIPE,
-                             stderr=subprocess.PIPE, text=True, env=ONE_THREAD)
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            "-u",
+            "-c",
+            "from avis_ctrl.cli import main; main()",
+            "design",
+            str(DESIGNS / "avis_z_phix.toml"),
+            "--out",
+            str(out),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ONE_THREAD,
+    )
     try:
         assert child.stdout is not None
         next(line for line in child.stdout if "D-K iteration" in line)
@@ -188,6 +244,7 @@ def test_the_first_interrupt_asks_and_the_second_ends():
 
     def usual(number, frame):
         raise KeyboardInterrupt
+
     before = signal.signal(signal.SIGINT, usual)
     try:
         with pytest.raises(KeyboardInterrupt), StopRequest(said.append):
@@ -222,8 +279,9 @@ cli.main()
 
 
 def test_an_interrupt_that_is_lost_comes_again():
-    child = subprocess.Popen([sys.executable, "-c", SWALLOWS], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                             text=True)
+    child = subprocess.Popen(
+        [sys.executable, "-c", SWALLOWS], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     try:
         assert child.stdout.readline() == "ready\n"
         child.send_signal(signal.SIGINT)
@@ -235,8 +293,17 @@ def test_an_interrupt_that_is_lost_comes_again():
 
 
 def test_public_names_load_on_first_use():
-    assert set(avis_ctrl.__all__) >= {"hinfsyn", "musyn", "mu", "mu_peak", "worst_case_gain", "RealScalar",
-                                      "ComplexScalar", "ComplexFull", "StateSpace"}
+    assert set(avis_ctrl.__all__) >= {
+        "hinfsyn",
+        "musyn",
+        "mu",
+        "mu_peak",
+        "worst_case_gain",
+        "RealScalar",
+        "ComplexScalar",
+        "ComplexFull",
+        "StateSpace",
+    }
     assert all(callable(getattr(avis_ctrl, name)) for name in set(avis_ctrl.__all__) - {"__version__", "plot"})
     with pytest.raises(AttributeError, match="no attribute 'musin'"):
         avis_ctrl.musin  # noqa: B018

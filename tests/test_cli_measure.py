@@ -16,8 +16,12 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import simulate_campaign
 from avis_ctrl.study.plan_file import plan_from_table
 
-PLAN = {"title": "short", "duration_s": 20.0, "multisine": {"period_s": 5.0},
-        "record": [{"excitation": "noise", "level_percent": 40.0, "records": 2, "band_Hz": [0.5, 50.0]}]}
+PLAN = {
+    "title": "short",
+    "duration_s": 20.0,
+    "multisine": {"period_s": 5.0},
+    "record": [{"excitation": "noise", "level_percent": 40.0, "records": 2, "band_Hz": [0.5, 50.0]}],
+}
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +43,7 @@ def changed(campaign: Path, folder: Path, change: Callable[[h5py.File], None]) -
 def set_y(value: float, rows: slice, column: int) -> Callable[[h5py.File], None]:
     def change(file: h5py.File) -> None:
         file["records/00/y"][rows, column] = value
+
     return change
 
 
@@ -58,12 +63,20 @@ def shorter_y(file: h5py.File) -> None:
     file["records/00"].create_dataset("y", data=y).attrs.update({"names": names, "unit": unit})
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    (set_y(np.nan, slice(100, 101), 2), "Sx2"), (set_y(0.25, slice(None), 1), "Sz1"), (other_rate, "sample_rate_Hz"),
-    (wrong_names, "sensors of the rig avis"), (shorter_y, "y"),
-    (lambda file: file.attrs.update(version=9), "version"), (lambda file: file.attrs.update(format="x"), "format"),
-    (lambda file: file.pop("records"), "records")],
-    ids=["NaN", "constant channel", "unequal rates", "names", "shapes", "version", "format", "no records"])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (set_y(np.nan, slice(100, 101), 2), "Sx2"),
+        (set_y(0.25, slice(None), 1), "Sz1"),
+        (other_rate, "sample_rate_Hz"),
+        (wrong_names, "sensors of the rig avis"),
+        (shorter_y, "y"),
+        (lambda file: file.attrs.update(version=9), "version"),
+        (lambda file: file.attrs.update(format="x"), "format"),
+        (lambda file: file.pop("records"), "records"),
+    ],
+    ids=["NaN", "constant channel", "unequal rates", "names", "shapes", "version", "format", "no records"],
+)
 def test_hostile_campaigns_are_one_line(campaign, tmp_path, change, said):
     done = avis("identify", str(changed(campaign, tmp_path, change)), "--rig", "avis", "--out", str(tmp_path / "out"))
     assert done.returncode == 2, done.stderr
@@ -81,25 +94,29 @@ def test_truncated_files_are_one_line(campaign, tmp_path, keep):
     assert done.stderr.count("\n") == 1 and "cut.h5" in done.stderr
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    (("identify", "none.h5", "--rig", "avis", "--out", "o"), "none.h5"),
-    (("identify", "C", "--rig", "avos", "--out", "o"), "avos"),
-    (("identify", "C", "--rig", "halcyonics", "--out", "o"), "acc_A1"),
-    (("identify", "C", "--rig", "avis", "--out", "o", "--prior", "mass=heavy"), "heavy"),
-    (("identify", "C", "--rig", "avis", "--out", "o", "--parameter", "weight"), "weight"),
-    (("identify", "C", "--rig", "avis", "--out", "o", "--hold-out", "77"), "77"),
-    (("identify", "C", "--rig", "avis", "--out", "o", "--columns", "u"), "columns"),
-    (("identify", "C", "--rig", "avis"), "--out"),
-    (("predict", "nowhere", "C", "--out", "p.h5"), "nowhere"),
-    (("excite", "--rig", "avis", "--out", "s.h5", "--kind", "chirp"), "chirp"),
-    (("excite", "--rig", "avis", "--out", "s.h5", "--rms", "9"), "9"),
-    (("excite", "--rig", "avis", "--out", "s.doc"), "s.doc"),
-    (("simulate-campaign", "--rig", "avis", "--out", "no/where/c.h5", "--duration", "20"), "no/where"),
-    (("simulate-campaign", "--rig", "avis", "--out", "c.h5", "--plan", "none.toml"), "none.toml"),
-    (("convert", "C", "no/where/c.h5"), "no/where"),
-    (("single-axis", "pendulum", "C", "--columns", "u=u"), "pendulum"),
-    (("single-axis", "drive", "C", "--columns", "force"), "force"),
-], ids=lambda value: " ".join(value)[:50] if isinstance(value, tuple) else str(value))
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("identify", "none.h5", "--rig", "avis", "--out", "o"), "none.h5"),
+        (("identify", "C", "--rig", "avos", "--out", "o"), "avos"),
+        (("identify", "C", "--rig", "halcyonics", "--out", "o"), "acc_A1"),
+        (("identify", "C", "--rig", "avis", "--out", "o", "--prior", "mass=heavy"), "heavy"),
+        (("identify", "C", "--rig", "avis", "--out", "o", "--parameter", "weight"), "weight"),
+        (("identify", "C", "--rig", "avis", "--out", "o", "--hold-out", "77"), "77"),
+        (("identify", "C", "--rig", "avis", "--out", "o", "--columns", "u"), "columns"),
+        (("identify", "C", "--rig", "avis"), "--out"),
+        (("predict", "nowhere", "C", "--out", "p.h5"), "nowhere"),
+        (("excite", "--rig", "avis", "--out", "s.h5", "--kind", "chirp"), "chirp"),
+        (("excite", "--rig", "avis", "--out", "s.h5", "--rms", "9"), "9"),
+        (("excite", "--rig", "avis", "--out", "s.doc"), "s.doc"),
+        (("simulate-campaign", "--rig", "avis", "--out", "no/where/c.h5", "--duration", "20"), "no/where"),
+        (("simulate-campaign", "--rig", "avis", "--out", "c.h5", "--plan", "none.toml"), "none.toml"),
+        (("convert", "C", "no/where/c.h5"), "no/where"),
+        (("single-axis", "pendulum", "C", "--columns", "u=u"), "pendulum"),
+        (("single-axis", "drive", "C", "--columns", "force"), "force"),
+    ],
+    ids=lambda value: " ".join(value)[:50] if isinstance(value, tuple) else str(value),
+)
 def test_wrong_usage_is_one_line(campaign, tmp_path, arguments, said, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = avis(*(str(campaign) if one == "C" else one for one in arguments))
@@ -132,8 +149,15 @@ def test_help_says_the_layouts_of_files(command):
     done = avis(command, "--help")
     words = " ".join(done.stdout.split())
     assert done.returncode == 0
-    for said in ("struct array records", "u, y and t or sample_rate_Hz (or fs) are required", "y_names=Sy1+Sz1",
-                 "--period", "--excitation", "--sample-rate", "--unit-y"):
+    for said in (
+        "struct array records",
+        "u, y and t or sample_rate_Hz (or fs) are required",
+        "y_names=Sy1+Sz1",
+        "--period",
+        "--excitation",
+        "--sample-rate",
+        "--unit-y",
+    ):
         assert said in words, said
 
 
@@ -145,22 +169,39 @@ def test_a_flat_file_without_names_is_held_against_the_rig(flat, tmp_path):
     assert "the file does not name its rig; assumed to be avis" in words
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "Sensors 'Sy1' and 'Sz1' are exchanged" in done.stderr
-    named = avis("identify", str(flat[1]), "--rig", "avis", "--out", str(tmp_path / "out"), "--band", "0.01", "0.011",
-                 "--columns", "y_names=Sz1+Sy1+Sx2+Sz2+Sy3+Sz3")
+    named = avis(
+        "identify",
+        str(flat[1]),
+        "--rig",
+        "avis",
+        "--out",
+        str(tmp_path / "out"),
+        "--band",
+        "0.01",
+        "0.011",
+        "--columns",
+        "y_names=Sz1+Sy1+Sx2+Sz2+Sy3+Sz3",
+    )
     assert "exchanged" not in named.stderr
     assert "y: the file does not name its channels" not in " ".join(named.stdout.split())
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    (("identify", "F", "--rig", "avis", "--out", "o", "--columns", "y_names=a+b+c+d+e+f"),
-     "--columns y_names=Sy1+Sz1+..."),
-    (("identify", "C", "--rig", "halcyonics", "--out", "o"), "the file is a campaign of avis"),
-    (("convert", "F", "o.h5", "--excitation", "chirp"), "excitation = 'chirp': expected one of multisine"),
-    (("convert", "F", "o.h5", "--unit-y", "Pa"), "y unit = 'Pa'"),
-    (("convert", "F", "o.h5", "--sample-rate", "500"), "expected 1000 Hz, the rate of the time stamps"),
-    (("convert", "C", "o.h5", "--period", "5"), "an HDF5 campaign states this itself"),
-    (("convert", __file__, "o.h5"), "not a measurement file (.py)"),
-], ids=lambda value: " ".join(map(str, value))[-40:] if isinstance(value, tuple) else "")
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ("identify", "F", "--rig", "avis", "--out", "o", "--columns", "y_names=a+b+c+d+e+f"),
+            "--columns y_names=Sy1+Sz1+...",
+        ),
+        (("identify", "C", "--rig", "halcyonics", "--out", "o"), "the file is a campaign of avis"),
+        (("convert", "F", "o.h5", "--excitation", "chirp"), "excitation = 'chirp': expected one of multisine"),
+        (("convert", "F", "o.h5", "--unit-y", "Pa"), "y unit = 'Pa'"),
+        (("convert", "F", "o.h5", "--sample-rate", "500"), "expected 1000 Hz, the rate of the time stamps"),
+        (("convert", "C", "o.h5", "--period", "5"), "an HDF5 campaign states this itself"),
+        (("convert", __file__, "o.h5"), "not a measurement file (.py)"),
+    ],
+    ids=lambda value: " ".join(map(str, value))[-40:] if isinstance(value, tuple) else "",
+)
 def test_files_that_say_little_are_refused_in_one_line(campaign, flat, tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     done = avis(*({"C": str(campaign), "F": str(flat[0])}.get(one, one) for one in arguments))
@@ -181,8 +222,10 @@ def test_what_the_file_does_not_say_may_be_said(flat, tmp_path):
 def test_single_axis_says_what_it_took_the_columns_for(data):
     drive = ("single-axis", "drive", str(data / "emps" / "DATA_EMPS.mat"), "--columns", "force=vir,position=qm,t=t")
     plain, scaled = avis(*drive), avis(*drive, "--scale", "force=35.15")
-    assert plain.stdout.splitlines()[0] == ("assumed units: force = vir in N, position = qm in m, t in s "
-                                            "(not scaled; if the file has another unit: --scale force=FACTOR)")
+    assert plain.stdout.splitlines()[0] == (
+        "assumed units: force = vir in N, position = qm in m, t in s "
+        "(not scaled; if the file has another unit: --scale force=FACTOR)"
+    )
     assert "force = vir times 35.15 in N" in scaled.stdout
 
 

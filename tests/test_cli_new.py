@@ -16,9 +16,15 @@ RESPONSE = "RESP.XX.NS388..SHZ.GS11D.4_5.380.1740.26_2"
 
 
 def avis(*arguments: str, answers: str = "\n" * 12, env: dict[str, str] | None = None) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-c", "import sys; sys.argv[0] = 'avis'\n"
-                           "from avis_ctrl.cli import main; main()", *arguments], input=answers, capture_output=True,
-                          text=True, check=False, timeout=60, env={**os.environ, "COLUMNS": "120", **(env or {})})
+    return subprocess.run(
+        [sys.executable, "-c", "import sys; sys.argv[0] = 'avis'\nfrom avis_ctrl.cli import main; main()", *arguments],
+        input=answers,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env={**os.environ, "COLUMNS": "120", **(env or {})},
+    )
 
 
 @pytest.mark.parametrize(("mounts", "drives"), [(3, 6), (4, 8)])
@@ -58,8 +64,21 @@ def test_a_design_for_this_rig(tmp_path):
     rig, path = tmp_path / "rigs" / "mine.toml", tmp_path / "mine_design.toml"
     rig.parent.mkdir()
     assert avis("new", "rig", str(rig)).returncode == 0
-    done = avis("new", "design", str(path), "--rig", str(rig), "--band", "2, 20", "--band-limit", "-9", "--mass", "5",
-                "--keep", "x, z")
+    done = avis(
+        "new",
+        "design",
+        str(path),
+        "--rig",
+        str(rig),
+        "--band",
+        "2, 20",
+        "--band-limit",
+        "-9",
+        "--mass",
+        "5",
+        "--keep",
+        "x, z",
+    )
     assert done.returncode == 0, done.stderr
     design, read = read_study(path)
     assert read.name == "my_table" and design.keep == ["x", "z"]
@@ -72,17 +91,21 @@ def test_a_design_for_this_rig(tmp_path):
         assert lines[lines.index(section) - 1].startswith("# ")
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    (("rig", "OUT", "--mounts", "5"), "mounts = 5: expected 3 or 4"),
-    (("rig", "OUT", "--mass", "-3"), "mass_kg = -3.0: expected a finite number, greater than zero"),
-    (("rig", "OUT", "--size", "1, 2"), "--size = '1, 2': expected 3 numbers"),
-    (("rig", "OUT", "--size", "1500, 1000, 500"), "expected three positive lengths in metres"),
-    (("rig", "OUT", "--name", 'a"b'), "expected a name without quotes"),
-    (("rig", "OUT", "--geophone", "RESP.absent"), "RESP.absent"),
-    (("rig", "OLD"), "this file exists"),
-    (("design", "OUT", "--rig", "absent.toml"), "absent.toml"),
-    (("design", "OUT", "--keep", "up"), "up"),
-    (("design", "OUT", "--band", "10, 1"), "band_Hz")])
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("rig", "OUT", "--mounts", "5"), "mounts = 5: expected 3 or 4"),
+        (("rig", "OUT", "--mass", "-3"), "mass_kg = -3.0: expected a finite number, greater than zero"),
+        (("rig", "OUT", "--size", "1, 2"), "--size = '1, 2': expected 3 numbers"),
+        (("rig", "OUT", "--size", "1500, 1000, 500"), "expected three positive lengths in metres"),
+        (("rig", "OUT", "--name", 'a"b'), "expected a name without quotes"),
+        (("rig", "OUT", "--geophone", "RESP.absent"), "RESP.absent"),
+        (("rig", "OLD"), "this file exists"),
+        (("design", "OUT", "--rig", "absent.toml"), "absent.toml"),
+        (("design", "OUT", "--keep", "up"), "up"),
+        (("design", "OUT", "--band", "10, 1"), "band_Hz"),
+    ],
+)
 def test_wrong_answers_are_one_line_and_write_nothing(tmp_path, arguments, said):
     (tmp_path / "OLD").write_text("kept")
     done = avis("new", *(str(tmp_path / word) if word in ("OUT", "OLD") else word for word in arguments))
@@ -98,8 +121,12 @@ def test_a_wrong_answer_is_asked_for_again_at_once(tmp_path):
         assert done.stdout.count(asked) >= 2
     assert "greater than zero" in done.stdout + done.stderr
     assert load_rig(path).parameters()["mass"].value == 240
-    done = avis("new", "design", str(tmp_path / "design.toml"),
-                answers="none.toml\navis\n\nup\nz\n10, 1\n1, 10\n\n9\n-6" + "\n" * 5)
+    done = avis(
+        "new",
+        "design",
+        str(tmp_path / "design.toml"),
+        answers="none.toml\navis\n\nup\nz\n10, 1\n1, 10\n\n9\n-6" + "\n" * 5,
+    )
     assert done.returncode == 0, done.stderr
     design, _ = read_study(tmp_path / "design.toml")
     assert design.keep == ["z"] and design.transmissibility.band_dB == -6.0

@@ -42,10 +42,19 @@ def test_the_examples_of_a_page(page, level):
         assert any(name.endswith(".svg") for name in runner.files)
 
 
-@pytest.mark.parametrize("code, shown", [
-    ("1 + 1  # -> 3", None), ("0.5  # -> 0.51", None), ("raise ValueError", None), ("0.5  # -> 0.5001", ""),
-    ("print('seen')", "seen"), ("[1, 2]", "[1, 2]"), ("import avis_ctrl as ac\nac.real('k', 1, percent=5)", "<table>"),
-    ("import avis_ctrl as ac\nax = ac.plot.vc_curves()", "![figure](page-1.svg)")])
+@pytest.mark.parametrize(
+    "code, shown",
+    [
+        ("1 + 1  # -> 3", None),
+        ("0.5  # -> 0.51", None),
+        ("raise ValueError", None),
+        ("0.5  # -> 0.5001", ""),
+        ("print('seen')", "seen"),
+        ("[1, 2]", "[1, 2]"),
+        ("import avis_ctrl as ac\nac.real('k', 1, percent=5)", "<table>"),
+        ("import avis_ctrl as ac\nax = ac.plot.vc_curves()", "![figure](page-1.svg)"),
+    ],
+)
 def test_results_are_compared_and_shown(tmp_path, code, shown):
     page = f"```python\n{code}\n```\n"
     if shown is None:
@@ -73,9 +82,15 @@ def test_every_public_name_is_in_the_reference():
 
 def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
     pytest.importorskip("mkdocs", reason="the site needs the extra: pip install 'avis_ctrl[docs]'")
-    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path)], cwd=ROOT, check=False,
-                          capture_output=True, text=True, timeout=300, env={
-                              **os.environ, "AVIS_DOCS": "check", "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"})
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "AVIS_DOCS": "check", "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"},
+    )
     assert done.returncode == 0, done.stderr
     for page in tmp_path.rglob("*.html"):
         tags = re.findall(r"<(?:script|img|iframe|link)[^>]*>", page.read_text())

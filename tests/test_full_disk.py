@@ -49,20 +49,30 @@ def given(tmp_path_factory) -> dict[str, str]:
     return {"PLAN": str(folder / "plan.toml"), "CAMPAIGN": str(folder / "campaign.h5"), "FOUND": str(folder)}
 
 
-@pytest.mark.parametrize(("arguments", "out", "at_byte"), [
-    (("simulate-campaign", "--rig", "avis", "--plan", "PLAN", "--out"), "c.h5", 200_000),
-    (("convert", "CAMPAIGN"), "c.h5", 1000),
-    (("convert", "CAMPAIGN"), "c.h5", 200_000),
-    (("predict", "FOUND", "CAMPAIGN", "--out"), "p.h5", 200_000),
-    (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.h5", 1000),
-    (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.csv", 200_000),
-    (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.mat", 1000)],
-    ids=lambda value: value[0] if isinstance(value, tuple) else str(value))
+@pytest.mark.parametrize(
+    ("arguments", "out", "at_byte"),
+    [
+        (("simulate-campaign", "--rig", "avis", "--plan", "PLAN", "--out"), "c.h5", 200_000),
+        (("convert", "CAMPAIGN"), "c.h5", 1000),
+        (("convert", "CAMPAIGN"), "c.h5", 200_000),
+        (("predict", "FOUND", "CAMPAIGN", "--out"), "p.h5", 200_000),
+        (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.h5", 1000),
+        (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.csv", 200_000),
+        (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.mat", 1000),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else str(value),
+)
 def test_a_file_that_the_system_refuses(arguments, out, at_byte, given, tmp_path):
     path = tmp_path / out
     path.write_bytes(b"old")
-    done = subprocess.run([sys.executable, "-c", LIMITED, str(at_byte), *(given.get(one, one) for one in arguments),
-                           str(path)], capture_output=True, text=True, timeout=60, env=ONE_THREAD, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(at_byte), *(given.get(one, one) for one in arguments), str(path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=ONE_THREAD,
+        check=False,
+    )
     assert done.returncode == 3, done.stderr
     assert done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
     assert f"{path} was not written" in done.stderr and "File too large" in done.stderr
@@ -71,9 +81,22 @@ def test_a_file_that_the_system_refuses(arguments, out, at_byte, given, tmp_path
 
 def test_what_cannot_be_printed_is_one_line(given, tmp_path):
     with open("/dev/full", "w", encoding="utf-8") as full:
-        done = subprocess.run([sys.executable, "-c", "from avis_ctrl.cli import main; main()", "convert",
-                               given["CAMPAIGN"], str(tmp_path / "c.h5")], stdout=full, stderr=subprocess.PIPE,
-                              text=True, timeout=60, env=ONE_THREAD, check=False)
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-c",
+                "from avis_ctrl.cli import main; main()",
+                "convert",
+                given["CAMPAIGN"],
+                str(tmp_path / "c.h5"),
+            ],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            env=ONE_THREAD,
+            check=False,
+        )
     assert done.returncode == 3
     assert done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
     assert "No space left" in done.stderr
@@ -85,10 +108,14 @@ def _writes(path: Path) -> list[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call):
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-            modes = {one.value for one in (*node.args, *(k.value for k in node.keywords))
-                     if isinstance(one, ast.Constant) and isinstance(one.value, str)}
+            modes = {
+                one.value
+                for one in (*node.args, *(k.value for k in node.keywords))
+                if isinstance(one, ast.Constant) and isinstance(one.value, str)
+            }
             if name in ("write_text", "write_bytes", "mkstemp", "NamedTemporaryFile") or (
-                    name in ("open", "File", "fdopen") and modes & {"w", "a", "x", "wb", "ab", "xb", "w+b", "r+"}):
+                name in ("open", "File", "fdopen") and modes & {"w", "a", "x", "wb", "ab", "xb", "w+b", "r+"}
+            ):
                 found.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
     return found
 

@@ -12,9 +12,29 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "avis_ctrl"
-LEVEL = {"errors": -2, "summary": -2, "checks": -1, "files": -1, "uncertain_value": -1, "lti": 0, "rigs": 1,
-         "measurement": 1, "identification": 2, "uncertainty": 2, "robust": 3, "classical": 3, "simulation": 4,
-         "gap": 5, "study": 6, "report": 7, "plot": 7, "export": 7, "sweep": 8, "interface": 9, "cli": 10}
+LEVEL = {
+    "errors": -2,
+    "summary": -2,
+    "checks": -1,
+    "files": -1,
+    "uncertain_value": -1,
+    "lti": 0,
+    "rigs": 1,
+    "measurement": 1,
+    "identification": 2,
+    "uncertainty": 2,
+    "robust": 3,
+    "classical": 3,
+    "simulation": 4,
+    "gap": 5,
+    "study": 6,
+    "report": 7,
+    "plot": 7,
+    "export": 7,
+    "sweep": 8,
+    "interface": 9,
+    "cli": 10,
+}
 PROJECT = ("avis_ctrl", "tests", "benchmarks", "designs")
 FILES = sorted(PACKAGE.rglob("*.py"))
 
@@ -29,12 +49,13 @@ def imports(path: Path) -> tuple[tuple[str, bool], ...]:
             if isinstance(child, ast.Import):
                 yield from ((alias.name, at_once) for alias in child.names)
             elif isinstance(child, ast.ImportFrom):
-                base = [*package[:len(package) - child.level + 1]] if child.level else []
+                base = [*package[: len(package) - child.level + 1]] if child.level else []
                 module = ".".join([*base, *([child.module] if child.module else [])])
                 yield from ((f"{module}.{alias.name}", at_once) for alias in child.names)
             else:
                 inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
                 yield from walk(child, at_once and not inside)
+
     return tuple(walk(ast.parse(path.read_text(encoding="utf-8")), True))
 
 
@@ -95,9 +116,11 @@ def import_circles() -> list[list[str]]:
             found |= new
             waiting += new
         return found
+
     reach = {name: reached(name) for name in after}
-    groups = {frozenset(other for other in reach[name] if name in reach[other])
-              for name in after if name in reach[name]}
+    groups = {
+        frozenset(other for other in reach[name] if name in reach[other]) for name in after if name in reach[name]
+    }
     return sorted(sorted(group) for group in groups)
 
 
@@ -105,8 +128,14 @@ def test_no_import_circles():
     assert import_circles() == []
 
 
-@pytest.mark.parametrize("back", ["from .a import x\n", "if TYPE_CHECKING:\n    from avis_ctrl.lti.a import x\n",
-                                  "def f():\n    from avis_ctrl.lti import a\n"])
+@pytest.mark.parametrize(
+    "back",
+    [
+        "from .a import x\n",
+        "if TYPE_CHECKING:\n    from avis_ctrl.lti.a import x\n",
+        "def f():\n    from avis_ctrl.lti import a\n",
+    ],
+)
 def test_a_circle_is_found_however_it_is_hidden(tmp_path, monkeypatch, back):
     monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path / "avis_ctrl")
     folder = tmp_path / "avis_ctrl" / "lti"
@@ -119,8 +148,12 @@ def test_a_circle_is_found_however_it_is_hidden(tmp_path, monkeypatch, back):
 
 def private_imports(path: Path) -> list[str]:
     """Names with a leading underscore that a file takes from a module of the project."""
-    return [name for name, _ in imports(path) if name.split(".")[0] in PROJECT
-            and any(part.startswith("_") and not part.startswith("__") for part in name.split("."))]
+    return [
+        name
+        for name, _ in imports(path)
+        if name.split(".")[0] in PROJECT
+        and any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
+    ]
 
 
 @pytest.mark.parametrize("folder", PROJECT)
@@ -134,21 +167,28 @@ def test_a_private_import_is_found_even_inside_a_function(tmp_path, monkeypatch)
     monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path / "avis_ctrl")
     path = tmp_path / "tests" / "test_a.py"
     path.parent.mkdir()
-    path.write_text("from __future__ import annotations\nfrom os import _exit\nfrom avis_ctrl import __version__\n"
-                    "def f():\n    from avis_ctrl.lti.norms import _inner\n")
+    path.write_text(
+        "from __future__ import annotations\nfrom os import _exit\nfrom avis_ctrl import __version__\n"
+        "def f():\n    from avis_ctrl.lti.norms import _inner\n"
+    )
     assert private_imports(path) == ["avis_ctrl.lti.norms._inner"]
 
 
 def users(library: str, at_once: bool = False) -> list[str]:
-    return [str(path.relative_to(PACKAGE)) for path in FILES
-            for name, direct in imports(path) if name.split(".")[0] == library and (direct or not at_once)]
+    return [
+        str(path.relative_to(PACKAGE))
+        for path in FILES
+        for name, direct in imports(path)
+        if name.split(".")[0] == library and (direct or not at_once)
+    ]
 
 
 def test_slycot_is_a_second_opinion_only():
     """One adapter imports it, and only the analysis of a finished design and the doctor use it: no bound does."""
     assert set(users("slycot")) == {"robust/slycot_adapter.py"}
-    users_of_adapter = {str(path.relative_to(PACKAGE)) for path in FILES for name, _ in imports(path)
-                        if "slycot_adapter" in name}
+    users_of_adapter = {
+        str(path.relative_to(PACKAGE)) for path in FILES for name, _ in imports(path) if "slycot_adapter" in name
+    }
     assert users_of_adapter == {"study/analysis.py", "study/doctor.py"}
 
 

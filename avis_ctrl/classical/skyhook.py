@@ -41,15 +41,19 @@ class Skyhook:
         if len(self.axes) != len(self.gains):
             raise InputError(f"{len(self.axes)} axes but {len(self.gains)} gains", field="gains", value=self.gains)
         if not all(np.isfinite(g) and g >= 0 for g in self.gains):
-            raise InputError("expected gains of at least 0: a negative one feeds the motion", field="gains",
-                             value=self.gains)
+            raise InputError(
+                "expected gains of at least 0: a negative one feeds the motion", field="gains", value=self.gains
+            )
         for field in ("tilt_corner_Hz", "roll_off_Hz"):
             value = getattr(self, field)
             if not (np.isfinite(value) and value > 0):
                 raise InputError("expected a positive frequency", field=field, value=value)
         if self.tilt_corner_Hz >= self.roll_off_Hz:
-            raise InputError(f"expected a corner below the roll-off at {self.roll_off_Hz:g} Hz",
-                             field="tilt_corner_Hz", value=self.tilt_corner_Hz)
+            raise InputError(
+                f"expected a corner below the roll-off at {self.roll_off_Hz:g} Hz",
+                field="tilt_corner_Hz",
+                value=self.tilt_corner_Hz,
+            )
 
     @property
     def filter(self) -> StateSpace:
@@ -68,8 +72,9 @@ class Skyhook:
         return append(*(self.loop(axis).renamed([f"seen_{axis}_dot"], [f"command_{axis}"]) for axis in self.axes))
 
 
-def critical_damping(mass: np.typing.ArrayLike, stiffness: np.typing.ArrayLike, damping: np.typing.ArrayLike
-                     ) -> np.ndarray:
+def critical_damping(
+    mass: np.typing.ArrayLike, stiffness: np.typing.ArrayLike, damping: np.typing.ArrayLike
+) -> np.ndarray:
     """The classical rule: g = 2 sqrt(k m) - c damps each axis critically if the axes are decoupled."""
     m, k, c = (np.asarray(values, float) for values in (mass, stiffness, damping))
     return np.maximum(2.0 * np.sqrt(k * m) - c, 0.0)

@@ -54,8 +54,9 @@ class Scenarios:
     plants: int
 
     @staticmethod
-    def sample(plant: GeneralizedPlant, floor: Sequence[str], payload: Sequence[str], omega: np.ndarray,
-               count: int, seed: int) -> Scenarios:
+    def sample(
+        plant: GeneralizedPlant, floor: Sequence[str], payload: Sequence[str], omega: np.ndarray, count: int, seed: int
+    ) -> Scenarios:
         """The nominal plant and `count` samples on the boundary of the uncertainty set.
 
         All complex blocks of one sample have the same phase, and the phases of the samples cover the circle.
@@ -68,8 +69,9 @@ class Scenarios:
         for k in range(1, count + 1):
             deltas[k] = _boundary(plant, rng, np.exp(2j * np.pi * k / count))
         chosen = plant.restricted(list(floor), list(payload))
-        return Scenarios(chosen, omega, chosen.P.frequency_response(omega), deltas, tuple(floor), tuple(payload),
-                         count + 1)
+        return Scenarios(
+            chosen, omega, chosen.P.frequency_response(omega), deltas, tuple(floor), tuple(payload), count + 1
+        )
 
     def with_delta(self, delta: np.ndarray) -> Scenarios:
         """A copy with one more sample: a worst case found by a bound, the same at every frequency."""
@@ -85,8 +87,9 @@ class Scenarios:
         """A copy with more frequencies [rad/s]; each new one takes the perturbations of the nearest old frequency."""
         every = np.union1d(self.omega, omega)
         nearest = np.argmin(np.abs(np.log(every[:, None] / self.omega)), axis=1)
-        return replace(self, omega=every, responses=self.plant.P.frequency_response(every),
-                       deltas=self.deltas[:, nearest])
+        return replace(
+            self, omega=every, responses=self.plant.P.frequency_response(every), deltas=self.deltas[:, nearest]
+        )
 
     def channels(self) -> Channels:
         """Close Delta around the responses: F_u(P(j omega), Delta), sample by sample."""
@@ -101,9 +104,16 @@ class Scenarios:
 
 def _boundary(plant: GeneralizedPlant, rng: np.random.Generator, phase: complex) -> np.ndarray:
     """Real scalars at +-1, complex blocks of unit norm with the given phase."""
-    return plant.blocks.assemble([rng.choice([-1.0, 1.0]) if block.kind == "real"
-                                  else phase if block.kind == "complex"
-                                  else phase * np.eye(block.rows, block.cols) for block in plant.blocks.blocks])
+    return plant.blocks.assemble(
+        [
+            rng.choice([-1.0, 1.0])
+            if block.kind == "real"
+            else phase
+            if block.kind == "complex"
+            else phase * np.eye(block.rows, block.cols)
+            for block in plant.blocks.blocks
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -204,7 +214,7 @@ class Search:
         K, _ = self._loops(point)
         # Unstable loops have finite responses too: for stability the return difference must not encircle the origin. A
         # sample with the worst case of each frequency by itself is not a plant, so its encirclements have no meaning.
-        plants = self.channels.yu[:self.scenarios.plants]
+        plants = self.channels.yu[: self.scenarios.plants]
         turns = encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
         sigma = largest_singular_value(self.channels.closed(K))
         return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, turns)
@@ -212,14 +222,18 @@ class Search:
     def starts(self) -> list[np.ndarray]:
         """The classical tunings: multiples of critical damping with the usual corners and corners around them."""
         asked = self.settings
-        points = [self.search.point(g, (tilt, roll)) for g in asked.gain_factors for tilt in asked.tilt_corners_Hz
-                  for roll in asked.roll_offs_Hz]
+        points = [
+            self.search.point(g, (tilt, roll))
+            for g in asked.gain_factors
+            for tilt in asked.tilt_corners_Hz
+            for roll in asked.roll_offs_Hz
+        ]
         return list({tuple(np.round(point, 9)): point for point in points}.values())
 
     def best_starts(self, limit: float, more: Sequence[np.ndarray] = ()) -> list[np.ndarray]:
         """The best starting points, `more` included, best first. Unstable ones rank last."""
         ranked = sorted([*more, *self.starts()], key=lambda point: self.merit(point, limit).key())
-        return ranked[:self.settings.refined]
+        return ranked[: self.settings.refined]
 
     def improved(self, point: np.ndarray, limit: float) -> np.ndarray:
         """Minimise the peak down to the limit, then the maximum in the band, by linear programs in a trust region."""
@@ -230,8 +244,9 @@ class Search:
                 break
             values, slopes, in_band = self._linearised(point)
             low, high = np.maximum(bounds[:, 0] - point, -radius), np.minimum(bounds[:, 1] - point, radius)
-            trial = np.clip(point + _minimax_step(values, slopes, in_band, np.log(limit), low, high),
-                            bounds[:, 0], bounds[:, 1])
+            trial = np.clip(
+                point + _minimax_step(values, slopes, in_band, np.log(limit), low, high), bounds[:, 0], bounds[:, 1]
+            )
             there = self.merit(trial, limit)
             if there.key() < here.key():
                 gained = 1.0 if there.key()[:2] < here.key()[:2] else 1 - there.key()[2] / here.key()[2]
@@ -270,16 +285,21 @@ class Search:
         return log_s[at], slopes, in_band[at]
 
 
-def _minimax_step(values: np.ndarray, slopes: np.ndarray, in_band: np.ndarray, log_limit: float, low: np.ndarray,
-                  high: np.ndarray) -> np.ndarray:
+def _minimax_step(
+    values: np.ndarray, slopes: np.ndarray, in_band: np.ndarray, log_limit: float, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
     """Step between low and high that minimises, to first order, the excess over the limit, then the band's maximum."""
     n = slopes.shape[1]
     # Unknowns: the step, the largest excess over the limit (at least 0), the maximum in the band.
     excess = np.hstack([slopes, -np.ones((values.size, 1)), np.zeros((values.size, 1))])
     level = np.hstack([slopes, np.zeros((values.size, 1)), -np.ones((values.size, 1))])[in_band]
-    program = so.linprog(np.r_[np.zeros(n), 100.0, 1.0], A_ub=np.vstack([excess, level]),
-                         b_ub=np.r_[log_limit - values, -values[in_band]],
-                         bounds=[*zip(low, high, strict=True), (0, None), (None, None)], method="highs-ds")
+    program = so.linprog(
+        np.r_[np.zeros(n), 100.0, 1.0],
+        A_ub=np.vstack([excess, level]),
+        b_ub=np.r_[log_limit - values, -values[in_band]],
+        bounds=[*zip(low, high, strict=True), (0, None), (None, None)],
+        method="highs-ds",
+    )
     return program.x[:n] if program.status == 0 else np.zeros(n)
 
 

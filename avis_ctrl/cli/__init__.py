@@ -30,8 +30,12 @@ INTERRUPTED = UserInterruptError.exit_code
 AGAIN_S = 3.0  # time for clean-up before the interrupt is repeated
 
 # Markdown: paragraphs of the help are wrapped to the terminal.
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="markdown",
-                  help="Workbench for active vibration isolation tables.")
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    help="Workbench for active vibration isolation tables.",
+)
 
 
 def _version(asked: bool) -> None:
@@ -41,8 +45,11 @@ def _version(asked: bool) -> None:
 
 
 @app.callback()
-def _commands(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True,
-                                                    help="print the version")] = False) -> None:
+def _commands(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
+    ] = False,
+) -> None:
     """Workbench for active vibration isolation tables.
 
     Exit codes: 0 done (read the verdict), 2 invalid input, 3 a computation failed.
@@ -67,10 +74,20 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-for command, name in ((design, "design"), (compare, "compare"), (export, "export"), (identify, "identify"),
-                      (gap, "gap"), (predict, "predict"), (gap_axis, "gap-axis"), (excite, "excite"),
-                      (simulate_campaign, "simulate-campaign"), (convert, "convert"), (single_axis, "single-axis"),
-                      (sweep, "sweep")):
+for command, name in (
+    (design, "design"),
+    (compare, "compare"),
+    (export, "export"),
+    (identify, "identify"),
+    (gap, "gap"),
+    (predict, "predict"),
+    (gap_axis, "gap-axis"),
+    (excite, "excite"),
+    (simulate_campaign, "simulate-campaign"),
+    (convert, "convert"),
+    (single_axis, "single-axis"),
+    (sweep, "sweep"),
+):
     app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
 app.add_typer(new, name="new")
 
@@ -95,6 +112,7 @@ def _silence_lost_interrupts() -> None:
     def hook(ignored: Any) -> None:
         if not issubclass(ignored.exc_type, KeyboardInterrupt):
             usual(ignored)
+
     sys.unraisablehook = hook
 
 
@@ -114,6 +132,7 @@ def _say_unusual() -> None:
             print(f"avis: {message}", file=sys.stderr)
         else:
             usual(message, category, *of, **also)
+
     warnings.showwarning = show
 
 
@@ -141,8 +160,11 @@ def main() -> None:
         sys.exit(ComputationError.exit_code)
     except typer.Abort as error:
         if isinstance(error.__context__, EOFError):  # a prompt, but no more input
-            print("\navis: the standard input ended before all values were given; give what is missing as options "
-                  "(see --help)", file=sys.stderr)
+            print(
+                "\navis: the standard input ended before all values were given; give what is missing as options "
+                "(see --help)",
+                file=sys.stderr,
+            )
             sys.exit(InputError.exit_code)
         code = INTERRUPTED
     except KeyboardInterrupt:

@@ -56,8 +56,10 @@ class StopRequest:
     def _heard(self, number: int, frame: FrameType | None) -> None:
         self.asked = True
         signal.signal(signal.SIGINT, self.usual)
-        self.say("Ctrl-C: after this iteration the design continues with the best controller so far; "
-                 "again Ctrl-C to end without results")
+        self.say(
+            "Ctrl-C: after this iteration the design continues with the best controller so far; "
+            "again Ctrl-C to end without results"
+        )
 
     def __exit__(self, *error: object) -> None:
         if self.usual is not None:

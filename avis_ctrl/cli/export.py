@@ -22,21 +22,50 @@ ORDERS = "orders.png"  # with --order: the orders tried and their mu
 def export(
     design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
-    controller: Annotated[str | None, typer.Option("--controller", metavar="NAME", show_default="mu", help="a "
-                                                   "controller of the design; with --check, the one that DIR must "
-                                                   "have")] = None,
-    order: Annotated[int | None, typer.Option("--order", metavar="N", help="export a new controller with at most "
-                                              "N states for the axes of the design, found by descent on mu (two "
-                                              "minutes or more)")] = None,
-    mu_at_most: Annotated[float | None, typer.Option("--mu-at-most", metavar="MU", help="with --order: mu that the "
-                                                     "new controller may have, instead of the design's requirement"
-                                                     )] = None,
-    formats: Annotated[str | None, typer.Option("--format", metavar="LIST", show_default="c,mat,json", help="some of "
-                                                "c,mat,json; controller.json and certificate.json are always written"
-                                                )] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(
+            "--controller",
+            metavar="NAME",
+            show_default="mu",
+            help="a controller of the design; with --check, the one that DIR must have",
+        ),
+    ] = None,
+    order: Annotated[
+        int | None,
+        typer.Option(
+            "--order",
+            metavar="N",
+            help="export a new controller with at most "
+            "N states for the axes of the design, found by descent on mu (two "
+            "minutes or more)",
+        ),
+    ] = None,
+    mu_at_most: Annotated[
+        float | None,
+        typer.Option(
+            "--mu-at-most",
+            metavar="MU",
+            help="with --order: mu that the new controller may have, instead of the design's requirement",
+        ),
+    ] = None,
+    formats: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="LIST",
+            show_default="c,mat,json",
+            help="some of c,mat,json; controller.json and certificate.json are always written",
+        ),
+    ] = None,
     float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
-    check: Annotated[bool, typer.Option("--check", help="write nothing: check that the files in DIR belong together "
-                                        "and compute their certificate again")] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="write nothing: check that the files in DIR belong together and compute their certificate again",
+        ),
+    ] = False,
 ) -> None:
     """Write a controller for the rig's processor: sensor volts to drive volts, all axes.
 
@@ -59,16 +88,20 @@ def export(
     if order is not None and order < 1:
         raise InputError("expected a whole number, 1 or more", field="--order", value=order)
     if mu_at_most is not None and not (order is not None and mu_at_most > 0):
-        raise InputError("expected a positive number, and only together with --order", field="--mu-at-most",
-                         value=mu_at_most)
+        raise InputError(
+            "expected a positive number, and only together with --order", field="--mu-at-most", value=mu_at_most
+        )
     folder = open_design(design_dir)
     if check:
         with Progress(console) as progress:
             wrong = check_package(folder, out, progress, controller)
         if wrong:
-            raise InputError(f"{len(wrong)} {'difference' if len(wrong) == 1 else 'differences'}: "
-                             f"{'; '.join(wrong[:2])}{'; and others, listed above' if len(wrong) > 2 else ''}. Export "
-                             "the controller again", file=out)
+            raise InputError(
+                f"{len(wrong)} {'difference' if len(wrong) == 1 else 'differences'}: "
+                f"{'; '.join(wrong[:2])}{'; and others, listed above' if len(wrong) > 2 else ''}. Export "
+                "the controller again",
+                file=out,
+            )
         console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
     controller = controller or "mu"
@@ -119,10 +152,14 @@ def _anti_windup(choice: Choice) -> str:
     with_it, without = (1e3 * one[-1, 0] for one in (choice.chosen, choice.without))
     after = f"after floor motion that demands {choice.levels[-1]:g} times the drives' range"
     if choice.corner_Hz is None:
-        return ("No anti-windup: each law tried slows the recovery at some level of the floor, or is no better; "
-                f"{after} the payload moves with {without:.3g} mm/s r.m.s.")
-    return (f"Anti-windup: lag of {choice.corner_Hz:g} Hz, gain {choice.gain:g}; {after} the payload moves with "
-            f"{with_it:.3g} mm/s r.m.s., {without:.3g} mm/s without it.")
+        return (
+            "No anti-windup: each law tried slows the recovery at some level of the floor, or is no better; "
+            f"{after} the payload moves with {without:.3g} mm/s r.m.s."
+        )
+    return (
+        f"Anti-windup: lag of {choice.corner_Hz:g} Hz, gain {choice.gain:g}; {after} the payload moves with "
+        f"{with_it:.3g} mm/s r.m.s., {without:.3g} mm/s without it."
+    )
 
 
 def _summary(console: Console, made: Package) -> None:
@@ -131,19 +168,29 @@ def _summary(console: Console, made: Package) -> None:
     from rich.table import Table
 
     found = made.certificate.content
-    table = Table("computed from the exported numbers", "", title="certificate",
-                  caption="Bounds: the axes of the design, with the others locked. Simulation: all six axes.")
-    rows = (("mu, upper bound", found["mu_upper"], ""), ("mu, lower bound", found["mu_lower"], ""),
-            ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
-            ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
-            ("worst-case gain, between samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
-            ("worst plant simulated with the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
-            ("gain at rest, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
-            (f"drive {found['at_rest']['drive']}: voltage for offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV",
-             found["at_rest"]["drive_V"], " V"),
-            ("the same, relative to its limit", found["at_rest"]["percent_of_limit"], " %"),
-            ("payload velocity by rounding, bound", found["rounding_noise_m_per_s"], " m/s"),
-            ("time of one step on this machine", found["step_time_us"], " us"))
+    table = Table(
+        "computed from the exported numbers",
+        "",
+        title="certificate",
+        caption="Bounds: the axes of the design, with the others locked. Simulation: all six axes.",
+    )
+    rows = (
+        ("mu, upper bound", found["mu_upper"], ""),
+        ("mu, lower bound", found["mu_lower"], ""),
+        ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
+        ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
+        ("worst-case gain, between samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
+        ("worst plant simulated with the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
+        ("gain at rest, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
+        (
+            f"drive {found['at_rest']['drive']}: voltage for offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV",
+            found["at_rest"]["drive_V"],
+            " V",
+        ),
+        ("the same, relative to its limit", found["at_rest"]["percent_of_limit"], " %"),
+        ("payload velocity by rounding, bound", found["rounding_noise_m_per_s"], " m/s"),
+        ("time of one step on this machine", found["step_time_us"], " us"),
+    )
     for name, value, unit in rows:
         table.add_row(name, "not measured" if value is None else f"{value:.4g}{unit}")
     console.print(table)

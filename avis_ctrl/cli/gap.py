@@ -22,25 +22,52 @@ def gap(
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="records of the rig: HDF5, .mat, UFF 58 or CSV")],
     rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for gap.json, report and models")],
-    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable of the file "
-                                                "is what, as in avis identify")] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            "--columns", metavar="ROLE=NAME,..", help="which variable of the file is what, as in avis identify"
+        ),
+    ] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
-    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
-                                                                "the excited band")] = None,
-    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="corner of the amplifiers' "
-                                                       "first-order lag, if it is known [Hz]")] = None,
-    design: Annotated[bool, typer.Option("--design", help="also design controllers on both models, to show the "
-                                         "influence of the effect on mu (about a minute more)")] = False,
-    design_file: Annotated[Path | None, typer.Option("--design-file", metavar="DESIGN.toml", help="as --design, with "
-                                                     "the axes, uncertainty and weights of this file instead of the "
-                                                     "default design for z and phi_x")] = None,
-    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="Python file with effects of "
-                                                 "your own, run before the search (docs/own_effect.md)")] = None,
-    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate "
-                                                         "has the result stop")] = False,
+    band_Hz: Annotated[
+        tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default the excited band")
+    ] = None,
+    amplifier_Hz: Annotated[
+        float | None,
+        typer.Option("--amplifier-corner", help="corner of the amplifiers' first-order lag, if it is known [Hz]"),
+    ] = None,
+    design: Annotated[
+        bool,
+        typer.Option(
+            "--design",
+            help="also design controllers on both models, to show the "
+            "influence of the effect on mu (about a minute more)",
+        ),
+    ] = False,
+    design_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--design-file",
+            metavar="DESIGN.toml",
+            help="as --design, with "
+            "the axes, uncertainty and weights of this file instead of the "
+            "default design for z and phi_x",
+        ),
+    ] = None,
+    effects: Annotated[
+        Path | None,
+        typer.Option(
+            "--effects",
+            metavar="FILE.py",
+            help="Python file with effects of your own, run before the search (docs/own_effect.md)",
+        ),
+    ] = None,
+    despite_gates: Annotated[
+        bool, typer.Option("--despite-gates", help="continue even if a gate has the result stop")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
     """Find where model and measurement disagree, and name the physical effects that the model lacks.
@@ -57,8 +84,9 @@ def gap(
     from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES
 
     console = Console(highlight=False)
-    options = GapOptions(seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None,
-                         design_file)  # raises at once if they are invalid
+    options = GapOptions(
+        seed, band_Hz, True, despite_gates, amplifier_Hz, design or design_file is not None, design_file
+    )  # raises at once if they are invalid
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
 
@@ -84,8 +112,9 @@ def gap(
         except InputError as error:
             raise error if error.file else error.in_file(campaign) from None
         progress("report")
-        files = write_gap(folder, found.gap, *rendered(document(found)), found.to_json(),
-                          found.design.files if found.design else None)
+        files = write_gap(
+            folder, found.gap, *rendered(document(found)), found.to_json(), found.design.files if found.design else None
+        )
     _summary(console, found)
     console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
 
@@ -95,8 +124,9 @@ def _summary(console: Console, found: GapFinding) -> None:
 
     gap = found.gap
     console.print(f"[bold]{gap.verdict}[/]: {gap.sentences[0]}")
-    table = Table("stage", "error of held-out y, r.m.s.", "chi-square per degree of freedom",
-                  title="gap on held-out records")
+    table = Table(
+        "stage", "error of held-out y, r.m.s.", "chi-square per degree of freedom", title="gap on held-out records"
+    )
     for stage in gap.stages:
         table.add_row(stage.name, f"{100 * stage.nrmse:.3g} %", f"{stage.chi2_per_dof:.4g}")
     table.add_row("[dim]noise alone[/]", f"[dim]{100 * gap.noise_nrmse:.3g} %[/]", "[dim]1[/]")
@@ -106,8 +136,10 @@ def _summary(console: Console, found: GapFinding) -> None:
     if gap.next_experiment:
         console.print(f"- next: {gap.next_experiment}")
     elif gap.effects and found.design is None and not found.design_note:
-        console.print("- next: --design shows the influence on the controller; avis predict tests the updated model "
-                      "on another campaign")
+        console.print(
+            "- next: --design shows the influence on the controller; avis predict tests the updated model "
+            "on another campaign"
+        )
     if found.design is not None:
         for sentence in found.design.sentences:
             console.print(f"- {sentence}")

@@ -13,28 +13,63 @@ from avis_ctrl.cli.file_options import SAMPLE_RATE, factors, roles
 
 def gap_axis(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="drive, oscillator, seismometer or levels")],
-    path: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one "
-                                         "CSV per frequency; for levels a folder of `u_*mV*.npy` and `y_*mV*.npy`")],
-    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="drive: force, position, "
-                                                "reference; oscillator: u, y; seismometer: drive, coil and/or "
-                                                "displacement; each also t; by name, or in CSV by number from 1; "
-                                                "levels: none")] = None,
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MEASUREMENT",
+            help="a record; for a seismometer a folder with one "
+            "CSV per frequency; for levels a folder of `u_*mV*.npy` and `y_*mV*.npy`",
+        ),
+    ],
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            "--columns",
+            metavar="ROLE=NAME,..",
+            help="drive: force, position, "
+            "reference; oscillator: u, y; seismometer: drive, coil and/or "
+            "displacement; each also t; by name, or in CSV by number from 1; "
+            "levels: none",
+        ),
+    ] = None,
     scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
     sample_rate_Hz: SAMPLE_RATE = None,
-    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz, of what is "
-                                                                "fitted; around one mode of a structure")] = None,
-    cutoff_Hz: Annotated[float | None, typer.Option("--cutoff", metavar="HZ", help="low-pass of the motion of which "
-                                                    "a drive's friction is formed; the fit itself runs as far up as "
-                                                    "force and motion are coherent")] = None,
-    output: Annotated[str, typer.Option("--output", metavar="KIND", help="what the column of y or position holds: "
-                                        "position, velocity or acceleration")] = "position",
-    range_s: Annotated[tuple[float, float] | None, typer.Option("--range", metavar="START END", help="s, part of each "
-                                                                "record")] = None,
+    band_Hz: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--band", metavar="LOW HIGH", help="Hz, of what is fitted; around one mode of a structure"),
+    ] = None,
+    cutoff_Hz: Annotated[
+        float | None,
+        typer.Option(
+            "--cutoff",
+            metavar="HZ",
+            help="low-pass of the motion of which "
+            "a drive's friction is formed; the fit itself runs as far up as "
+            "force and motion are coherent",
+        ),
+    ] = None,
+    output: Annotated[
+        str,
+        typer.Option(
+            "--output",
+            metavar="KIND",
+            help="what the column of y or position holds: position, velocity or acceleration",
+        ),
+    ] = "position",
+    range_s: Annotated[
+        tuple[float, float] | None, typer.Option("--range", metavar="START END", help="s, part of each record")
+    ] = None,
     resample_Hz: Annotated[float | None, typer.Option("--resample", metavar="HZ", help="new sample rate")] = None,
-    also: Annotated[list[Path] | None, typer.Option("--also", metavar="RECORD", help="another record of the same axis; "
-                                                    "of several, whole ones are held out")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="folder for gap.json, reports and the model "
-                                             "that avis predict reads")] = None,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--also", metavar="RECORD", help="another record of the same axis; of several, whole ones are held out"
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="folder for gap.json, reports and the model that avis predict reads"),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", hidden=True, help="has no influence any more")] = 1,
 ) -> None:
     """Find the effects that a model of one axis lacks: their size and probability, and the gap before and after.
@@ -58,12 +93,21 @@ def gap_axis(
     files: list[str] = []
     with output_folder(out, FILES) if out else nullcontext() as folder:
         with Progress(console) as progress:
-            found = find_axis_gap_in(kind, [path, *(also or ())] if also else path, names, scale=scales,
-                                     sample_rate_Hz=sample_rate_Hz, progress=progress, **reading, **options)
+            found = find_axis_gap_in(
+                kind,
+                [path, *(also or ())] if also else path,
+                names,
+                scale=scales,
+                sample_rate_Hz=sample_rate_Hz,
+                progress=progress,
+                **reading,
+                **options,
+            )
         if folder:
             given = {"kind": kind, "columns": names, "scale": scales, "sample_rate_Hz": sample_rate_Hz}
-            files = write_axis_gap(folder, found, path.name, {**given, **reading, **options},
-                                   lambda *told: rendered(document(*told)))
+            files = write_axis_gap(
+                folder, found, path.name, {**given, **reading, **options}, lambda *told: rendered(document(*told))
+            )
     console.print(f"verdict: {found.verdict}")
     for sentence in found.sentences:
         console.print(sentence, soft_wrap=True, markup=False)
@@ -71,7 +115,8 @@ def gap_axis(
         console.print(f"{name} = {one}", markup=False)
     for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
-        console.print(f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True,
-                      markup=False)
+        console.print(
+            f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True, markup=False
+        )
     if folder:
         console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")

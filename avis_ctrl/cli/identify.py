@@ -28,39 +28,83 @@ if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
 
 
 def identify(
-    measurement: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5 campaign, .mat, UFF 58, CSV or a "
-                                                "folder of CSV; records or frequency responses")],
-    rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="rig to start from: avis, halcyonics, "
-                                     "halcyonics_loaded or a rig.toml")],
+    measurement: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MEASUREMENT",
+            help="HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or frequency responses",
+        ),
+    ],
+    rig: Annotated[
+        str,
+        typer.Option(
+            "--rig", metavar="RIG", help="rig to start from: avis, halcyonics, halcyonics_loaded or a rig.toml"
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for rig, report and uncertainty")],
-    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable of the file "
-                                                "is what, such as u=V1+V2,y=S1,t=time; names of the channels: "
-                                                "y_names=Sy1+Sz1")] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            "--columns",
+            metavar="ROLE=NAME,..",
+            help="which variable of the file "
+            "is what, such as u=V1+V2,y=S1,t=time; names of the channels: "
+            "y_names=Sy1+Sz1",
+        ),
+    ] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
-    parameters: Annotated[list[str] | None, typer.Option("--parameter", metavar="NAME", help="parameter to fit, such "
-                                                         "as 'isolator*.k_z' (repeatable); by default mass, inertia, "
-                                                         "stiffness, damping")] = None,
-    priors: Annotated[list[str] | None, typer.Option("--prior", metavar="NAME=MEAN+-STD", help="prior knowledge of a "
-                                                     "parameter (repeatable)")] = None,
-    hold_out: Annotated[list[str] | None, typer.Option("--hold-out", metavar="RECORD", help="record kept for "
-                                                       "validation (repeatable); chosen automatically by default"
-                                                       )] = None,
-    band_Hz: Annotated[tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default "
-                                                                "the excited band")] = None,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--parameter",
+            metavar="NAME",
+            help="parameter to fit, such as 'isolator*.k_z' (repeatable); by default mass, inertia, stiffness, damping",
+        ),
+    ] = None,
+    priors: Annotated[
+        list[str] | None,
+        typer.Option("--prior", metavar="NAME=MEAN+-STD", help="prior knowledge of a parameter (repeatable)"),
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold-out",
+            metavar="RECORD",
+            help="record kept for validation (repeatable); chosen automatically by default",
+        ),
+    ] = None,
+    band_Hz: Annotated[
+        tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default the excited band")
+    ] = None,
     starts: Annotated[int, typer.Option("--starts", help="number of starting points of the fit")] = 3,
-    amplifier_Hz: Annotated[float | None, typer.Option("--amplifier-corner", help="corner of the amplifiers' "
-                                                       "first-order lag [Hz]; by default none, or 300 Hz on a rig with "
-                                                       "accelerometers")] = None,
-    kalman: Annotated[bool, typer.Option("--kalman", help="also run the extended Kalman filter, for comparison")
-                      ] = False,
-    design: Annotated[Path | None, typer.Option("--design", metavar="DESIGN.toml", help="design file whose rig and "
-                                                "uncertainty are replaced by the identified ones; by default a design "
-                                                "for z and phi_x with the weights of the shipped examples")] = None,
-    despite_gates: Annotated[bool, typer.Option("--despite-gates", help="continue even if a gate "
-                                                         "has the result stop")] = False,
+    amplifier_Hz: Annotated[
+        float | None,
+        typer.Option(
+            "--amplifier-corner",
+            help="corner of the amplifiers' "
+            "first-order lag [Hz]; by default none, or 300 Hz on a rig with "
+            "accelerometers",
+        ),
+    ] = None,
+    kalman: Annotated[
+        bool, typer.Option("--kalman", help="also run the extended Kalman filter, for comparison")
+    ] = False,
+    design: Annotated[
+        Path | None,
+        typer.Option(
+            "--design",
+            metavar="DESIGN.toml",
+            help="design file whose rig and "
+            "uncertainty are replaced by the identified ones; by default a design "
+            "for z and phi_x with the weights of the shipped examples",
+        ),
+    ] = None,
+    despite_gates: Annotated[
+        bool, typer.Option("--despite-gates", help="continue even if a gate has the result stop")
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
     """Identify a rig and its uncertainty from measurements, and write a report.
@@ -87,9 +131,17 @@ def identify(
         from avis_ctrl.study.identification_design import design_start
         from avis_ctrl.study.identification_output import require_readable, write_identification
 
-        options = IdentifyOptions(tuple(parameters or ()), dict(_prior(text) for text in priors or ()),
-                                  tuple(hold_out) if hold_out else None, band_Hz, starts, kalman, despite_gates, seed,
-                                  amplifier_Hz)
+        options = IdentifyOptions(
+            tuple(parameters or ()),
+            dict(_prior(text) for text in priors or ()),
+            tuple(hold_out) if hold_out else None,
+            band_Hz,
+            starts,
+            kalman,
+            despite_gates,
+            seed,
+            amplifier_Hz,
+        )
         found = identify(measured, start, options, progress)
         progress("uncertainty for design")
         try:
@@ -106,12 +158,17 @@ def identify(
 
 
 def predict(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="output folder of avis identify, avis gap or "
-                                           "avis gap-axis")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="output folder of avis identify, avis gap or avis gap-axis")
+    ],
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
     out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
-    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="file with your own effects, if "
-                                                 "the models of avis gap contain them")] = None,
+    effects: Annotated[
+        Path | None,
+        typer.Option(
+            "--effects", metavar="FILE.py", help="file with your own effects, if the models of avis gap contain them"
+        ),
+    ] = None,
 ) -> None:
     """Predict the sensor signals of another campaign from its voltages and floor motion, and compare them with its y.
 
@@ -156,8 +213,12 @@ def predict(
     if errors:
         names = list(errors[0].relative)
         noisy = any(one.noise is not None for one in errors)
-        table = Table("record", *names, *["noise between periods"] * noisy,
-                      title="r.m.s. error relative to measured y; each record is predicted from rest")
+        table = Table(
+            "record",
+            *names,
+            *["noise between periods"] * noisy,
+            title="r.m.s. error relative to measured y; each record is predicted from rest",
+        )
         for one in errors:
             noise = "" if one.noise is None else f"{100 * one.noise:.3g} %"
             table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy)
@@ -185,10 +246,12 @@ def _summary(console: Console, found: Identification) -> None:
     loaded = " with its load" if getattr(found.rig, "load", None) else ""
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
     start |= {name: one.value for name, one in found.start.parameters().items()}
-    table = Table("parameter", "start", "identified", "+- 1 sigma", "unit",
-                  title=f"{found.rig.name}{loaded}, identified")
-    for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
-                                        information.units, strict=True):
+    table = Table(
+        "parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}{loaded}, identified"
+    )
+    for name, value, sigma, unit in zip(
+        information.names, information.values, information.standard_deviation, information.units, strict=True
+    ):
         shown, std = rounded(value, sigma)
         table.add_row(name, f"{start[name]:.6g}", shown, std if sigma < float("inf") else "only in combination", unit)
     console.print(table)
@@ -204,11 +267,20 @@ def _summary(console: Console, found: Identification) -> None:
 
 def single_axis(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="seismometer, decay, drive or oscillator")],
-    path: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one "
-                                         "CSV per frequency")],
-    columns: Annotated[str, typer.Option("--columns", metavar="ROLE=NAME,..", help="seismometer: drive, coil and/or "
-                                         "displacement; decay: y; drive: force, position, reference; oscillator: u, "
-                                         "y; each also t")],
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one CSV per frequency"),
+    ],
+    columns: Annotated[
+        str,
+        typer.Option(
+            "--columns",
+            metavar="ROLE=NAME,..",
+            help="seismometer: drive, coil and/or "
+            "displacement; decay: y; drive: force, position, reference; oscillator: u, "
+            "y; each also t",
+        ),
+    ],
     scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
     sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, if the file has none")] = None,
 ) -> None:
@@ -236,9 +308,13 @@ UNITS = {
 
 def _assumed_units(kind: str, roles: dict[str, str], factors: dict[str, float]) -> str:
     """One line with the unit assumed for each column."""
-    said = [f"{role} = {roles[role]}{f' times {factors[role]:g}' if role in factors else ''} in {unit}"
-            for role, unit in UNITS[kind].items() if role in roles]
-    unscaled = [role for role in roles if role in UNITS[kind] and role not in factors
-                and UNITS[kind][role] != "any unit"]
+    said = [
+        f"{role} = {roles[role]}{f' times {factors[role]:g}' if role in factors else ''} in {unit}"
+        for role, unit in UNITS[kind].items()
+        if role in roles
+    ]
+    unscaled = [
+        role for role in roles if role in UNITS[kind] and role not in factors and UNITS[kind][role] != "any unit"
+    ]
     change = f" (not scaled; if the file has another unit: --scale {unscaled[0]}=FACTOR)" if unscaled else ""
     return f"assumed units: {', '.join(said)}, t in s{change}"

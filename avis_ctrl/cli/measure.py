@@ -24,15 +24,29 @@ def excite(
     kind: Annotated[str, typer.Option("--kind", help="multisine or noise")] = "multisine",
     band_Hz: Annotated[tuple[float, float], typer.Option("--band", metavar="LOW HIGH", help="Hz")] = (0.5, 60.0),
     period_s: Annotated[float, typer.Option("--period", help="period of a multisine, of noise its length, s")] = 10.0,
-    periods: Annotated[int, typer.Option("--periods", help="number of periods of a multisine; the first one contains "
-                                         "the transient")] = 6,
-    rms_V: Annotated[float | None, typer.Option("--rms", help="r.m.s. voltage of each drive [V]; by default half of "
-                                                "the largest level at which neither the drives nor the converter clip, "
-                                                "computed for the rig file")] = None,
-    lines: Annotated[str, typer.Option("--lines", help="full, odd or odd_detection (odd lines, one in each group not "
-                                       "excited)")] = "full",
-    scheme: Annotated[str, typer.Option("--scheme", help="orthogonal (one record per drive, all drives on all lines) "
-                                        "or zippered (one record, each drive has its own lines)")] = "orthogonal",
+    periods: Annotated[
+        int, typer.Option("--periods", help="number of periods of a multisine; the first one contains the transient")
+    ] = 6,
+    rms_V: Annotated[
+        float | None,
+        typer.Option(
+            "--rms",
+            help="r.m.s. voltage of each drive [V]; by default half of "
+            "the largest level at which neither the drives nor the converter clip, "
+            "computed for the rig file",
+        ),
+    ] = None,
+    lines: Annotated[
+        str, typer.Option("--lines", help="full, odd or odd_detection (odd lines, one in each group not excited)")
+    ] = "full",
+    scheme: Annotated[
+        str,
+        typer.Option(
+            "--scheme",
+            help="orthogonal (one record per drive, all drives on all lines) "
+            "or zippered (one record, each drive has its own lines)",
+        ),
+    ] = "orthogonal",
     seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
     """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
@@ -51,11 +65,13 @@ def excite(
     with Progress(console) as progress:
         progress(f"{kind} for {len(names)} drives, {band_Hz[0]:g} to {band_Hz[1]:g} Hz")
         if kind == "multisine":
-            signals = multisine(MultisineSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V,
-                                                  rms_V, lines, scheme=scheme, seed=seed))  # type: ignore[arg-type]
+            signals = multisine(
+                MultisineSettings(
+                    names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V, lines, scheme=scheme, seed=seed
+                )
+            )  # type: ignore[arg-type]
         elif kind == "noise":
-            signals = noise(NoiseSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V,
-                                          seed=seed))
+            signals = noise(NoiseSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V, seed=seed))
         else:
             raise InputError("expected multisine or noise", field="--kind", value=kind)
         if rms_V is None:
@@ -64,11 +80,17 @@ def excite(
             most = largest_level(open_loop(table, plan), signals, signals.u.shape[1] * (periods if periods < 4 else 4))
             signals = signals.scaled_to(LEVEL_SHARE * most)
         write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
-    shown = Table("record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation",
-                  title="largest value over the drives")
+    shown = Table(
+        "record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation", title="largest value over the drives"
+    )
     for k in range(len(signals.u)):
-        shown.add_row(str(k), *(f"{values[k].max():.3g}" for values in (signals.rms_V, signals.peak_V, signals.crest,
-                                                                        signals.crest_before)))
+        shown.add_row(
+            str(k),
+            *(
+                f"{values[k].max():.3g}"
+                for values in (signals.rms_V, signals.peak_V, signals.crest, signals.crest_before)
+            ),
+        )
     console.print(shown)
     console.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
 
@@ -76,21 +98,49 @@ def excite(
 def simulate_campaign(
     rig: RIG,
     out: Annotated[Path, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")],
-    plan: Annotated[Path | None, typer.Option("--plan", metavar="PLAN.toml", help="records, levels, floor; by default "
-                                              "multisines at three levels, noise, rest and a shaken floor")] = None,
-    write_plan: Annotated[Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, as "
-                                                    "a starting point")] = None,
-    truth: Annotated[Path | None, typer.Option("--truth", metavar="FILE", help="also write the rig that was simulated, "
-                                               "with its perturbed values")] = None,
-    perturbed: Annotated[bool, typer.Option("--perturbed", help="default plan with stiffness, mass and inertia up to "
-                                            "5 % off, damping up to 20 %")] = False,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan",
+            metavar="PLAN.toml",
+            help="records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor",
+        ),
+    ] = None,
+    write_plan: Annotated[
+        Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, as a starting point")
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth", metavar="FILE", help="also write the rig that was simulated, with its perturbed values"
+        ),
+    ] = None,
+    perturbed: Annotated[
+        bool,
+        typer.Option(
+            "--perturbed", help="default plan with stiffness, mass and inertia up to 5 % off, damping up to 20 %"
+        ),
+    ] = False,
     orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
-    duration_s: Annotated[float, typer.Option("--duration", help="length of each record of the default plan "
-                                           "in seconds")] = 60.0,
-    effects: Annotated[Path | None, typer.Option("--effects", metavar="FILE.py", help="Python file with effects of "
-                                                 "your own that the plan names (docs/own_effect.md)")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="seed of excitation, floor, noise and perturbation; for another "
-                                      "campaign of the same table, use the file written by --truth as --rig")] = 1,
+    duration_s: Annotated[
+        float, typer.Option("--duration", help="length of each record of the default plan in seconds")
+    ] = 60.0,
+    effects: Annotated[
+        Path | None,
+        typer.Option(
+            "--effects",
+            metavar="FILE.py",
+            help="Python file with effects of your own that the plan names (docs/own_effect.md)",
+        ),
+    ] = None,
+    seed: Annotated[
+        int,
+        typer.Option(
+            "--seed",
+            help="seed of excitation, floor, noise and perturbation; for another "
+            "campaign of the same table, use the file written by --truth as --rig",
+        ),
+    ] = 1,
 ) -> None:
     """Simulate a measurement campaign with the nonlinear model, to plan and rehearse an identification."""
     from rich.console import Console
@@ -106,20 +156,27 @@ def simulate_campaign(
         if written is not None:
             require_other(written, plan, rig, effects)
     if plan and (perturbed or orthogonal):
-        raise InputError("these belong to the default plan; in a plan, write perturb_percent under [truth] and scheme "
-                         "under [multisine]", field="--perturbed, --orthogonal")
+        raise InputError(
+            "these belong to the default plan; in a plan, write perturb_percent under [truth] and scheme "
+            "under [multisine]",
+            field="--perturbed, --orthogonal",
+        )
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
 
         load_effects(effects)
     console = Console(highlight=False)
     table = load_rig(rig)
-    chosen = read_plan(plan) if plan else default_plan(table, "orthogonal" if orthogonal else "zippered",
-                                                       perturbed=perturbed, duration_s=duration_s)
+    chosen = (
+        read_plan(plan)
+        if plan
+        else default_plan(table, "orthogonal" if orthogonal else "zippered", perturbed=perturbed, duration_s=duration_s)
+    )
     with Progress(console) as progress:
         try:
-            rehearsal = rehearse_with_effects(table, chosen, seed,
-                                  lambda k, total, name: progress(f"record {name}, {k} of {total}"))
+            rehearsal = rehearse_with_effects(
+                table, chosen, seed, lambda k, total, name: progress(f"record {name}, {k} of {total}")
+            )
         except InputError as error:
             section = re.split(r"\W", error.field or "")[0]
             of_plan = plan and not error.file and section in type(chosen).model_fields
@@ -136,9 +193,14 @@ def simulate_campaign(
 def convert(
     source: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5, .mat, UFF 58, CSV or a folder of CSV")],
     out: Annotated[Path, typer.Argument(metavar="CAMPAIGN.h5")],
-    columns: Annotated[str | None, typer.Option("--columns", metavar="ROLE=NAME,..", help="which variable is what, "
-                                                "such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1"
-                                                )] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            "--columns",
+            metavar="ROLE=NAME,..",
+            help="which variable is what, such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1",
+        ),
+    ] = None,
     rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, if the file has none")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
@@ -155,16 +217,23 @@ def convert(
 
     require_other(out, source)
     console = Console(highlight=False)
-    measured = read_measurements(source, parse_columns(columns) if columns else None, rig,
-                                 **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
+    measured = read_measurements(
+        source,
+        parse_columns(columns) if columns else None,
+        rig,
+        **known_hints(period_s, excitation, sample_rate_Hz, unit_y),
+    )
     if isinstance(measured, Campaign):
         write_campaign(out, measured)
         for note in in_short(measured.notes):
             console.print(note)
-        console.print(f"{out}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
-                      f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz")
+        console.print(
+            f"{out}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
+            f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz"
+        )
     else:
         write_frequency_response(out, measured)
-        console.print(f"{out}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
-                      f"inputs, {len(measured.outputs)} outputs")
-
+        console.print(
+            f"{out}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
+            f"inputs, {len(measured.outputs)} outputs"
+        )

@@ -12,8 +12,10 @@ import typer
 
 from avis_ctrl.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, help="Write a commented rig file or design file to start from. What is not "
-                                             "given as an option is asked for.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Write a commented rig file or design file to start from. What is not given as an option is asked for.",
+)
 
 
 def _absent(out: Path) -> Path:
@@ -25,6 +27,7 @@ def _absent(out: Path) -> Path:
 
 def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], None]) -> Any:
     """An option that is prompted for if it is not given; an invalid answer is prompted for again."""
+
     def checked(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
         try:
             check(ctx, str(param.name), value)
@@ -33,6 +36,7 @@ def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], 
                 raise typer.BadParameter(str(error)) from None
             raise
         return value
+
     # [kg] in a help text would be markup.
     return typer.Option(flag, prompt=question, help=question.replace("[", r"\["), callback=checked)
 
@@ -61,28 +65,47 @@ def rig(
     size_m: Annotated[str, _asked("--size", "Length, width, height of the payload [m]", _check_rig)] = "1.2, 0.9, 0.4",
     mounts: Annotated[int, _asked("--mounts", "Number of mounts, 3 or 4", _check_rig)] = 4,
     vertical_Hz: Annotated[float, _asked("--vertical", "Vertical natural frequency [Hz]", _check_rig)] = 3.0,
-    horizontal_Hz: Annotated[float, _asked("--horizontal", "Horizontal natural frequency, without rocking [Hz]",
-                                           _check_rig)] = 2.0,
+    horizontal_Hz: Annotated[
+        float, _asked("--horizontal", "Horizontal natural frequency, without rocking [Hz]", _check_rig)
+    ] = 2.0,
     damping: Annotated[float, _asked("--damping", "Damping ratio, 0.03 for 3 %", _check_rig)] = 0.03,
     constant_N_per_V: Annotated[float, _asked("--force-constant", "Force of a drive [N/V]", _check_rig)] = 2.0,
     limit_V: Annotated[float, _asked("--limit", "Largest drive voltage [V]", _check_rig)] = 10.0,
     geophone: Annotated[str, _asked("--geophone", "RESP file of the geophones (empty: a common one)", _check_rig)] = "",
-    sample_rate_Hz: Annotated[float, _asked("--sample-rate", "Sample rate of the controller [Hz]", _check_rig)
-                              ] = 1000.0,
+    sample_rate_Hz: Annotated[
+        float, _asked("--sample-rate", "Sample rate of the controller [Hz]", _check_rig)
+    ] = 1000.0,
 ) -> None:
     """Write a rig file for a table of given mass, size and natural frequencies."""
     from avis_ctrl.files import write_whole
     from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
-    text = rig_text(NewRig(**_rig_fields({
-        "name": name, "mass_kg": mass_kg, "size_m": size_m, "mounts": mounts, "vertical_Hz": vertical_Hz,
-        "horizontal_Hz": horizontal_Hz, "damping": damping, "constant_N_per_V": constant_N_per_V, "limit_V": limit_V,
-        "geophone": geophone, "sample_rate_Hz": sample_rate_Hz})))
+    text = rig_text(
+        NewRig(
+            **_rig_fields(
+                {
+                    "name": name,
+                    "mass_kg": mass_kg,
+                    "size_m": size_m,
+                    "mounts": mounts,
+                    "vertical_Hz": vertical_Hz,
+                    "horizontal_Hz": horizontal_Hz,
+                    "damping": damping,
+                    "constant_N_per_V": constant_N_per_V,
+                    "limit_V": limit_V,
+                    "geophone": geophone,
+                    "sample_rate_Hz": sample_rate_Hz,
+                }
+            )
+        )
+    )
     modes = rig_of(text).equations_of_motion().natural_frequencies().frequencies_Hz
     write_whole(out, text.encode())
-    print(f"{out}: natural frequencies {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz. The mounts stand below the "
-          "centre of mass, so horizontal motion is coupled with rocking.\n"
-          f"Next: replace the values marked \"assumed\" in the file, then run avis new design DESIGN.toml --rig {out}")
+    print(
+        f"{out}: natural frequencies {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz. The mounts stand below the "
+        "centre of mass, so horizontal motion is coupled with rocking.\n"
+        f'Next: replace the values marked "assumed" in the file, then run avis new design DESIGN.toml --rig {out}'
+    )
 
 
 def _check_design(ctx: typer.Context, name: str, value: Any) -> None:
@@ -122,13 +145,19 @@ def design(
     out: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="file to write", callback=_absent)],
     rig: Annotated[str, _asked("--rig", "Rig file, or avis, halcyonics, halcyonics_loaded", _check_design)] = "avis",
     title: Annotated[str, _asked("--title", "Title of the report", _check_design)] = "My design",
-    keep: Annotated[str, _asked("--keep", "Coordinates under one controller, such as z, phi_x (empty: chosen for the "
-                                          "rig)", _check_design)] = "",
+    keep: Annotated[
+        str,
+        _asked(
+            "--keep", "Coordinates under one controller, such as z, phi_x (empty: chosen for the rig)", _check_design
+        ),
+    ] = "",
     band_Hz: Annotated[str, _asked("--band", "Band in which the table must isolate [Hz]", _check_design)] = "1, 10",
-    peak_dB: Annotated[float, _asked("--peak-limit", "Transmissibility at any frequency, at most [dB]", _check_design)
-                       ] = 3.5,
-    band_dB: Annotated[float, _asked("--band-limit", "Transmissibility in the band, at most [dB]", _check_design)
-                       ] = -7.0,
+    peak_dB: Annotated[
+        float, _asked("--peak-limit", "Transmissibility at any frequency, at most [dB]", _check_design)
+    ] = 3.5,
+    band_dB: Annotated[
+        float, _asked("--band-limit", "Transmissibility in the band, at most [dB]", _check_design)
+    ] = -7.0,
     mass_percent: Annotated[float, _asked("--mass", "Mass known to within [%]", _check_design)] = 10.0,
     stiffness_percent: Annotated[float, _asked("--stiffness", "Stiffness known to within [%]", _check_design)] = 15.0,
     damping_percent: Annotated[float, _asked("--damping", "Damping known to within [%]", _check_design)] = 30.0,
@@ -144,8 +173,10 @@ def design(
     made = new_design(NewDesign(**_design_fields({key: ctx.params[key] for key in DESIGN})), load_rig(rig), named)
     write_whole(out, design_text(made).encode())
     read_study(out)
-    print(f"{out}: written. Next: replace the values marked \"Assumed\", then run avis design {out} --out "
-          f"{out.with_suffix('')}")
+    print(
+        f'{out}: written. Next: replace the values marked "Assumed", then run avis design {out} --out '
+        f"{out.with_suffix('')}"
+    )
 
 
 def _is_file(rig: str) -> bool:

@@ -10,15 +10,22 @@ import typer
 
 
 def sweep(
-    points: Annotated[Path, typer.Argument(metavar="POINTS.toml",
-                                                help="a base and the keys that vary (docs/sweep.md)")],
+    points: Annotated[
+        Path, typer.Argument(metavar="POINTS.toml", help="a base and the keys that vary (docs/sweep.md)")
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for table, picture and points")],
-    scheduler: Annotated[str | None, typer.Option("--scheduler", metavar="ADDRESS", help="a dask scheduler of a "
-                                                  "cluster, such as tcp://HOST:8786")] = None,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, metavar="N", help="start a dask scheduler with N "
-                                                "workers on this machine")] = None,
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes without dask; by default "
-                                             "one for each processor")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="a dask scheduler of a cluster, such as tcp://HOST:8786"),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, metavar="N", help="start a dask scheduler with N workers on this machine"),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", min=1, metavar="N", help="processes without dask; by default one for each processor"),
+    ] = None,
 ) -> None:
     """Compute many designs (points), and write a table and their Pareto front.
 
@@ -48,8 +55,14 @@ def sweep(
     plan = plan_sweep(points, out)
     with output_folder(out, FILES, (POINTS,)) as folder:
         open_folder(folder / POINTS)
-        bar = Progress(TextColumn("points"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                       console=console, disable=not console.is_terminal)
+        bar = Progress(
+            TextColumn("points"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
         with bar:
             shown = bar.add_task("points", total=None)
 
@@ -57,20 +70,27 @@ def sweep(
                 bar.update(shown, completed=done, total=total)
                 if text or not console.is_terminal:
                     console.print(f"[dim]{done} of {total}[/]" + (f": {text}" if text else ""), soft_wrap=True)
+
             try:
                 found = run_sweep(plan, backend, progress)
             except KeyboardInterrupt:
-                raise UserInterruptError("interrupted; finished points are kept: the same command computes the "
-                                         "others") from None
+                raise UserInterruptError(
+                    "interrupted; finished points are kept: the same command computes the others"
+                ) from None
         files = write_sweep(found, folder)
     rows, front = found.rows, front_of(found)
     count = {status: sum(row.status == status for row in rows) for status in ("done", "failed", "lost")}
-    console.print(f"{len(rows)} points: {', '.join(f'{n} {status}' for status, n in count.items() if n)}; "
-                  f"{found.computed} computed now; {len(front)} on the Pareto front")
+    console.print(
+        f"{len(rows)} points: {', '.join(f'{n} {status}' for status, n in count.items() if n)}; "
+        f"{found.computed} computed now; {len(front)} on the Pareto front"
+    )
     console.print(f"{len(files)} files in {folder}; open {folder / 'sweep.html'} or {folder / 'sweep.csv'}")
     if count["lost"]:
         why = next(row.message for row in rows if row.status == "lost")
-        raise ComputationError(f"{count['lost']} points are not finished", cause=why,
-                               next_step="run the same command again: finished points are kept")
+        raise ComputationError(
+            f"{count['lost']} points are not finished",
+            cause=why,
+            next_step="run the same command again: finished points are kept",
+        )
     if not count["done"]:
         raise ComputationError("every point failed", cause=rows[0].message)

@@ -61,27 +61,37 @@ class Choice:
 
     def as_dict(self) -> dict[str, Any]:
         """Entry of certificate.json."""
+
         def row(figures: np.ndarray) -> dict[str, list[float]]:
             return {"rms_m_per_s": figures[:, 0].tolist(), "late_peak_m_per_s": figures[:, 1].tolist()}
-        return {"chosen": "none" if self.corner_Hz is None else "lag of the excess", "corner_Hz": self.corner_Hz,
-                "gain": self.gain, "demand_over_limit": list(self.levels), "recovery": row(self.chosen),
-                "recovery_without": row(self.without)}
+
+        return {
+            "chosen": "none" if self.corner_Hz is None else "lag of the excess",
+            "corner_Hz": self.corner_Hz,
+            "gain": self.gain,
+            "demand_over_limit": list(self.levels),
+            "recovery": row(self.chosen),
+            "recovery_without": row(self.without),
+        }
 
 
-def choose_anti_windup(loop: SampledLoop, axes: tuple[str, ...],
-                       settings: AntiWindupSettings = AntiWindupSettings()) -> Choice:
+def choose_anti_windup(
+    loop: SampledLoop, axes: tuple[str, ...], settings: AntiWindupSettings = AntiWindupSettings()
+) -> Choice:
     """Choose the anti-windup for the loop of the exported controller by the velocity of `axes`.
 
     Converter and noise are omitted: beyond the converter's range the code switches the drives off, so that they do not
     reach their limits.
     """
-    sensors = replace(loop.sensors, converter=None, noise_rms_V=np.zeros(1), flicker_rms_V=np.zeros(1),
-                      offset_V=np.zeros(1))
+    sensors = replace(
+        loop.sensors, converter=None, noise_rms_V=np.zeros(1), flicker_rms_V=np.zeros(1), offset_V=np.zeros(1)
+    )
     loop = replace(loop, sensors=sensors)
     floors = _floors(loop, settings)
 
     def recovery(law: AntiWindup, level: int) -> np.ndarray:
         return _recovery(replace(loop, anti_windup=law), axes, settings.levels[level] * floors, settings)
+
     levels = range(len(settings.levels))
     without = np.array([recovery(NO_ANTI_WINDUP, k) for k in levels])
     best = Choice(NO_ANTI_WINDUP, None, None, settings.levels, without, without)
@@ -106,15 +116,15 @@ def _floors(loop: SampledLoop, settings: AntiWindupSettings) -> np.ndarray:
     floors = []
     for record in range(settings.records):
         floor = fade * floor_velocity(loop, n, np.random.default_rng((settings.seed, record)))
-        demanded = simulate(replace(loop, limit_V=1e12), n * loop.period_s, settle_s=0.0, nonlinear=False,
-                            floor=floor).demanded
+        demanded = simulate(
+            replace(loop, limit_V=1e12), n * loop.period_s, settle_s=0.0, nonlinear=False, floor=floor
+        ).demanded
         most = np.max(np.abs(demanded) / loop.limits_V)
         floors.append(floor / most if most > 0 else floor)
     return np.array(floors)
 
 
-def _recovery(loop: SampledLoop, axes: tuple[str, ...], floors: np.ndarray, settings: AntiWindupSettings
-              ) -> np.ndarray:
+def _recovery(loop: SampledLoop, axes: tuple[str, ...], floors: np.ndarray, settings: AntiWindupSettings) -> np.ndarray:
     """(2,) r.m.s. velocity in the rest, and largest velocity in its late part, r.m.s. over the records; inf if
     unstable."""
     kept = [COORDINATES.index(name) for name in axes]
@@ -125,5 +135,5 @@ def _recovery(loop: SampledLoop, axes: tuple[str, ...], floors: np.ndarray, sett
         if record.diverged:
             return np.full(2, np.inf)
         speed = np.linalg.norm(record.q_dot[:, kept] * lever_arms(loop.rig)[kept], axis=1)
-        found.append((np.sqrt(np.mean(speed[start:] ** 2)), np.max(speed[late[0]:late[1]])))
+        found.append((np.sqrt(np.mean(speed[start:] ** 2)), np.max(speed[late[0] : late[1]])))
     return np.sqrt(np.mean(np.square(found), axis=0))

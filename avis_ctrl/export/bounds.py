@@ -119,16 +119,19 @@ class Errors:
     W_a: Rational
     W_E: Rational
 
-    def closed(self, plant: GeneralizedPlant, W_v: Rational | None = None, W_f: Rational | None = None
-               ) -> tuple[StateSpace, BlockStructure]:
+    def closed(
+        self, plant: GeneralizedPlant, W_v: Rational | None = None, W_f: Rational | None = None
+    ) -> tuple[StateSpace, BlockStructure]:
         """The loop closed with K; the blocks of the two errors follow those of the plant.
 
         W_v, W_f : for additional outputs W_v force, and inputs whose product with W_f is added to what is seen.
         """
         P, blocks, n = plant.P, plant.blocks, plant.nmeas
         force, seen = [f"{name} applied" for name in plant.u], [f"{name} alone" for name in plant.y]
-        parts = {"plant": P.renamed(dict(zip(plant.u, force, strict=True)), dict(zip(plant.y, seen, strict=True))),
-                 "K": self.K.renamed(plant.y, plant.u)}
+        parts = {
+            "plant": P.renamed(dict(zip(plant.u, force, strict=True)), dict(zip(plant.y, seen, strict=True))),
+            "K": self.K.renamed(plant.y, plant.u),
+        }
         for k in range(n):
             terms = [seen[k], f"w_E{k}"]
             if W_f is not None and W_v is not None:
@@ -143,10 +146,18 @@ class Errors:
         w = [f"w_{kind}{k}" for kind in "aE" for k in range(n)]
         z = [*plant.u, *(f"z_{kind}{k}" for kind in "aE" for k in range(n))]
         above = range(n if W_f is not None else 0)
-        closed = connect(parts, [*P.inputs[:blocks.n_w], *w, *plant.w, *(f"floor above {k}" for k in above)],
-                         [*P.outputs[:blocks.n_z], *z, *plant.z, *(f"velocity above {k}" for k in above)])
-        return closed, BlockStructure((*blocks.blocks, ComplexFull(n, 2 * n, "sampled controller"),
-                                       ComplexFull(n, n, "images of the sample rate")))
+        closed = connect(
+            parts,
+            [*P.inputs[: blocks.n_w], *w, *plant.w, *(f"floor above {k}" for k in above)],
+            [*P.outputs[: blocks.n_z], *z, *plant.z, *(f"velocity above {k}" for k in above)],
+        )
+        return closed, BlockStructure(
+            (
+                *blocks.blocks,
+                ComplexFull(n, 2 * n, "sampled controller"),
+                ComplexFull(n, n, "images of the sample rate"),
+            )
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,15 +211,19 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
     grid = Grid.of(axes.half_rate, settings)
     gains = _gain(K, grid.centre)
     least = max(settings.least * float(gains[-1]), settings.least_of_all * float(np.max(gains)))
-    W_a = _cover(grid, _controller_error(axes, K, least, grid, settings),
-                 np.full(grid.centre.size, settings.harmless), settings)
+    W_a = _cover(
+        grid, _controller_error(axes, K, least, grid, settings), np.full(grid.centre.size, settings.harmless), settings
+    )
     # Bounds of the table between frequencies take minutes if it has many blocks; at a few frequencies, seconds.
     if only_stable and not (at_least := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + SLACK:
-        raise StabilityNotProvedError("the bound of the loop gain from half the sample rate on is at least "
-                                      f"{at_least:.3g}; the proof needs less than 1")
+        raise StabilityNotProvedError(
+            "the bound of the loop gain from half the sample rate on is at least "
+            f"{at_least:.3g}; the proof needs less than 1"
+        )
     table = plant.synthesis.P.select(plant.synthesis.y, plant.synthesis.u)
-    W_E = _cover(grid, axes.folding(grid.centre, grid.half), settings.harmless_images * _gain(table, grid.centre),
-                 settings)
+    W_E = _cover(
+        grid, axes.folding(grid.centre, grid.half), settings.harmless_images * _gain(table, grid.centre), settings
+    )
     errors = Errors(K, least, W_a, W_E)
     gain_above = _gain_above(axes, errors, settings)
     if only_stable and not gain_above < 1:
@@ -217,30 +232,44 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
     performance, blocks = errors.closed(plant.synthesis)
     motion, _ = errors.closed(plant.full.restricted(plant.floor_velocities, plant.velocities))
     if not performance.is_stable():
-        raise ComputationError("the closed loop of the design's controller is unstable with the nominal plant",
-                               cause="files of different designs in one folder", next_step="run avis design again")
+        raise ComputationError(
+            "the closed loop of the design's controller is unstable with the nominal plant",
+            cause="files of different designs in one folder",
+            next_step="run avis design again",
+        )
     whole = blocks.with_performance(len(plant.synthesis.w), len(plant.synthesis.z))
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     # One proof of robust stability serves all gains: the additional channels do not change the loop of the blocks.
     robust = stability_bound(motion.select(range(blocks.n_z), range(blocks.n_w)), blocks)
     if only_stable and (largest := float(np.max(robust.upper_curve, initial=robust.lower))) >= 1 + SLACK:
-        raise StabilityNotProvedError("mu of the uncertainty together with the sampling errors is at least "
-                                      f"{robust.lower:.4g} and bounded by {largest:.4g} only; the proof needs less "
-                                      "than 1")
+        raise StabilityNotProvedError(
+            "mu of the uncertainty together with the sampling errors is at least "
+            f"{robust.lower:.4g} and bounded by {largest:.4g} only; the proof needs less "
+            "than 1"
+        )
 
     def worst(system: StateSpace, band: tuple[float, float] = below, points: int = settings.few_points) -> MuPeak:
         return worst_case_gain(system, blocks, band=band, slack=SLACK, robust=robust, points=points)
+
     in_band = low, min(high, axes.half_rate)
     from_below, from_above = _between_samples(axes, errors, grid, settings)
-    mu, peak, band, *between = each(lambda one: one(), [
-        lambda: mu_peak(performance, whole, band=below, slack=SLACK), lambda: worst(motion, points=settings.points),
-        lambda: worst(motion, in_band), lambda: worst(from_below), lambda: worst(from_above)])
+    mu, peak, band, *between = each(
+        lambda one: one(),
+        [
+            lambda: mu_peak(performance, whole, band=below, slack=SLACK),
+            lambda: worst(motion, points=settings.points),
+            lambda: worst(motion, in_band),
+            lambda: worst(from_below),
+            lambda: worst(from_above),
+        ],
+    )
     all_times, above = (one.upper if one.guaranteed else np.inf for one in between)
     return Bounds(mu, peak, band, all_times, above + axes.passive_above(), gain_above)
 
 
-def _controller_error(axes: SampledAxes, K: StateSpace, least: float, grid: Grid, settings: CoverSettings
-                      ) -> np.ndarray:
+def _controller_error(
+    axes: SampledAxes, K: StateSpace, least: float, grid: Grid, settings: CoverSettings
+) -> np.ndarray:
     """(n,) bound of the emitted controller's error relative to [K; least I], over each interval."""
     error, remainder = axes.controller_error(K, least, grid.centre, grid.half)
     allowed = np.maximum(settings.harmless, settings.remainder * (error - remainder))
@@ -262,12 +291,13 @@ def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> f
     return float(np.max(size * table))
 
 
-def _gain_above_at_least(axes: SampledAxes, K: StateSpace, least: float, W_a: Rational, settings: CoverSettings
-                         ) -> float:
+def _gain_above_at_least(
+    axes: SampledAxes, K: StateSpace, least: float, W_a: Rational, settings: CoverSettings
+) -> float:
     """A lower bound of `_gain_above`, up to the accuracy of the optimised bounds: at some of its frequencies, and with
     only the nearest image at half the rate."""
     omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
-    omega = omega[::(settings.intervals - 1) // (settings.first_points - 1)]
+    omega = omega[:: (settings.intervals - 1) // (settings.first_points - 1)]
     table = axes.force_to_seen_at(omega)
     table[0] *= 2
     return float(np.max(_emitted_gain(K, least, W_a, omega) * table))
@@ -279,8 +309,9 @@ def _emitted_gain(K: StateSpace, least: float, W_a: Rational, omega: np.ndarray)
     return size + W_a.magnitude(omega) * np.hypot(size, least)
 
 
-def _between_samples(axes: SampledAxes, errors: Errors, grid: Grid, settings: CoverSettings
-                     ) -> tuple[StateSpace, StateSpace]:
+def _between_samples(
+    axes: SampledAxes, errors: Errors, grid: Grid, settings: CoverSettings
+) -> tuple[StateSpace, StateSpace]:
     """The lifted loops from the floor up to half the sample rate, and from the floor above it, to all payload motion.
 
     The held forces move the payload above half the rate by at most W_v times their r.m.s. Floor motion there acts on
@@ -294,8 +325,10 @@ def _between_samples(axes: SampledAxes, errors: Errors, grid: Grid, settings: Co
     W_f = _cover(grid, folded, settings.harmless_images * np.full(folded.size, np.max(folded)), settings)
     motion, blocks = errors.closed(part, W_v, W_f)
     n_w, n_d = blocks.n_w, len(part.w)
-    first, second = (motion.select(None, [*range(n_w), *inputs])
-                     for inputs in (range(n_w, n_w + n_d), range(n_w + n_d, motion.ninputs)))
+    first, second = (
+        motion.select(None, [*range(n_w), *inputs])
+        for inputs in (range(n_w, n_w + n_d), range(n_w + n_d, motion.ninputs))
+    )
     return first, second
 
 

@@ -173,30 +173,49 @@ def c_files(controller: SampledController, guard: Protection, provenance: Proven
     def places(name: str, values: np.ndarray) -> str:
         return f"static const int {name}[{values.size}] = {{{', '.join(map(str, values))}}};\n"
 
-    shown = {name: values if values.size else np.zeros((1, max(values.shape[1], 1)))
-             for name, values in controller.matrices().items()}
+    shown = {
+        name: values if values.size else np.zeros((1, max(values.shape[1], 1)))
+        for name, values in controller.matrices().items()
+    }
     shown["C"] = K.C if n_x else np.zeros((n_u, 1))
     most = float(np.finfo(controller.dtype).max)
-    constants = "".join([
-        *(matrix(name, values) for name, values in shown.items()),
-        places("FROM", first if n_x else np.zeros(1, int)), places("TO", last if n_x else np.zeros(1, int)),
-        vector("LIMIT", controller.limits_V), vector("INPUT_LIMIT", np.minimum(guard.input_limit_V, most)),
-        f"static const real_t RISE = {number(guard.rise)}, FALL = {number(guard.fall)};\n",
-        f"static const real_t KEEP = {number(guard.anti_windup.keep)}, FEED = {number(guard.anti_windup.feed)};\n",
-        f"static const uint32_t WAIT = {guard.wait}u;\n"])
-    common = {"comment": provenance.comment(), "n_x": n_x, "n_y": n_y, "n_u": n_u, "room": max(n_x, 1),
-              "zero": number(0.0), "one": number(1.0), "largest": "FLT_MAX" if single else "DBL_MAX",
-              "real": "float" if single else "double",
-              "period_s": K.dt, "start_s": K.dt * guard.wait + K.dt / guard.rise,
-              "inputs": _harmless(", ".join(K.inputs)), "outputs": _harmless(", ".join(K.outputs))}
+    constants = "".join(
+        [
+            *(matrix(name, values) for name, values in shown.items()),
+            places("FROM", first if n_x else np.zeros(1, int)),
+            places("TO", last if n_x else np.zeros(1, int)),
+            vector("LIMIT", controller.limits_V),
+            vector("INPUT_LIMIT", np.minimum(guard.input_limit_V, most)),
+            f"static const real_t RISE = {number(guard.rise)}, FALL = {number(guard.fall)};\n",
+            f"static const real_t KEEP = {number(guard.anti_windup.keep)}, FEED = {number(guard.anti_windup.feed)};\n",
+            f"static const uint32_t WAIT = {guard.wait}u;\n",
+        ]
+    )
+    common = {
+        "comment": provenance.comment(),
+        "n_x": n_x,
+        "n_y": n_y,
+        "n_u": n_u,
+        "room": max(n_x, 1),
+        "zero": number(0.0),
+        "one": number(1.0),
+        "largest": "FLT_MAX" if single else "DBL_MAX",
+        "real": "float" if single else "double",
+        "period_s": K.dt,
+        "start_s": K.dt * guard.wait + K.dt / guard.rise,
+        "inputs": _harmless(", ".join(K.inputs)),
+        "outputs": _harmless(", ".join(K.outputs)),
+    }
     return {HEADER: _HEADER.format(**common), SOURCE: _SOURCE.format(**common, constants=constants)}
 
 
 def _filled(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n,) first nonzero column of each row, and one past the last."""
     spans = [np.flatnonzero(row) for row in A]
-    return (np.array([span[0] if span.size else 0 for span in spans], int),
-            np.array([span[-1] + 1 if span.size else 0 for span in spans], int))
+    return (
+        np.array([span[0] if span.size else 0 for span in spans], int),
+        np.array([span[-1] + 1 if span.size else 0 for span in spans], int),
+    )
 
 
 def constants_of(source: str, dtype: type[np.floating]) -> dict[str, np.ndarray]:

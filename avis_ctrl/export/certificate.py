@@ -49,13 +49,20 @@ class Certificate:
     def one_line(self) -> str:
         """Summary for the header of the C files."""
         c = self.content
-        known = {"mu": c["mu_upper"], "peak": c["worst_case_peak_transmissibility_dB"],
-                 "band": c["worst_case_band_transmissibility_dB"]}
-        text = {name: "unbounded" if value is None or not np.isfinite(value) else f"{value:.4g}"
-                for name, value in known.items()}
+        known = {
+            "mu": c["mu_upper"],
+            "peak": c["worst_case_peak_transmissibility_dB"],
+            "band": c["worst_case_band_transmissibility_dB"],
+        }
+        text = {
+            name: "unbounded" if value is None or not np.isfinite(value) else f"{value:.4g}"
+            for name, value in known.items()
+        }
         proved = "proved between frequencies" if c["guaranteed"] else "not proved"
-        return (f"mu at most {text['mu']}, worst-case transmissibility at most {text['peak']} dB, in the band "
-                f"{text['band']} dB, {'stable' if c['stable'] else 'not stable'}, {proved}")
+        return (
+            f"mu at most {text['mu']}, worst-case transmissibility at most {text['peak']} dB, in the band "
+            f"{text['band']} dB, {'stable' if c['stable'] else 'not stable'}, {proved}"
+        )
 
 
 def shipped_loop(folder: DesignFolder, controller: SampledController) -> SampledLoop:
@@ -63,8 +70,13 @@ def shipped_loop(folder: DesignFolder, controller: SampledController) -> Sampled
     return replace(folder.loop(folder.controller(controller.name)), digital=controller.system)
 
 
-def certify(folder: DesignFolder, controller: SampledController, progress: Progress = lambda text: None,
-            only_stable: bool = False, settings: StabilitySettings = StabilitySettings()) -> Certificate:
+def certify(
+    folder: DesignFolder,
+    controller: SampledController,
+    progress: Progress = lambda text: None,
+    only_stable: bool = False,
+    settings: StabilitySettings = StabilitySettings(),
+) -> Certificate:
     """Compute the certificate of a controller's numbers, except for the execution time of a step.
 
     Parameters
@@ -89,28 +101,38 @@ def certify(folder: DesignFolder, controller: SampledController, progress: Progr
         found = bounds(axes, only_stable)
         worst = worst_transmissibility(axes, found)
         lower = mu_lower(axes, found)
-        unstable += _unstable([("worst case", with_delta(folder.rig, folder.plant, loop, "worst case", worst.delta,
-                                                         worst.omega))])
+        unstable += _unstable(
+            [("worst case", with_delta(folder.rig, folder.plant, loop, "worst case", worst.delta, worst.omega))]
+        )
     bounded = (found.mu, found.peak, found.band)
     unproved = tuple(one.covers for one in bounded if not (one.guaranteed and np.isfinite(one.upper)))
     if not found.gain_above < 1:
         unproved += (gain_above_in_words(found.gain_above),)
 
-    content = {"format": "avis-certificate", "version": 1, "controller_sha256": controller.sha256,
-               "mu_upper": found.mu.upper, "mu_lower": lower, "guaranteed": not unproved,
-               "stable": not unstable and bool(np.isfinite(found.peak.upper)) and found.gain_above < 1,
-               "worst_case_peak_transmissibility_dB": decibels(found.peak.upper),
-               "worst_case_band_transmissibility_dB": decibels(found.band.upper),
-               "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
-               "step_time_us": None,
-               "at_rest": {**at_rest(loop).as_dict(), "gain_Ns_per_m": axes.gain_at_rest()},
-               "between_samples": {"worst_case_gain_dB": decibels(found.all_times),
-                                   "floor_above_half_rate_dB": decibels(found.above)}}
+    content = {
+        "format": "avis-certificate",
+        "version": 1,
+        "controller_sha256": controller.sha256,
+        "mu_upper": found.mu.upper,
+        "mu_lower": lower,
+        "guaranteed": not unproved,
+        "stable": not unstable and bool(np.isfinite(found.peak.upper)) and found.gain_above < 1,
+        "worst_case_peak_transmissibility_dB": decibels(found.peak.upper),
+        "worst_case_band_transmissibility_dB": decibels(found.band.upper),
+        "rounding_noise_m_per_s": float(np.linalg.norm(noise)),
+        "step_time_us": None,
+        "at_rest": {**at_rest(loop).as_dict(), "gain_Ns_per_m": axes.gain_at_rest()},
+        "between_samples": {
+            "worst_case_gain_dB": decibels(found.all_times),
+            "floor_above_half_rate_dB": decibels(found.above),
+        },
+    }
     return Certificate(content, loop, worst, (*unstable, *unproved))
 
 
-def _sampled_plants(folder: DesignFolder, nominal: SampledLoop, settings: StabilitySettings
-                    ) -> list[tuple[str, SampledLoop]]:
+def _sampled_plants(
+    folder: DesignFolder, nominal: SampledLoop, settings: StabilitySettings
+) -> list[tuple[str, SampledLoop]]:
     """Loops of all axes with the emitted numbers, by name: the nominal one at several gains, and random plants."""
     K, rng = nominal.digital, np.random.default_rng((folder.design.simulation.seed, 3))
     assert K is not None

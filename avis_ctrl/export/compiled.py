@@ -41,8 +41,11 @@ def _library(files: Mapping[str, str], *flags: str) -> ctypes.CDLL:
     """The shared library of all C sources among the files, by name."""
     gcc = compiler()
     if gcc is None:
-        raise ComputationError("the C code was not compiled", cause="gcc is not installed",
-                               next_step="install gcc, or compile the files on the target")
+        raise ComputationError(
+            "the C code was not compiled",
+            cause="gcc is not installed",
+            next_step="install gcc, or compile the files on the target",
+        )
     with tempfile.TemporaryDirectory() as folder:
         write_together(Path(folder), {name: text.encode() for name, text in files.items()})
         sources, library = [name for name in files if name.endswith(".c")], str(Path(folder) / "controller.so")
@@ -65,16 +68,23 @@ class CompiledController:
         real = ctypes.c_float if controller.arithmetic == "float32" else ctypes.c_double
 
         class State(ctypes.Structure):
-            _fields_ = (("x", real * max(controller.system.nstates, 1)), ("excess", real * controller.system.noutputs),
-                        ("gain", real), ("wait", ctypes.c_uint32))
+            _fields_ = (
+                ("x", real * max(controller.system.nstates, 1)),
+                ("excess", real * controller.system.noutputs),
+                ("gain", real),
+                ("wait", ctypes.c_uint32),
+            )
 
         self._step, self._init = self._library.avis_controller_step, self._library.avis_controller_init
         self._step.restype = self._init.restype = None
         self.dtype, self.state = controller.dtype, State()
         self._y = np.zeros(controller.system.ninputs, controller.dtype)
         self._u = np.zeros(controller.system.noutputs, controller.dtype)
-        self._arguments: tuple[Any, ...] = (ctypes.byref(self.state), self._y.ctypes.data_as(ctypes.c_void_p),
-                                            self._u.ctypes.data_as(ctypes.c_void_p))
+        self._arguments: tuple[Any, ...] = (
+            ctypes.byref(self.state),
+            self._y.ctypes.data_as(ctypes.c_void_p),
+            self._u.ctypes.data_as(ctypes.c_void_p),
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -109,14 +119,19 @@ void time_steps(unsigned runs, unsigned steps, const real_t *y, double *seconds)
 """
 
 
-def step_time_us(files: Mapping[str, str], controller: SampledController, settings: TimingSettings = TimingSettings()
-                 ) -> float | None:
+def step_time_us(
+    files: Mapping[str, str], controller: SampledController, settings: TimingSettings = TimingSettings()
+) -> float | None:
     """Median time of one step on this machine [us], -O2; None without gcc."""
     if compiler() is None:
         return None
     loaded = _library({**files, "timer.c": _TIMER}, "-std=gnu99", *BUILD)
     y = np.random.default_rng(0).normal(0, 1e-2, (16, controller.system.ninputs)).astype(controller.dtype)
     seconds = np.zeros(settings.runs)
-    loaded.time_steps(ctypes.c_uint(settings.runs), ctypes.c_uint(settings.steps),
-                      y.ctypes.data_as(ctypes.c_void_p), seconds.ctypes.data_as(ctypes.c_void_p))
+    loaded.time_steps(
+        ctypes.c_uint(settings.runs),
+        ctypes.c_uint(settings.steps),
+        y.ctypes.data_as(ctypes.c_void_p),
+        seconds.ctypes.data_as(ctypes.c_void_p),
+    )
     return float(1e6 * np.median(seconds))

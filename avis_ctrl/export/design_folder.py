@@ -91,13 +91,19 @@ class DesignFolder:
         loop = self.loop(self.controller(name))
         system = processor_form(digital_controller(loop))
         names = loop.rig.sensor_rows()[0], loop.rig.equations_of_motion().actuators
-        return SampledController(name, system.renamed(*names), arithmetic, loop.limits_V,
-                                 loop.loop_delay_s * loop.sample_rate_Hz).rounded(arithmetic)
+        return SampledController(
+            name, system.renamed(*names), arithmetic, loop.limits_V, loop.loop_delay_s * loop.sample_rate_Hz
+        ).rounded(arithmetic)
 
 
 def _companion(row: dict[str, Any]) -> Companion:
-    return Companion(row["axis"], row["gain"], row["tilt_corner_Hz"], row["roll_off_Hz"],
-                     row["modulus_margin"] if row["modulus_margin"] is not None else np.nan)
+    return Companion(
+        row["axis"],
+        row["gain"],
+        row["tilt_corner_Hz"],
+        row["roll_off_Hz"],
+        row["modulus_margin"] if row["modulus_margin"] is not None else np.nan,
+    )
 
 
 def open_design(path: Path) -> DesignFolder:
@@ -112,13 +118,20 @@ def open_design(path: Path) -> DesignFolder:
         raise InputError("expected a folder that avis design wrote", field="DESIGN_DIR", value=str(path))
     if not (path / "result.json").exists():
         other = "; this is a folder of avis export: are DESIGN_DIR and --out swapped?"
-        raise InputError("expected a folder that avis design wrote; result.json is missing in it"
-                         + other * (path / "certificate.json").exists(), field="DESIGN_DIR", value=str(path))
+        raise InputError(
+            "expected a folder that avis design wrote; result.json is missing in it"
+            + other * (path / "certificate.json").exists(),
+            field="DESIGN_DIR",
+            value=str(path),
+        )
     result = read_json(path / "result.json", "avis-design")
     design, rig = read_saved(path)
     if result.get("stable") is not True:
-        raise ComputationError("the closed loop of this design was unstable in simulation, so it is not exported",
-                               cause=str(result.get("verdict", "")), next_step="design again with other weights")
+        raise ComputationError(
+            "the closed loop of this design was unstable in simulation, so it is not exported",
+            cause=str(result.get("verdict", "")),
+            next_step="design again with other weights",
+        )
     if not isinstance(result.get("controllers"), list) or not isinstance(result.get("all_axes"), dict):
         raise InputError("expected controllers and all_axes", file=path / "result.json")
     return DesignFolder(path, design, rig, result, build_plant(design, rig))

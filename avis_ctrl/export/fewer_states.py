@@ -25,8 +25,9 @@ def mu_asked(design: Design) -> float:
     return min(design.upper_limits("mu_upper"), default=np.inf)
 
 
-def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Progress = lambda text: None
-                      ) -> tuple[DesignFolder, str]:
+def with_fewer_states(
+    folder: DesignFolder, name: str, order: int, progress: Progress = lambda text: None
+) -> tuple[DesignFolder, str]:
     """The folder with an additional controller of at most `order` states in the logical axes, and its name.
 
     The controller is found by descent on the peak of mu (`fixed_order`). The initial controllers are `name`, reduced
@@ -40,16 +41,21 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
     """
     K, P = folder.controller(name), folder.plant.synthesis
     if not 1 <= order < K.nstates:
-        raise InputError(f"expected 1 to {K.nstates - 1}: the controller {name!r} of this design has {K.nstates} "
-                         "states", field="--order", value=order)
+        raise InputError(
+            f"expected 1 to {K.nstates - 1}: the controller {name!r} of this design has {K.nstates} states",
+            field="--order",
+            value=order,
+        )
     with threadpool_limits(1):
         task = Task(P.P, P.all_blocks.complexified(), limit=gain_limit(folder.plant, folder.rig.sample_rate_Hz))
         tried = [_order_and_mu(P, K)]
         if tried[0][1] > (allowed := mu_asked(folder.design)):
             # No reason to refuse: the descent may reach a lower mu with fewer states, since the D-K iteration stops at
             # the target of the design.
-            progress(f"mu of {name!r} itself is at most {tried[0][1]:.4g}, above the {allowed:g} that the design "
-                     "requires; fewer states meet it only if the descent lowers mu")
+            progress(
+                f"mu of {name!r} itself is at most {tried[0][1]:.4g}, above the {allowed:g} that the design "
+                "requires; fewer states meet it only if the descent lowers mu"
+            )
         try:
             for step in fixed_order(task, K, order, [folder.controller(one) for one in folder.names if one != name]):
                 found = step.K
@@ -60,8 +66,12 @@ def with_fewer_states(folder: DesignFolder, name: str, order: int, progress: Pro
             on_the_way = ", ".join(f"{mu:.4g} with {states} states" for states, mu in tried[1:])
             if not on_the_way:
                 raise
-            raise ComputationError(error.failed, measured=f"{error.measured}; mu at most {on_the_way}",
-                                   cause=error.cause, next_step="--order with one of these numbers") from error
+            raise ComputationError(
+                error.failed,
+                measured=f"{error.measured}; mu at most {on_the_way}",
+                cause=error.cause,
+                next_step="--order with one of these numbers",
+            ) from error
     made = f"{name}_{order}"
     return replace(folder, added={made: Added(found.renamed(K.inputs, K.outputs), tuple(tried))}), made
 

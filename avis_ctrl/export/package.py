@@ -61,8 +61,14 @@ def formats_of(text: str) -> tuple[str, ...]:
     return asked
 
 
-def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "float64", formats: Sequence[str] = FORMATS,
-                 progress: Progress = lambda text: None, mu_at_most: float = np.inf) -> Package:
+def make_package(
+    folder: DesignFolder,
+    name: str,
+    arithmetic: Arithmetic = "float64",
+    formats: Sequence[str] = FORMATS,
+    progress: Progress = lambda text: None,
+    mu_at_most: float = np.inf,
+) -> Package:
     """Everything that `avis export` writes; controller.json and certificate.json are always included.
 
     Raises
@@ -79,17 +85,20 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
     if not certificate.content["stable"]:
         raise _not_proved(folder, name, arithmetic, "; ".join(dict.fromkeys(certificate.reasons)))
     if not (mu := certificate.content["mu_upper"]) <= mu_at_most:
-        raise ComputationError(f"mu of the exported controller {name!r} is not proved to be at most {mu_at_most:g}; "
-                               "nothing was written", measured=f"upper bound of mu {mu:.4g}",
-                               next_step=f"ask for a larger --order, or accept it with --mu-at-most {mu + 0.005:.2f}")
+        raise ComputationError(
+            f"mu of the exported controller {name!r} is not proved to be at most {mu_at_most:g}; nothing was written",
+            measured=f"upper bound of mu {mu:.4g}",
+            next_step=f"ask for a larger --order, or accept it with --mu-at-most {mu + 0.005:.2f}",
+        )
     progress("anti-windup: the table with its drives at their limits, with and without")
     choice = choose_anti_windup(shipped_loop(folder, controller), tuple(folder.design.keep))
     guard, replay = protection(controller, folder.rig, choice.law), None
     if compiler() is not None:
         progress("worst plant with the compiled code, on the nonlinear table")
         plain = c_files(controller, guard, Provenance(()))
-        certificate = replace(certificate, content={**certificate.content,
-                                                    "step_time_us": step_time_us(plain, controller)})
+        certificate = replace(
+            certificate, content={**certificate.content, "step_time_us": step_time_us(plain, controller)}
+        )
         replay = replay_worst_plant(folder, certificate, controller, plain)
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
@@ -114,8 +123,11 @@ def make_package(folder: DesignFolder, name: str, arithmetic: Arithmetic = "floa
 def _not_proved(folder: DesignFolder, name: str, arithmetic: Arithmetic, reasons: str) -> ComputationError:
     precise = "double precision (without --float32), or " if arithmetic == "float32" else ""
     further = "a larger --order" if name in folder.added else "another controller of the folder"
-    return ComputationError(f"the loop of the exported controller {name!r} is not proved stable; nothing was written",
-                            measured=reasons, next_step=f"try {precise}{further}")
+    return ComputationError(
+        f"the loop of the exported controller {name!r} is not proved stable; nothing was written",
+        measured=reasons,
+        next_step=f"try {precise}{further}",
+    )
 
 
 def _sha256(data: bytes) -> str:
@@ -129,25 +141,39 @@ def _content_sha256(content: Mapping[str, Any]) -> str:
 
 def _provenance(folder: DesignFolder, controller: SampledController, certificate: Certificate) -> Provenance:
     made = folder.result.get("provenance", {})
-    return Provenance((
-        f"Controller {controller.name!r} of the design {folder.design.title!r} for the rig {folder.rig.name!r},",
-        f"{controller.sample_rate_Hz:g} Hz, {controller.arithmetic}; {controller.system.nstates} states.",
-        f"Written by avis_ctrl {avis_ctrl.__version__}; the design was made by {made.get('avis_ctrl')}, "
-        f"{made.get('date')}.",
-        f"Inputs of the design, SHA-256: {folder.inputs_sha256}",
-        f"controller.json, SHA-256: {controller.sha256}",
-        f"Certificate: {certificate.one_line()}.",
-        "Do not edit: a changed number is no longer what the certificate is for."))
+    return Provenance(
+        (
+            f"Controller {controller.name!r} of the design {folder.design.title!r} for the rig {folder.rig.name!r},",
+            f"{controller.sample_rate_Hz:g} Hz, {controller.arithmetic}; {controller.system.nstates} states.",
+            f"Written by avis_ctrl {avis_ctrl.__version__}; the design was made by {made.get('avis_ctrl')}, "
+            f"{made.get('date')}.",
+            f"Inputs of the design, SHA-256: {folder.inputs_sha256}",
+            f"controller.json, SHA-256: {controller.sha256}",
+            f"Certificate: {certificate.one_line()}.",
+            "Do not edit: a changed number is no longer what the certificate is for.",
+        )
+    )
 
 
 def _mat(controller: SampledController) -> bytes:
     K, file = controller.system, io.BytesIO()
     cells = {name: np.array(values, dtype=object) for name, values in (("inputs", K.inputs), ("outputs", K.outputs))}
-    scipy.io.savemat(file, {**controller.matrices(), **cells, "sample_rate_Hz": controller.sample_rate_Hz,
-                            "limits_V": controller.limits_V, "delay_samples": controller.delay_samples,
-                            "name": controller.name, "arithmetic": controller.arithmetic,
-                            "input_units": np.array(["V"] * K.ninputs, dtype=object),
-                            "output_units": np.array(["V"] * K.noutputs, dtype=object)}, format="5", oned_as="row")
+    scipy.io.savemat(
+        file,
+        {
+            **controller.matrices(),
+            **cells,
+            "sample_rate_Hz": controller.sample_rate_Hz,
+            "limits_V": controller.limits_V,
+            "delay_samples": controller.delay_samples,
+            "name": controller.name,
+            "arithmetic": controller.arithmetic,
+            "input_units": np.array(["V"] * K.ninputs, dtype=object),
+            "output_units": np.array(["V"] * K.noutputs, dtype=object),
+        },
+        format="5",
+        oned_as="row",
+    )
     return file.getvalue()
 
 
@@ -166,8 +192,13 @@ class CheckSettings:
     rounding: float = 3.0
 
 
-def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda text: None, name: str | None = None,
-                  settings: CheckSettings = CheckSettings()) -> list[str]:
+def check_package(
+    folder: DesignFolder,
+    out: Path,
+    progress: Progress = lambda text: None,
+    name: str | None = None,
+    settings: CheckSettings = CheckSettings(),
+) -> list[str]:
     """Inconsistencies in an exported folder, one line each; empty if there are none.
 
     First the files are checked: missing or unlisted files, the hashes, the numbers in the C and .mat files, the test
@@ -183,17 +214,23 @@ def check_package(folder: DesignFolder, out: Path, progress: Progress = lambda t
     ------
     InputError : a folder that is not an export, unreadable files, another controller.
     """
+
     def reported(lines: list[str]) -> list[str]:
         for line in lines:
             progress(line)
         return lines
+
     _require_export(out)
     stored = read_json(out / CERTIFICATE, "avis-certificate", "the certificate of avis export")
     if (inputs := stored.get("design_inputs_sha256")) not in (None, (own := folder.inputs_sha256)):
-        return reported([f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in "
-                         f"{folder.path}"])
-    found = [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"
-             ] if stored.get("content_sha256") != _content_sha256(stored) else []
+        return reported(
+            [f"this code was exported from another design: SHA-256 of its inputs {inputs}, {own} in {folder.path}"]
+        )
+    found = (
+        [f"{CERTIFICATE} is not as it was written: its content_sha256 differs"]
+        if stored.get("content_sha256") != _content_sha256(stored)
+        else []
+    )
     wrong = _wrong_files(out, stored)
     if foreign := _foreign_files(out, stored):
         progress(f"Note: {CERTIFICATE} does not list {', '.join(foreign)}; not checked")
@@ -274,12 +311,16 @@ def _wrong_files(out: Path, stored: Mapping[str, Any]) -> list[str]:
             found.append(f"{CONTROLLER} is not the file that the certificate names: its hash differs")
         elif _sha256(data) != digest:
             found.append(f"{name} is not the file that was exported: its hash differs")
-    return found + [f"{name} is not listed in {CERTIFICATE}" for name in FILES
-                    if name not in hashes and name != CERTIFICATE and (out / name).exists()]
+    return found + [
+        f"{name} is not listed in {CERTIFICATE}"
+        for name in FILES
+        if name not in hashes and name != CERTIFICATE and (out / name).exists()
+    ]
 
 
-def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Path, stored: Mapping[str, Any],
-                   settings: CheckSettings) -> list[str]:
+def _wrong_vectors(
+    folder: DesignFolder, controller: SampledController, out: Path, stored: Mapping[str, Any], settings: CheckSettings
+) -> list[str]:
     """Test vectors that differ from the response of controller.json with the certificate's anti-windup; wrong
     tolerances."""
     found = []
@@ -300,13 +341,16 @@ def _wrong_vectors(folder: DesignFolder, controller: SampledController, out: Pat
         if samples != len(y):
             found.append(f"{key}.samples: {samples} in {CERTIFICATE}, {len(y)} rows in {file}")
         if not np.max(np.abs(expected_V(controller, guard, y) - u)) <= stated:
-            found.append(f"the outputs in {file} are not those that {CONTROLLER} gives for its inputs with the "
-                         f"anti-windup of {CERTIFICATE}")
+            found.append(
+                f"the outputs in {file} are not those that {CONTROLLER} gives for its inputs with the "
+                f"anti-windup of {CERTIFICATE}"
+            )
         else:
             tolerance = agreement_V(controller, guard, y, u)
             if not tolerance / settings.rounding <= stated <= tolerance * settings.rounding:
-                found.append(f"{key}.tolerance_V: {stated:g} in {CERTIFICATE}, {tolerance:g} computed from "
-                             f"{CONTROLLER}")
+                found.append(
+                    f"{key}.tolerance_V: {stated:g} in {CERTIFICATE}, {tolerance:g} computed from {CONTROLLER}"
+                )
     return found
 
 
@@ -332,5 +376,8 @@ def _numbers_in_mat(path: Path) -> dict[str, np.ndarray]:
 
 
 def _differences(name: str, controller: SampledController, numbers: dict[str, np.ndarray]) -> list[str]:
-    return [f"{key} in {name} differs from {CONTROLLER}" for key, matrix in controller.matrices().items()
-            if matrix.size and not np.array_equal(numbers.get(key, np.zeros(0)), matrix)]
+    return [
+        f"{key} in {name} differs from {CONTROLLER}"
+        for key, matrix in controller.matrices().items()
+        if matrix.size and not np.array_equal(numbers.get(key, np.zeros(0)), matrix)
+    ]

@@ -50,20 +50,27 @@ class Protection:
     anti_windup: AntiWindup
 
 
-def protection(controller: SampledController, rig: Rig, anti_windup: AntiWindup = NO_ANTI_WINDUP,
-               settings: ProtectionSettings = ProtectionSettings()) -> Protection:
+def protection(
+    controller: SampledController,
+    rig: Rig,
+    anti_windup: AntiWindup = NO_ANTI_WINDUP,
+    settings: ProtectionSettings = ProtectionSettings(),
+) -> Protection:
     """Constants for this controller and the rig's converter."""
     rate, system, dtype = controller.sample_rate_Hz, controller.system, controller.dtype
     largest = np.inf if rig.converter is None else min(abs(volts) for volts in rig.converter.limits_V)
-    return Protection(np.full(system.ninputs, dtype(largest), float), max(1, round(settings.wait_s * rate)),
-                      _exact_in_sums(1 / max(1.0, settings.rise_s * rate)),
-                      _exact_in_sums(1 / max(1.0, settings.fall_s * rate)),
-                      AntiWindup(*(float(dtype(one)) for one in anti_windup)))
+    return Protection(
+        np.full(system.ninputs, dtype(largest), float),
+        max(1, round(settings.wait_s * rate)),
+        _exact_in_sums(1 / max(1.0, settings.rise_s * rate)),
+        _exact_in_sums(1 / max(1.0, settings.fall_s * rate)),
+        AntiWindup(*(float(dtype(one)) for one in anti_windup)),
+    )
 
 
 def _exact_in_sums(change: float) -> float:
     """Round up to a multiple of 2^-23; float32 has all of these up to 1, so that the gain has no rounding error."""
-    return float(np.ceil(change * 2.0 ** 23) / 2.0 ** 23)
+    return float(np.ceil(change * 2.0**23) / 2.0**23)
 
 
 class Processor:
@@ -90,8 +97,9 @@ class Processor:
         valid = bool(np.all(np.abs(y) < guard.input_limit_V))
         v = np.clip(np.where(np.isfinite(y), y, 0.0), -guard.input_limit_V, guard.input_limit_V).astype(self.dtype)
         self.wait = guard.wait if not valid else max(self.wait - 1, 0)
-        self.gain = max(self.gain - self.fall, self.dtype(0)) if self.wait else min(self.gain + self.rise,
-                                                                                   self.dtype(1))
+        self.gain = (
+            max(self.gain - self.fall, self.dtype(0)) if self.wait else min(self.gain + self.rise, self.dtype(1))
+        )
         demanded = self.gain * (self.C @ self.x + self.D @ v - self.excess)
         u = np.clip(demanded, -self.limits_V, self.limits_V)
         self.excess = self.keep * self.excess + self.feed * (demanded - u)

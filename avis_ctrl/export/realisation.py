@@ -27,16 +27,25 @@ def processor_form(system: StateSpace) -> StateSpace:
     ComputationError : a controller that is unstable by itself: it cannot start from zero output.
     """
     if not system.is_stable():
-        raise ComputationError("the sampled controller is not stable by itself, so it cannot run with its output at "
-                               "zero, as a safe start needs",
-                               measured=f"spectral radius {np.max(np.abs(system.poles())):.6g}",
-                               next_step="export another controller of the folder, or design with less bandwidth")
+        raise ComputationError(
+            "the sampled controller is not stable by itself, so it cannot run with its output at "
+            "zero, as a safe start needs",
+            measured=f"spectral radius {np.max(np.abs(system.poles())):.6g}",
+            next_step="export another controller of the folder, or design with less bandwidth",
+        )
     if not system.nstates:
         return system
     _, group = connected_components(system.A != 0, directed=False)
     parts = [_schur(_part(system, np.flatnonzero(group == k))) for k in range(group.max() + 1)]
-    joined = StateSpace(la.block_diag(*(p.A for p in parts)), np.vstack([p.B for p in parts]),
-                        np.hstack([p.C for p in parts]), system.D, system.dt, system.inputs, system.outputs)
+    joined = StateSpace(
+        la.block_diag(*(p.A for p in parts)),
+        np.vstack([p.B for p in parts]),
+        np.hstack([p.C for p in parts]),
+        system.D,
+        system.dt,
+        system.inputs,
+        system.outputs,
+    )
     return joined
 
 
@@ -60,5 +69,9 @@ def balanced(part: StateSpace) -> StateSpace:
     if sigma[-1] <= np.sqrt(np.finfo(float).eps) * sigma[0]:
         return part
     root = np.sqrt(sigma)
-    return replace(part, A=(U / root).T @ Lo.T @ part.A @ Lc @ Vt.T / root, B=(U / root).T @ Lo.T @ part.B,
-                   C=part.C @ Lc @ Vt.T / root)
+    return replace(
+        part,
+        A=(U / root).T @ Lo.T @ part.A @ Lc @ Vt.T / root,
+        B=(U / root).T @ Lo.T @ part.B,
+        C=part.C @ Lc @ Vt.T / root,
+    )

@@ -37,8 +37,13 @@ class Replay:
     record: SimulationRecord
 
 
-def replay_worst_plant(folder: DesignFolder, certificate: Certificate, controller: SampledController,
-                       files: Mapping[str, str], settings: ReplaySettings = ReplaySettings()) -> Replay:
+def replay_worst_plant(
+    folder: DesignFolder,
+    certificate: Certificate,
+    controller: SampledController,
+    files: Mapping[str, str],
+    settings: ReplaySettings = ReplaySettings(),
+) -> Replay:
     """Move the floor of the worst plant with a sine at the worst frequency, in the worst direction.
 
     The motion caused by sensor and converter noise is subtracted. It comes from a second simulation with the same noise

@@ -27,8 +27,9 @@ from avis_ctrl.simulation.sampled_response import open_response
 from avis_ctrl.study.analysis import PEAK_FACTOR
 
 
-def rounding_noise(controller: SampledController, loop: SampledLoop, points: int = 1500, steps: int = 100_000
-                   ) -> np.ndarray:
+def rounding_noise(
+    controller: SampledController, loop: SampledLoop, points: int = 1500, steps: int = 100_000
+) -> np.ndarray:
     """(6,) bound of the payload velocity due to rounding, rotations at the edge [m/s].
 
     loop : its `digital` is the controller's system. points : number of frequencies for the signals' r.m.s. values.
@@ -46,9 +47,10 @@ def rounding_noise(controller: SampledController, loop: SampledLoop, points: int
         # One more rounding when the inputs are read.
         terms = np.count_nonzero(by_state, axis=1) + by_input.shape[1] + 1
         return terms * eps / (1 - terms * eps) * (np.abs(by_state) @ x + np.abs(by_input) @ y)
+
     e = np.concatenate([errors(K.A, K.B), errors(K.C, K.D)])
     rows = np.zeros((N_Q, Phi.shape[0]))
-    rows[:, N_Q:2 * N_Q] = np.diag(lever_arms(loop.rig))
+    rows[:, N_Q : 2 * N_Q] = np.diag(lever_arms(loop.rig))
     return _peak_gain(Phi, Gamma, rows, steps) @ e
 
 
@@ -57,8 +59,10 @@ def _peak_gain(Phi: np.ndarray, Gamma: np.ndarray, rows: np.ndarray, steps: int)
     values, vectors = la.eig(Phi)
     size = np.abs(values)
     if np.max(size) >= 1:
-        raise ComputationError("the loop of all axes is unstable with the exported controller",
-                               measured=f"spectral radius {np.max(size):.6g}")
+        raise ComputationError(
+            "the loop of all axes is unstable with the exported controller",
+            measured=f"spectral radius {np.max(size):.6g}",
+        )
     total = np.zeros((rows.shape[0], Gamma.shape[1]))
     for _ in range(steps):
         total += np.abs(rows @ Gamma)
@@ -83,6 +87,7 @@ def _levels(loop: SampledLoop, points: int) -> tuple[np.ndarray, np.ndarray]:
 
     def peak(density: np.ndarray) -> np.ndarray:
         return PEAK_FACTOR * np.sqrt(np.trapezoid(np.sum(np.abs(density) ** 2, axis=2), omega / (2 * np.pi), axis=0))
+
     # In addition the offsets of the channels, of either sign; at rest only position sensors are fed back.
     offset = np.array([one.offset_V for one in loop.rig.sensors()])
     to_states = replace(K, C=np.eye(K.nstates), D=np.zeros((K.nstates, K.ninputs)), outputs=(), states=())

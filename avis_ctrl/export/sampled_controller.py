@@ -60,10 +60,22 @@ class SampledController:
     def as_bytes(self) -> bytes:
         """The content of controller.json; floats are printed so that they read back exactly."""
         K = self.system
-        return as_json({"format": FORMAT, "version": 1, "name": self.name, "sample_rate_Hz": self.sample_rate_Hz,
-                        "arithmetic": self.arithmetic, **self.matrices(), "inputs": K.inputs, "outputs": K.outputs,
-                        "input_units": ["V"] * K.ninputs, "output_units": ["V"] * K.noutputs,
-                        "limits_V": self.limits_V, "delay_samples": self.delay_samples})
+        return as_json(
+            {
+                "format": FORMAT,
+                "version": 1,
+                "name": self.name,
+                "sample_rate_Hz": self.sample_rate_Hz,
+                "arithmetic": self.arithmetic,
+                **self.matrices(),
+                "inputs": K.inputs,
+                "outputs": K.outputs,
+                "input_units": ["V"] * K.ninputs,
+                "output_units": ["V"] * K.noutputs,
+                "limits_V": self.limits_V,
+                "delay_samples": self.delay_samples,
+            }
+        )
 
     @property
     def sha256(self) -> str:
@@ -98,8 +110,9 @@ def controller_from(content: dict[str, Any]) -> SampledController:
     system = StateSpace(A, B, C, D, 1.0 / rate, tuple(content["inputs"]), tuple(content["outputs"]))
     if limits.shape != (system.noutputs,) or not (np.all(np.isfinite(limits)) and np.all(limits > 0)):
         raise InputError(f"expected {system.noutputs} positive limits", field="limits_V", value=limits.tolist())
-    found = SampledController(str(content["name"]), system, content["arithmetic"], limits,
-                              float(content["delay_samples"]))
+    found = SampledController(
+        str(content["name"]), system, content["arithmetic"], limits, float(content["delay_samples"])
+    )
     held = found.rounded(found.arithmetic)
     for name, matrix in found.matrices().items():
         if not np.array_equal(matrix, held.matrices()[name]):

@@ -88,23 +88,41 @@ class SampledAxes:
         sensors."""
         rig, keep, plant = folder.rig, folder.design.keep, folder.plant
         if plant.relative and len(plant.relative) != len(plant.axes):
-            raise InputError("expected axes that are all measured in space, or all against the chassis; a mixture has "
-                             "no certificate of its code", field="keep", value=keep)
+            raise InputError(
+                "expected axes that are all measured in space, or all against the chassis; a mixture has "
+                "no certificate of its code",
+                field="keep",
+                value=keep,
+            )
         kept = [COORDINATES.index(name) for name in keep]
         lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
         names, H = rig.sensor_rows()
         found = actuator_axes(rig, keep)
         if controller.system.inputs != tuple(names) or controller.system.outputs != tuple(found.actuators):
-            raise InputError("expected the sensors and drives of the design's rig", field="inputs, outputs",
-                             value=[*controller.system.inputs, *controller.system.outputs])
+            raise InputError(
+                "expected the sensors and drives of the design's rig",
+                field="inputs, outputs",
+                value=[*controller.system.inputs, *controller.system.outputs],
+            )
         alike = np.array([one.inertial != bool(plant.relative) for one in rig.sensors()])
-        filters = {one for one, used in zip(conditioning(rig, folder.design.loop.integrator_corner_Hz), alike,
-                                            strict=True) if used}
+        filters = {
+            one
+            for one, used in zip(conditioning(rig, folder.design.loop.integrator_corner_Hz), alike, strict=True)
+            if used
+        }
         if len(filters) > 1:
-            raise InputError("expected sensors of one kind: several kinds have no certificate of their code",
-                             field="sensors", value=sorted({one.quantity for one in rig.sensors()}))
-        return SampledAxes(folder, controller, found.matrix[kept] / lever[:, None],
-                           H[:, kept] / lever * alike[:, None], np.array([one.gain for one in rig.sensors()]))
+            raise InputError(
+                "expected sensors of one kind: several kinds have no certificate of their code",
+                field="sensors",
+                value=sorted({one.quantity for one in rig.sensors()}),
+            )
+        return SampledAxes(
+            folder,
+            controller,
+            found.matrix[kept] / lever[:, None],
+            H[:, kept] / lever * alike[:, None],
+            np.array([one.gain for one in rig.sensors()]),
+        )
 
     @property
     def period_s(self) -> float:
@@ -136,8 +154,13 @@ class SampledAxes:
     def sensor_volts(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega, n_y) volts of each sensor per seen velocity along it."""
         known = {id(one): 1.0 / one.frequency_response(omega)[:, 0, 0] for one in self._filters if one is not None}
-        return np.stack([gain * (known[id(one)] if one is not None else np.ones(omega.size))
-                         for one, gain in zip(self._filters, self.gains_V, strict=True)], axis=1)
+        return np.stack(
+            [
+                gain * (known[id(one)] if one is not None else np.ones(omega.size))
+                for one, gain in zip(self._filters, self.gains_V, strict=True)
+            ],
+            axis=1,
+        )
 
     def volts(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega, n_u, n) drive volts per seen velocity of the axes."""
@@ -152,8 +175,9 @@ class SampledAxes:
         """Largest gain from the seen velocities of the axes to their forces far below every pole [N s/m]."""
         return float(np.linalg.norm(self.response(np.array([self.settings.rest * self.half_rate]))[0], 2))
 
-    def controller_error(self, K: StateSpace, least: float, centre: np.ndarray, half: np.ndarray
-                         ) -> tuple[np.ndarray, np.ndarray]:
+    def controller_error(
+        self, K: StateSpace, least: float, centre: np.ndarray, half: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(n,) bound over |omega - centre| <= half of |M| in R - K exp(-j omega tau) = M [K; least I], including the
         effect of rounded decoding; and the part of it that decreases with the square of the interval width.
 
@@ -167,8 +191,13 @@ class SampledAxes:
         no_pade = roots_jet(delay, [-one for one in delay], (-1.0) ** len(delay), centre, half)
         channel = self._channel
         unfiltered = roots_jet(channel.poles, channel.zeros, 1 / channel.leading, centre, half)
-        code = StateSpace(own.A, own.B @ (self.gains_V[:, None] * self.rows), self.forces @ own.C,
-                          self.forces @ own.D @ (self.gains_V[:, None] * self.rows), T)
+        code = StateSpace(
+            own.A,
+            own.B @ (self.gains_V[:, None] * self.rows),
+            self.forces @ own.C,
+            self.forces @ own.D @ (self.gains_V[:, None] * self.rows),
+            T,
+        )
         held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
         R = held * (unfiltered * system_jet(code, centre, half))
         # The part that rounding adds beside the axes is about 1e-7 of R and as smooth: doubled for the interval.
@@ -178,8 +207,14 @@ class SampledAxes:
     def folding(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound of |E| [m/(N s)] over |omega - centre| <= half, up to half the sample rate."""
         own = self._filter(centre, half)[0]
-        terms = [own / self._filter(image, half)[1] * self._high_gain("force", "seen", image, half)
-                 * (centre + half) / (image - half) for image in self._images(centre)]
+        terms = [
+            own
+            / self._filter(image, half)[1]
+            * self._high_gain("force", "seen", image, half)
+            * (centre + half)
+            / (image - half)
+            for image in self._images(centre)
+        ]
         # Hold and table together fall at least as k^-2.
         return np.sum(terms, axis=0) + self._rest(terms)
 
@@ -195,14 +230,23 @@ class SampledAxes:
         allocation[[self.controller.system.outputs.index(name) for name in plant.actuators]] = plant.allocation
         if (weight := plant.weights.get("actuator chain *")) is not None:
             beside = volts - allocation @ (self.forces @ volts)
-            found += weight.magnitude(omega) * hold * np.linalg.norm(self.forces, 2) * np.linalg.norm(
-                beside, ord=2, axis=(1, 2))
+            found += (
+                weight.magnitude(omega)
+                * hold
+                * np.linalg.norm(self.forces, 2)
+                * np.linalg.norm(beside, ord=2, axis=(1, 2))
+            )
         if (weight := plant.weights.get("sensor chain *")) is not None:
-            by_sensor = self.forces @ (self.controller.system.frequency_response(omega)
-                                       * self.sensor_volts(omega)[:, None, :])
+            by_sensor = self.forces @ (
+                self.controller.system.frequency_response(omega) * self.sensor_volts(omega)[:, None, :]
+            )
             beside = by_sensor - by_sensor @ self.rows @ plant.decoding
-            found += weight.magnitude(omega) * hold * np.linalg.norm(self.rows, 2) * np.linalg.norm(
-                beside, ord=2, axis=(1, 2))
+            found += (
+                weight.magnitude(omega)
+                * hold
+                * np.linalg.norm(self.rows, 2)
+                * np.linalg.norm(beside, ord=2, axis=(1, 2))
+            )
         return found
 
     # -- images of the sample rate -------------------------------------------------------
@@ -235,8 +279,10 @@ class SampledAxes:
 
     def held_images(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """(n,) bound over each interval of the r.m.s. payload velocity at all images, per force [m/(N s)]."""
-        terms = [np.square(self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half))
-                 for image in self._images(centre)]
+        terms = [
+            np.square(self._high_gain("force", "velocity", image, half) * (centre + half) / (image - half))
+            for image in self._images(centre)
+        ]
         return np.sqrt(np.sum(terms, axis=0) + self._rest(terms))
 
     def folded_floor(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -245,8 +291,10 @@ class SampledAxes:
         An accelerometer without a filter shows motion equally at every image, so that the sum over all has no bound.
         """
         own = self._filter(centre, half)[0]
-        terms = [np.square(self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1])
-                 for image in self._images(centre)]
+        terms = [
+            np.square(self._high_gain("floor", "seen", image, half) * own / self._filter(image, half)[1])
+            for image in self._images(centre)
+        ]
         return np.sqrt(np.sum(terms, axis=0))
 
     @cached_property
@@ -307,8 +355,9 @@ class SampledAxes:
         if (source, target) == ("floor", "velocity"):
             return Rational(self._proved(source, target, None))
         near, far = np.split(self.high_grid, [self.settings.near])
-        gains = np.concatenate([self._gains_at(source, target, near),
-                                self._gains_at(source, target, far, simplified=True)])
+        gains = np.concatenate(
+            [self._gains_at(source, target, near), self._gains_at(source, target, far, simplified=True)]
+        )
         fitted = covering_fit(self.high_grid, gains, gains, self.settings.order).function
         return fitted.scaled(self._proved(source, target, fitted))
 
@@ -320,8 +369,10 @@ class SampledAxes:
         if (unbounded := np.flatnonzero(np.isinf(gains))).size:
             gains[unbounded] = skewed_upper_bound(M[unbounded], whole).beta
         if not np.all(np.isfinite(gains)):
-            raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
-                                   next_step="design with smaller uncertainty")
+            raise ComputationError(
+                "the table above half the sample rate has no bounded gain over the uncertainty set",
+                next_step="design with smaller uncertainty",
+            )
         return gains
 
     def _proved(self, source: str, target: str, weight: Rational | None) -> float:
@@ -331,8 +382,9 @@ class SampledAxes:
         if weight is not None:
             part = append(gain(np.eye(n_z)), *[weight.inverse().system()] * (part.noutputs - n_z)) @ part
         # points=0: only the largest gain is required, no curve.
-        found = worst_case_gain(part, blocks, band=(self.high_grid[0], np.inf), slack=self.settings.slack,
-                                robust=self._stability, points=0)
+        found = worst_case_gain(
+            part, blocks, band=(self.high_grid[0], np.inf), slack=self.settings.slack, robust=self._stability, points=0
+        )
         if not (found.guaranteed and np.isfinite(found.upper)):
             raise ComputationError("the table's gain above half the sample rate is not proved", measured=found.covers)
         return found.upper
@@ -341,7 +393,11 @@ class SampledAxes:
         """The open table without anti-alias filter, and its blocks; from force or floor to seen or payload velocity."""
         plant = self._unfiltered
         blocks, P = plant.full.blocks, plant.full.P
-        names = {"force": plant.full.u, "floor": plant.floor_velocities, "seen": plant.full.y,
-                 "velocity": plant.velocities}
-        part = P.select([*P.outputs[:blocks.n_z], *names[target]], [*P.inputs[:blocks.n_w], *names[source]])
+        names = {
+            "force": plant.full.u,
+            "floor": plant.floor_velocities,
+            "seen": plant.full.y,
+            "velocity": plant.velocities,
+        }
+        part = P.select([*P.outputs[: blocks.n_z], *names[target]], [*P.inputs[: blocks.n_w], *names[source]])
         return part, blocks.with_performance(len(names[source]), len(names[target]))

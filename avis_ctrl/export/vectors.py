@@ -49,21 +49,23 @@ class SignalSettings:
     seed: int = 1
 
 
-def vectors(controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
-            ) -> tuple[np.ndarray, np.ndarray]:
+def vectors(
+    controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
+) -> tuple[np.ndarray, np.ndarray]:
     """Inputs (samples, n_y) and outputs (samples, n_u) from `init` on, computed in double precision [V]."""
     start = guard.wait + 1 / guard.rise
     samples = round(start / settings.start)
     y = _linear(controller, guard, samples, settings)
     end = samples - max(1, round(settings.falling * (samples - start)))
     extreme = _extreme(controller, guard, round(settings.limits * (samples - start)), settings)
-    y[end - len(extreme):end] = extreme
+    y[end - len(extreme) : end] = extreme
     y[end, 0] = _invalid(guard)[0]
     return _with_outputs(controller, guard, y)
 
 
-def restarts(controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
-             ) -> tuple[np.ndarray, np.ndarray]:
+def restarts(
+    controller: SampledController, guard: Protection, settings: SignalSettings = SignalSettings()
+) -> tuple[np.ndarray, np.ndarray]:
     """Inputs (samples, n_y) and outputs (samples, n_u) from `init` on [V]: three times the beginning of a start and an
     invalid input of one sample, then a whole restart. The inputs reach no limit in the linear range, so that the
     outputs agree more closely."""
@@ -76,14 +78,20 @@ def restarts(controller: SampledController, guard: Protection, settings: SignalS
     return _with_outputs(controller, guard, y)
 
 
-def agreement_V(controller: SampledController, guard: Protection, y: np.ndarray, u: np.ndarray,
-                settings: SignalSettings = SignalSettings()) -> float:
+def agreement_V(
+    controller: SampledController,
+    guard: Protection,
+    y: np.ndarray,
+    u: np.ndarray,
+    settings: SignalSettings = SignalSettings(),
+) -> float:
     """Allowed difference between the outputs of another implementation and u (n, n_u), for inputs y (n, n_y) [V].
 
     From the difference between the controller's precision and the next higher one, rounded up to two digits.
     """
-    other, margin = (np.longdouble, 2 * settings.margin) if controller.arithmetic == "float64" else (
-        np.float32, settings.margin)
+    other, margin = (
+        (np.longdouble, 2 * settings.margin) if controller.arithmetic == "float64" else (np.float32, settings.margin)
+    )
     differ = margin * float(np.max(np.abs(_run(Processor(controller, guard, other), y) - u)))
     # If long double is no wider than double, the difference is zero; then that of one rounding is used.
     differ = max(differ, margin * float(np.finfo(controller.dtype).eps) * float(np.max(np.abs(u))))
@@ -178,7 +186,7 @@ def read_csv(path: Path, controller: SampledController) -> tuple[np.ndarray, np.
         raise InputError(f"expected test vectors; {error}", file=path) from None
     if head != _head(K) or rows.shape != (len(lines), K.ninputs + K.noutputs) or not lines:
         raise InputError(f"expected the columns {_head(K)}", file=path)
-    return rows[:, :K.ninputs], rows[:, K.ninputs:]
+    return rows[:, : K.ninputs], rows[:, K.ninputs :]
 
 
 def _head(K: StateSpace) -> str:

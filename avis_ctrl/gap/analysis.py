@@ -1,6 +1,6 @@
 """Gap analysis of a rig and a campaign, from the signals to the verdict.
 
-    prepare -> fit of rig -> fit with tolerances -> search -> naming -> stages, power fractions and residual
+prepare -> fit of rig -> fit with tolerances -> search -> naming -> stages, power fractions and residual
 """
 
 from __future__ import annotations
@@ -21,17 +21,7 @@ from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
 from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
-from avis_ctrl.gap.result import (
-    Considered,
-    Detectable,
-    Gap,
-    NamedEffect,
-    Remainder,
-    Stage,
-    Verdict,
-    Where,
-    missed,
-)
+from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import (
     backward_elimination,
@@ -59,7 +49,7 @@ Progress = Callable[[str], None]
 @dataclass(frozen=True, eq=False)
 class Fits:
     """base : fit of the re-identified rig. tolerant : fit with all tolerances. steps : of the search. best : fit with
-        all effects."""
+    all effects."""
 
     base: Fitted
     tolerant: Fitted
@@ -81,10 +71,17 @@ class Names:
     refused: dict[str, str]
 
 
-def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, float] | None = None,
-            amplifier_corner_Hz: float | None = None, effects: Sequence[Effect] | None = None,
-            progress: Progress = lambda text: None, each: Mapper = sequential_map, settings: GapSettings = SETTINGS
-            ) -> Gap:
+def analyse(
+    campaign: Campaign,
+    rig: Rig,
+    seed: int = 1,
+    band_Hz: tuple[float, float] | None = None,
+    amplifier_corner_Hz: float | None = None,
+    effects: Sequence[Effect] | None = None,
+    progress: Progress = lambda text: None,
+    each: Mapper = sequential_map,
+    settings: GapSettings = SETTINGS,
+) -> Gap:
     """Search for missing effects, name them and update the model.
 
     Parameters
@@ -106,7 +103,7 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
         prepared = mended_with(prepared, fits.best.model, progress, each, settings)
         fits = _fits(prepared, rig, known, progress, each, settings)
     residual = ModelResidual.of(fits.best.model, prepared.held_out)
-    if prepared.local_noise and residual.noise_nrmse ** 2 > settings.within_noise * residual.nrmse ** 2:
+    if prepared.local_noise and residual.noise_nrmse**2 > settings.within_noise * residual.nrmse**2:
         # A local polynomial model counts distortion as noise; the model with its effects may predict it.
         progress("noise estimated again, with the effects that were found")
         prepared = with_noise_from(prepared, fits.best.model, each)
@@ -120,8 +117,9 @@ def analyse(campaign: Campaign, rig: Rig, seed: int = 1, band_Hz: tuple[float, f
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
 
 
-def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Progress, each: Mapper,
-          settings: GapSettings) -> Fits:
+def _fits(
+    prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
+) -> Fits:
     data = prepared.data(prepared.fitted, settings.lines)
     progress("fit of mass, inertia, stiffness and damping")
     start, nominal = prepared.rough, prepared.nominal.base
@@ -130,8 +128,12 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     base = fit(start, priors, priors.z(start.values), data, first_variances(data, settings), settings)
     progress("fit with all tolerances")
     tolerances = with_tolerances(nominal, tolerances_of(rig), settings)
-    apart = replace(base.model, base=replace(base.model.base, names=tolerances.names),
-                    nominal=replace(nominal, names=tolerances.names), corners_differ=True)
+    apart = replace(
+        base.model,
+        base=replace(base.model.base, names=tolerances.names),
+        nominal=replace(nominal, names=tolerances.names),
+        corners_differ=True,
+    )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
     starts: list[ActiveEffect] = []
@@ -142,8 +144,9 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Pro
     return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings, starts)
 
 
-def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper,
-              settings: GapSettings) -> Fits:
+def _refitted(
+    fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
+) -> Fits:
     """Refit the last model with the new noise estimate and continue the search from there. Effects found before are
     still judged with the noise estimate with which they were found."""
     data, best = prepared.data(prepared.fitted, settings.lines), fits.best
@@ -151,8 +154,15 @@ def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect], progres
     return _searched(replace(fits, best=best), data, effects, progress, each, settings)
 
 
-def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Mapper,
-              settings: GapSettings, starts: Sequence[ActiveEffect] = ()) -> Fits:
+def _searched(
+    fits: Fits,
+    data: Data,
+    effects: Sequence[Effect],
+    progress: Progress,
+    each: Mapper,
+    settings: GapSettings,
+    starts: Sequence[ActiveEffect] = (),
+) -> Fits:
     """Add the effects that the search finds in addition to those of the best fit."""
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
 
@@ -160,13 +170,14 @@ def _searched(fits: Fits, data: Data, effects: Sequence[Effect], progress: Progr
         """Whether the effect found last explains a negligible part of the gap."""
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
-    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough,
-                   starts)
+
+    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough, starts)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
-def _without_weak(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
-                  ) -> tuple[tuple[Step, ...], Fitted]:
+def _without_weak(
+    steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
+) -> tuple[tuple[Step, ...], Fitted]:
     """Remove weak effects (`is_weak`) that the evidence does not require; the remaining steps and the fit. Values
     beyond their tolerance are kept: their evidence lies in how far other values had to move, or in narrower priors
     (`outliers`)."""
@@ -181,7 +192,7 @@ def _left(model: TableModel, data: Data) -> float:
 
 def _excess(base: Fitted, data: Data) -> float:
     residual = ModelResidual.of(base.model, data.blocks)
-    return residual.nrmse ** 2 - residual.noise_nrmse ** 2
+    return residual.nrmse**2 - residual.noise_nrmse**2
 
 
 def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
@@ -196,16 +207,22 @@ def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
         why = _refusal(fits.best, step, probability[label], data, held, settings)
         if why:
             one = fits.best.model.effect(label)
-            refused[label] = (f"it behaves most like {one.effect.described(one.place, one.by_name)}, for which the "
-                              "library has no name" if one.effect.outside else
-                              f"{one.effect.name} fits best, but is not named: {why}")
+            refused[label] = (
+                f"it behaves most like {one.effect.described(one.place, one.by_name)}, for which the "
+                "library has no name"
+                if one.effect.outside
+                else f"{one.effect.name} fits best, but is not named: {why}"
+            )
             best = without_effect(best, label, data, settings) or best
     if refused:
         remaining = [step for step in fits.steps if step.label in best.labels]
         kept, best = _without_weak(remaining, best, data, settings)
-        refused |= {step.label: f"{name_of(step.label)[0]} is not named: without the effects that are refused, its "
-                                "strength is hardly distinguishable from zero"
-                    for step in remaining if step not in kept}
+        refused |= {
+            step.label: f"{name_of(step.label)[0]} is not named: without the effects that are refused, its "
+            "strength is hardly distinguishable from zero"
+            for step in remaining
+            if step not in kept
+        }
     named = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, named, {label: rivals[label] for label in named}, refused)
 
@@ -230,9 +247,11 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
 def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSettings) -> bool:
     """Whether an effect makes held-out records more likely: when it was found or, failing that, together with all
     effects found later. A weak effect may not show while a stronger one is missing."""
+
     def likelihood(one: Fitted) -> float:
         # With the priors: a value beyond its tolerance shows in how far other values had to move, hardly in a residual.
         return sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
+
     if likelihood(step.fitted) > likelihood(step.before):
         return True
     rest = without_effect(best, step.label, data, settings)
@@ -244,21 +263,37 @@ def _judged(one: ActiveEffect) -> list[str]:
     return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
 
 
-def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float,
-         progress: Progress, each: Mapper, settings: GapSettings) -> Gap:
+def _gap(
+    prepared: Prepared,
+    fits: Fits,
+    names: Names,
+    effects: Sequence[Effect],
+    seed: int,
+    began: float,
+    progress: Progress,
+    each: Mapper,
+    settings: GapSettings,
+) -> Gap:
     """Assemble the result; stages, maps and sentences are computed on held-out records."""
     blocks, updated = prepared.held_out, names.updated
     before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
     raw = ModelResidual.of(fits.base.model, prepared.unmasked)
-    noise = after.noise_nrmse ** 2
-    power = Power(noise, before.nrmse ** 2)
-    stages = [Stage("nominal", *_figures(ModelResidual.of(with_second_order(prepared.nominal), prepared.unmasked))),
-              Stage("re-identified", *_figures(raw)),
-              Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks)))]
-    stages += [Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
-               for label, one in _chain(fits, updated, prepared, settings)]
-    found = [_named(one, updated, names, power, after.nrmse ** 2, prepared) for one in updated.model.effects
-             if one.label in updated.labels]
+    noise = after.noise_nrmse**2
+    power = Power(noise, before.nrmse**2)
+    stages = [
+        Stage("nominal", *_figures(ModelResidual.of(with_second_order(prepared.nominal), prepared.unmasked))),
+        Stage("re-identified", *_figures(raw)),
+        Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks))),
+    ]
+    stages += [
+        Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
+        for label, one in _chain(fits, updated, prepared, settings)
+    ]
+    found = [
+        _named(one, updated, names, power, after.nrmse**2, prepared)
+        for one in updated.model.effects
+        if one.label in updated.labels
+    ]
     faults = prepared.faults
     if after.chi2_per_dof <= settings.known_noise:
         progress("noise of floor and sensors")
@@ -268,10 +303,11 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     found.sort(key=lambda one: -(one.share or 0.0))
     reported = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
-    excess = after.nrmse ** 2 - noise
+    excess = after.nrmse**2 - noise
     records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
-    remainder = Remainder(after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess),
-                          grows_faster(records))
+    remainder = Remainder(
+        after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess), grows_faster(records)
+    )
     closed = after.chi2_per_dof <= settings.within_noise or excess <= 0
     small = math.sqrt(max(excess, 0.0)) < settings.small
     verdict = _verdict(reported, closed, closed or small, remainder, settings)
@@ -285,13 +321,37 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         progress("detection limits of the effects")
         data = prepared.data(prepared.fitted, settings.lines)
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
-    sentences = (_opening(verdict, reported, traces, stages, remainder, after), *names.refused.values(),
-                 _remains(remainder, remaining), prepared.noise)
-    return Gap(verdict, reported, tuple(stages), where if verdict != "none" else (), remaining, after.noise_nrmse,
-               onward, fits.base.model, updated.model, _considered(fits, names, prepared, settings),
-               heat_map(before, after), tuple(one for one in sentences if one), prepared.halves.how, seed,
-               time.monotonic() - began, updated.whole_covariance(), limits, shares, records,
-               faults.raised if closed else (), traces, remainder, _moved(updated, settings))
+    sentences = (
+        _opening(verdict, reported, traces, stages, remainder, after),
+        *names.refused.values(),
+        _remains(remainder, remaining),
+        prepared.noise,
+    )
+    return Gap(
+        verdict,
+        reported,
+        tuple(stages),
+        where if verdict != "none" else (),
+        remaining,
+        after.noise_nrmse,
+        onward,
+        fits.base.model,
+        updated.model,
+        _considered(fits, names, prepared, settings),
+        heat_map(before, after),
+        tuple(one for one in sentences if one),
+        prepared.halves.how,
+        seed,
+        time.monotonic() - began,
+        updated.whole_covariance(),
+        limits,
+        shares,
+        records,
+        faults.raised if closed else (),
+        traces,
+        remainder,
+        _moved(updated, settings),
+    )
 
 
 def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
@@ -318,23 +378,32 @@ def _sensors(faults: SignalFaults) -> dict[str, float] | None:
     return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
 
 
-def _named(one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared
-           ) -> NamedEffect:
+def _named(
+    one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared
+) -> NamedEffect:
     reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
-    return NamedEffect(one.effect.name, name_of(one.label)[1], one.effect.title, reported,
-                       names.probability[one.label], names.rivals[one.label], label=one.label,
-                       share=share_of(updated.model, one.label, prepared.held_out, power, with_it))
+    return NamedEffect(
+        one.effect.name,
+        name_of(one.label)[1],
+        one.effect.title,
+        reported,
+        names.probability[one.label],
+        names.rivals[one.label],
+        label=one.label,
+        share=share_of(updated.model, one.label, prepared.held_out, power, with_it),
+    )
 
 
 def _share_of_signal(name: str, raw: ModelResidual, masked: ModelResidual, power: Power) -> float:
     """Part of the gap due to an effect on the signals alone, relative to the baseline's excess including this part. Hum
     is measured on the lines that it pollutes; floor and converter, which are part of the noise, by the noise itself."""
-    own = max(raw.nrmse ** 2 - masked.nrmse ** 2, 0.0) if name == "mains_hum" else power.noise
+    own = max(raw.nrmse**2 - masked.nrmse**2, 0.0) if name == "mains_hum" else power.noise
     return float(own / max(own + power.excess, 1e-300))
 
 
-def _verdict(reported: Sequence[NamedEffect], closed: bool, small: bool, residual: Remainder, settings: GapSettings
-             ) -> Verdict:
+def _verdict(
+    reported: Sequence[NamedEffect], closed: bool, small: bool, residual: Remainder, settings: GapSettings
+) -> Verdict:
     """Verdict by the rules of the contract. closed : the residual is noise. small : closed, or below 1 % of the
     response."""
     if not reported:
@@ -354,8 +423,10 @@ def separating_measurement(reported: Sequence[NamedEffect], fits: Fits) -> str |
             step = next(step for step in fits.steps if step.label == one.label)
             mine, other = step.tried[step.label], one.indistinguishable_from[0]
             # Of the places and laws of the rival, the one with the largest odds cannot be ruled out.
-            rival = max((fit for label, fit in step.tried.items() if name_of(label)[0] == other),
-                        key=lambda fit: odds_against_fit(mine, fit))
+            rival = max(
+                (fit for label, fit in step.tried.items() if name_of(label)[0] == other),
+                key=lambda fit: odds_against_fit(mine, fit),
+            )
             return between(one.name, other, mine.model, rival.model)
     return None
 
@@ -363,10 +434,12 @@ def separating_measurement(reported: Sequence[NamedEffect], fits: Fits) -> str |
 def _far(shifts: Sequence[Tolerance], settings: GapSettings) -> str:
     """Values of the rig file that moved further, as a whole, than their tolerances allow."""
     far = [one for one in shifts if abs(one.moved) > settings.beyond_least]
-    size = float(np.sqrt(np.mean([one.moved ** 2 for one in shifts])))
-    return (f"the fit moves {len(far)} of {len(shifts)} values of the rig file by more than {settings.beyond_least:g} "
-            f"tolerances, {shifts[0].parameter} by {abs(shifts[0].moved):.3g}, all by {size:.2g} r.m.s.: the rig file "
-            "is wrong there, its tolerances are too small, or an effect is missing that these values imitate")
+    size = float(np.sqrt(np.mean([one.moved**2 for one in shifts])))
+    return (
+        f"the fit moves {len(far)} of {len(shifts)} values of the rig file by more than {settings.beyond_least:g} "
+        f"tolerances, {shifts[0].parameter} by {abs(shifts[0].moved):.3g}, all by {size:.2g} r.m.s.: the rig file "
+        "is wrong there, its tolerances are too small, or an effect is missing that these values imitate"
+    )
 
 
 def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSettings) -> tuple[Considered, ...]:
@@ -379,34 +452,57 @@ def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSetti
             effect = one.model.effects[-1]
             if effect.effect.outside or label in names.updated.labels:
                 continue
-            reason = names.refused.get(label) or implausible(one) or (
-                f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
+            reason = (
+                names.refused.get(label)
+                or implausible(one)
+                or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
+            )
             reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
             chi2 = ModelResidual.of(one.model, thin).chi2_per_dof
-            rows.append(Considered(effect.effect.name, name_of(label)[1], chi2,
-                                   min(odds_against_fit(best, one), settings.most_sure), reason, reported))
-    return tuple(sorted(rows, key=lambda one: -one.probability)[:settings.shown_runners_up])
+            rows.append(
+                Considered(
+                    effect.effect.name,
+                    name_of(label)[1],
+                    chi2,
+                    min(odds_against_fit(best, one), settings.most_sure),
+                    reason,
+                    reported,
+                )
+            )
+    return tuple(sorted(rows, key=lambda one: -one.probability)[: settings.shown_runners_up])
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def _opening(verdict: Verdict, reported: Sequence[NamedEffect], traces: Sequence[NamedEffect], stages: Sequence[Stage],
-             residual: Remainder, after: ModelResidual) -> str:
+def _opening(
+    verdict: Verdict,
+    reported: Sequence[NamedEffect],
+    traces: Sequence[NamedEffect],
+    stages: Sequence[Stage],
+    residual: Remainder,
+    after: ModelResidual,
+) -> str:
     """The opening sentences: verdict and size of the gap."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"the noise alone is estimated at {_percent(after.noise_nrmse)}"
     also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
     if verdict == "none":
-        return (f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
-                f"{_percent(residual.nrmse)}; {rest}.{also}")
+        return (
+            f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
+            f"{_percent(residual.nrmse)}; {rest}.{also}"
+        )
     if verdict == "unexplained":
-        return (f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
-                f"error on held-out records is {_percent(residual.nrmse)}; {rest}.{also}")
+        return (
+            f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
+            f"error on held-out records is {_percent(residual.nrmse)}; {rest}.{also}"
+        )
     lines = " on the lines without hum" if any(one.name == "mains_hum" for one in (*reported, *traces)) else ""
-    return (f"{missed(reported)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
-            f"{_percent(residual.nrmse)}{lines}; {rest}.{also}")
+    return (
+        f"{missed(reported)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
+        f"{_percent(residual.nrmse)}{lines}; {rest}.{also}"
+    )
 
 
 def _remains(residual: Remainder, remaining: Sequence[Where]) -> str:
@@ -415,12 +511,20 @@ def _remains(residual: Remainder, remaining: Sequence[Where]) -> str:
         if not remaining:
             return "the residual is the noise"
         places = sorted({f"{one.output} from {one.from_Hz:.3g} to {one.to_Hz:.3g} Hz" for one in remaining})
-        return (f"as a whole the residual does not exceed the noise, but it does in {'; '.join(places[:3])}"
-                f"{' and elsewhere' if places[3:] else ''}")
-    level = {True: "; it grows faster than the drives", False: "; it does not grow faster than the drives",
-             None: ""}[residual.grows_with_level]
-    lies = f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz" \
-        if remaining else ""
-    return (f"the residual is {_percent(residual.nrmse)} of the held-out records, {residual.over_noise:.3g} times the "
-            f"noise{lies}; its power beyond noise is {_percent(residual.share)} of that of the re-identified "
-            f"model{level}")
+        return (
+            f"as a whole the residual does not exceed the noise, but it does in {'; '.join(places[:3])}"
+            f"{' and elsewhere' if places[3:] else ''}"
+        )
+    level = {True: "; it grows faster than the drives", False: "; it does not grow faster than the drives", None: ""}[
+        residual.grows_with_level
+    ]
+    lies = (
+        f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz"
+        if remaining
+        else ""
+    )
+    return (
+        f"the residual is {_percent(residual.nrmse)} of the held-out records, {residual.over_noise:.3g} times the "
+        f"noise{lies}; its power beyond noise is {_percent(residual.share)} of that of the re-identified "
+        f"model{level}"
+    )

@@ -68,18 +68,23 @@ def divide(campaign: Campaign) -> Halves:
     groups.sort(key=lambda group: -group[0].header.level_V)
     several = [group for group in groups if len(group) > 1]
     order = several[:1] + several[:0:-1]
-    chosen = [group[-1].header.name for group in order][:max(len(driven) // 3, 1)]
+    chosen = [group[-1].header.name for group in order][: max(len(driven) // 3, 1)]
     power = {record.header.name: drive_power(record) for record in driven}
     others = np.sum([value for name, value in power.items() if name not in chosen], axis=0)
     if chosen and len(driven) - len(chosen) >= 2 and all(excites_as_well(others, power[name]) for name in chosen):
         rest = tuple(record.header.name for record in campaign.records if record.header.name not in chosen)
-        return Halves(campaign.only(rest), campaign.only(tuple(sorted(chosen))),
-                      f"records {', '.join(sorted(chosen))}; another record of the same level is fitted")
+        return Halves(
+            campaign.only(rest),
+            campaign.only(tuple(sorted(chosen))),
+            f"records {', '.join(sorted(chosen))}; another record of the same level is fitted",
+        )
     parts = [_parted(record) for record in driven]
     quiet = tuple(record for record in campaign.records if record not in driven)
-    return Halves(replace(campaign, records=(*(first for first, _ in parts), *quiet)),
-                  replace(campaign, records=tuple(last for _, last in parts)),
-                  "the last third of every record, because no two records have the same level")
+    return Halves(
+        replace(campaign, records=(*(first for first, _ in parts), *quiet)),
+        replace(campaign, records=tuple(last for _, last in parts)),
+        "the last third of every record, because no two records have the same level",
+    )
 
 
 def _parted(record: RecordSource) -> tuple[RecordSource, RecordSource]:
@@ -94,8 +99,13 @@ def blocks_of(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float
     return [block for block in found if np.any(block.U)]
 
 
-def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, residual: Campaign, model: TableModel,
-               band_Hz: tuple[float, float]) -> tuple[list[SpectralBlock], str]:
+def with_noise(
+    blocks: Sequence[SpectralBlock],
+    campaign: Campaign,
+    residual: Campaign,
+    model: TableModel,
+    band_Hz: tuple[float, float],
+) -> tuple[list[SpectralBlock], str]:
     """The blocks with noise that is not affected by errors of the modelled response to the drives, and a sentence.
 
     The noise is measured where u is silent: in records at rest, and on the lines between the harmonics of periodic
@@ -114,8 +124,11 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, residual: Ca
     for block in blocks:
         key = (block.kind, block.omega.tobytes())
         if key not in known:
-            known[key] = (noise_from_residuals(quiet, [block], model=model)[0] if block.kind in kinds
-                          else _local(residual, block, band_Hz))
+            known[key] = (
+                noise_from_residuals(quiet, [block], model=model)[0]
+                if block.kind in kinds
+                else _local(residual, block, band_Hz)
+            )
         like = known[key]
         assert like.noise is not None
         made.append(block.with_noise(like.noise, like.dof))
@@ -127,8 +140,11 @@ def with_noise(blocks: Sequence[SpectralBlock], campaign: Campaign, residual: Ca
 
 def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
     """Whether `with_noise` finds lines without drive for every kind of block."""
-    kinds = {"floor measured" if r.header.floor_names else "floor not measured" for r in campaign.records
-             if (r.header.period_samples and r.header.periods >= SETTINGS.settled) or not driven_inputs(r)}
+    kinds = {
+        "floor measured" if r.header.floor_names else "floor not measured"
+        for r in campaign.records
+        if (r.header.period_samples and r.header.periods >= SETTINGS.settled) or not driven_inputs(r)
+    }
     return {block.kind for block in blocks} <= kinds
 
 
@@ -144,12 +160,14 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
         record = source.load()
         records.append(Record(replace(record.header, floor_names=()), record.u, record.y, None))
     try:
-        found = measured_noise(replace(campaign, records=tuple(records)), replace(block, kind="floor not measured"),
-                               band_Hz)
+        found = measured_noise(
+            replace(campaign, records=tuple(records)), replace(block, kind="floor not measured"), band_Hz
+        )
         return replace(found, kind=block.kind)
     except AvisError as error:
-        raise InputError(f"expected records from which the noise can be estimated ({error})",
-                         field=f"record {block.name}") from None
+        raise InputError(
+            f"expected records from which the noise can be estimated ({error})", field=f"record {block.name}"
+        ) from None
 
 
 def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float]) -> Residual | None:
@@ -161,7 +179,7 @@ def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float
         block = record_block(segment, model.base, band_Hz)
         lines = np.rint(block.omega * segment.header.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
         block = block.lines(np.flatnonzero(lines % (h.periods - 1)))
-        block.U[:, :len(model.actuators)] = 0
+        block.U[:, : len(model.actuators)] = 0
     elif not driven_inputs(record):
         block = record_block(record.load(), model.base, band_Hz)
     else:

@@ -44,8 +44,9 @@ def detection_limits(score: Score, effects: Sequence[Effect] | None = None) -> t
                 continue
             std = _standard_deviations(score.of_effect(active(effect, model, place, [one.none for one in parameters])))
             for one, own in zip(parameters, std, strict=True):
-                row = Detectable(effect.name, place.partition("/")[0], one.name, SETTINGS.detected * float(own),
-                                 one.unit)
+                row = Detectable(
+                    effect.name, place.partition("/")[0], one.name, SETTINGS.detected * float(own), one.unit
+                )
                 key = (row.name, row.location, row.parameter)
                 if key not in rows or rows[key].value < row.value:
                     rows[key] = row
@@ -56,7 +57,7 @@ def _standard_deviations(A: np.ndarray) -> np.ndarray:
     """(k,) standard deviations of the parameters with directions A (k, N); infinite for undetermined parameters."""
     size, values, vectors = scaled_eigh(A @ A.T)
     known = values > SETTINGS.least_eigenvalue * max(values[-1], 1e-300)
-    variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1) / size ** 2
+    variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1) / size**2
     # Parameters in the null space change nothing: their standard deviation is infinite.
     loose = np.sum(vectors[:, ~known] ** 2, axis=1) > SETTINGS.least_left
     return np.where(loose, np.inf, np.sqrt(variance))

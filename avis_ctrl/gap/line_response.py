@@ -67,26 +67,32 @@ class LineResponse:
 
     def spectrum(self, samples: np.ndarray) -> np.ndarray:
         """(n, m) spectrum of (samples, m) from rest."""
-        return scipy.fft.rfft(samples, self.padded, axis=0)[:len(self.omega)]
+        return scipy.fft.rfft(samples, self.padded, axis=0)[: len(self.omega)]
 
     def in_time(self, spectrum: np.ndarray) -> np.ndarray:
         """(samples, m) time signal of a spectrum (n, m)."""
-        return scipy.fft.irfft(spectrum, self.padded, axis=0)[:self.samples]
+        return scipy.fft.irfft(spectrum, self.padded, axis=0)[: self.samples]
 
-    def record_response(self, u: np.ndarray, floor: np.ndarray | None, moved: np.ndarray | None = None,
-                        acceleration: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def record_response(
+        self,
+        u: np.ndarray,
+        floor: np.ndarray | None,
+        moved: np.ndarray | None = None,
+        acceleration: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """y (samples, n_y), and deflection (samples, n_g) of the mounts.
 
         u (samples, n_u), floor (samples, 3). moved : (n, n_q) spectrum of a motion in addition to the response to u and
         floor. acceleration : (samples, n_y) along the sensors in addition to that of the table's motion.
         """
         U = self.spectrum(np.hstack([u, np.zeros((len(u), 3)) if floor is None else floor]))
-        beside = None if acceleration is None else -self.spectrum(acceleration) / (self.omega ** 2)[:, None]
+        beside = None if acceleration is None else -self.spectrum(acceleration) / (self.omega**2)[:, None]
         Y, d, start = [], [], 0
         for part in self.parts:
             here = slice(start, start := start + len(part.ops.omega))
-            response = TableResponse(part, Acting(U[here, :, None],
-                                                  reading=None if beside is None else beside[here, :, None]))
+            response = TableResponse(
+                part, Acting(U[here, :, None], reading=None if beside is None else beside[here, :, None])
+            )
             x = response.x if moved is None else response.x + moved[here, :, None]
             Y.append(response.read(x)[:, :, 0])
             d.append(part.deflection(x, response.w)[:, :, 0])
@@ -107,11 +113,15 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
     if _last and _last[0][0] == key:
         return _last[0][1]
     if samples > SETTINGS.most_samples:
-        raise InputError(f"expected a record of at most {SETTINGS.most_samples} samples, which is simulated in one "
-                         "piece", field="samples", value=samples)
+        raise InputError(
+            f"expected a record of at most {SETTINGS.most_samples} samples, which is simulated in one piece",
+            field="samples",
+            value=samples,
+        )
     if model.period_s and abs(sample_rate_Hz * model.period_s - 1) > 1e-6:
-        raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz",
-                         value=sample_rate_Hz)
+        raise InputError(
+            f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz", value=sample_rate_Hz
+        )
     padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(SETTINGS.quiet_s * sample_rate_Hz))), True)
     _last.clear()  # first, so that memory never holds two
     _last.append((key, LineResponse(model, samples, padded, sample_rate_Hz)))

@@ -76,15 +76,30 @@ def model_to_dict(model: TableModel) -> dict[str, Any]:
     base = model.base
     text, values = _rig_text(base.rig)
     return {
-        "format": FORMAT, "version": VERSION, "rig": text, "rig_values": values,
-        "loaded": getattr(base.rig, "load", None) is not None, "free": list(base.names), "unit": base.sensors.unit,
-        "sensors": list(base.sensors.names), "sensitivity": [float(one) for one in base.sensors.sensitivity],
-        "actuators": list(base.actuators), "period_s": float(base.period_s), "delay_s": float(base.delay_s),
+        "format": FORMAT,
+        "version": VERSION,
+        "rig": text,
+        "rig_values": values,
+        "loaded": getattr(base.rig, "load", None) is not None,
+        "free": list(base.names),
+        "unit": base.sensors.unit,
+        "sensors": list(base.sensors.names),
+        "sensitivity": [float(one) for one in base.sensors.sensitivity],
+        "actuators": list(base.actuators),
+        "period_s": float(base.period_s),
+        "delay_s": float(base.delay_s),
         "amplifier_corner_Hz": None if base.amplifier_corner_Hz is None else float(base.amplifier_corner_Hz),
         "suspensions": {name: list(own) for name, own in base.sensors.detuned.items()},
-        "effects": [{"name": one.effect.name, "place": one.place,
-                     "values": {name: float(value) for name, value in one.by_name.items()}} for one in model.effects],
-        "campaign_s": [float(one) for one in campaign_clock(model)]}
+        "effects": [
+            {
+                "name": one.effect.name,
+                "place": one.place,
+                "values": {name: float(value) for name, value in one.by_name.items()},
+            }
+            for one in model.effects
+        ],
+        "campaign_s": [float(one) for one in campaign_clock(model)],
+    }
 
 
 def _rig_text(rig: Rig) -> tuple[str, dict[str, float]]:
@@ -133,8 +148,11 @@ def _checked(content: Mapping[str, Any]) -> ModelFile:
     if checked.campaign_s[0] >= checked.campaign_s[1]:
         raise InputError("expected the first time before the last one", field="campaign_s", value=checked.campaign_s)
     if len(checked.sensitivity) != len(checked.sensors):
-        raise InputError(f"expected {len(checked.sensors)} values, one for each sensor", field="sensitivity",
-                         value=checked.sensitivity)
+        raise InputError(
+            f"expected {len(checked.sensors)} values, one for each sensor",
+            field="sensitivity",
+            value=checked.sensitivity,
+        )
     for field in ("sensors", "actuators", "free"):
         names = getattr(checked, field)
         if len(set(names)) != len(names):
@@ -150,15 +168,21 @@ def _made(file: ModelFile) -> TableModel:
     except (ValueError, RecursionError) as error:
         raise InputError(f"expected the text of a rig file; {' '.join(str(error).split())}", field="rig") from None
     sensors = sensor_model(rig, file.unit, file.sensors)
-    if unknown := sorted(set(file.suspensions) - {name for name, own in zip(sensors.names, sensors.suspensions,
-                                                                            strict=False) if own}):
+    if unknown := sorted(
+        set(file.suspensions) - {name for name, own in zip(sensors.names, sensors.suspensions, strict=False) if own}
+    ):
         raise InputError("expected geophones of the model", field="suspensions", value=unknown)
-    own = tuple((f, z) if (f, z) != (0, 0) else None for f, z in (
-        file.suspensions.get(name, old or (0, 0)) for name, old in zip(sensors.names, sensors.suspensions,
-                                                                       strict=False)))
+    own = tuple(
+        (f, z) if (f, z) != (0, 0) else None
+        for f, z in (
+            file.suspensions.get(name, old or (0, 0))
+            for name, old in zip(sensors.names, sensors.suspensions, strict=False)
+        )
+    )
     sensors = replace(sensors, sensitivity=np.array(file.sensitivity), suspensions=own)
-    base = ResponseModel(rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s,
-                         file.amplifier_corner_Hz)
+    base = ResponseModel(
+        rig, tuple(file.free), sensors, tuple(file.actuators), file.period_s, file.delay_s, file.amplifier_corner_Hz
+    )
     model = TableModel(base)
     for k, one in enumerate(file.effects, 1):
         model = model.with_effect(_effect(model, one, f"effects[{k}]"))
@@ -174,8 +198,11 @@ def _require_finite_response(model: TableModel) -> None:
     except (np.linalg.LinAlgError, ZeroDivisionError, OverflowError):
         finite = False
     if not finite:
-        raise InputError("expected values that leave a finite response", field="effects",
-                         value=[f"{one.label} {one.by_name}" for one in model.effects])
+        raise InputError(
+            "expected values that leave a finite response",
+            field="effects",
+            value=[f"{one.label} {one.by_name}" for one in model.effects],
+        )
 
 
 def effect_at(model: TableModel, name: str, place: str | None, field: str) -> tuple[Effect, str]:
@@ -185,14 +212,20 @@ def effect_at(model: TableModel, name: str, place: str | None, field: str) -> tu
     """
     known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if name not in known:
-        raise InputError(f"expected one of {', '.join(library())}; load an effect of your own with --effects FILE.py",
-                         field=f"{field}.name", value=name)
+        raise InputError(
+            f"expected one of {', '.join(library())}; load an effect of your own with --effects FILE.py",
+            field=f"{field}.name",
+            value=name,
+        )
     places = known[name].places(model)
     if place is None and len(places) == 1:
         place = places[0]
     if place not in places:
-        raise InputError(f"expected one of {', '.join(places) or 'none: this rig has no place for it'}",
-                         field=f"{field}.place", value=place)
+        raise InputError(
+            f"expected one of {', '.join(places) or 'none: this rig has no place for it'}",
+            field=f"{field}.place",
+            value=place,
+        )
     return known[name], place
 
 
@@ -200,6 +233,9 @@ def _effect(model: TableModel, one: EffectFile, field: str) -> ActiveEffect:
     effect, place = effect_at(model, one.name, one.place, field)
     parameters = effect.parameters(model, place)
     if set(one.values) != {parameter.name for parameter in parameters}:
-        raise InputError(f"expected {', '.join(parameter.name for parameter in parameters)}", field=f"{field}.values",
-                         value=list(one.values))
+        raise InputError(
+            f"expected {', '.join(parameter.name for parameter in parameters)}",
+            field=f"{field}.values",
+            value=list(one.values),
+        )
     return ActiveEffect(effect, place, parameters, tuple(one.values[parameter.name] for parameter in parameters))

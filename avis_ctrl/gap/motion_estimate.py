@@ -53,8 +53,9 @@ class RecordMotionSettings:
 SETTINGS = RecordMotionSettings()
 
 
-def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Mapper = sequential_map
-              ) -> dict[str, RecordMotion]:
+def motion_of(
+    campaign: Campaign, model: TableModel, whole: Campaign | None = None, each: Mapper = sequential_map
+) -> dict[str, RecordMotion]:
     """Motion of every record of a campaign, by record name, from its measured y.
 
     Parameters
@@ -77,9 +78,19 @@ def motion_of(campaign: Campaign, model: TableModel, whole: Campaign | None = No
         source, begin, stop = origin(record)
         volts, deflection, y = known[id(source)]
         h = record.header
-        found[h.name] = RecordMotion(h.name, h.sample_rate_Hz, h.start_s, campaign_s, volts[:stop], deflection[:stop],
-                                     *mount_rows(model), begin, actuators=model.actuators,
-                                     sensors=model.sensors.names, y=y[:stop])
+        found[h.name] = RecordMotion(
+            h.name,
+            h.sample_rate_Hz,
+            h.start_s,
+            campaign_s,
+            volts[:stop],
+            deflection[:stop],
+            *mount_rows(model),
+            begin,
+            actuators=model.actuators,
+            sensors=model.sensors.names,
+            y=y[:stop],
+        )
     return found
 
 
@@ -152,13 +163,13 @@ def _unmodelled(residual: np.ndarray, lines: LineResponse, measured: np.ndarray)
 
     continued = np.pad(residual, ((margin, margin), (0, 0)))
     for k in range(SETTINGS.passes):
-        spectrum = scipy.fft.rfft(continued, lines.padded, axis=0)[:len(frequency)]
+        spectrum = scipy.fft.rfft(continued, lines.padded, axis=0)[: len(frequency)]
         e = _force(spectrum, H, at, frequency) * fade[at, None]
         if k < SETTINGS.passes - 1:
             force = in_time(e)
-            force[margin + samples:] = 0
+            force[margin + samples :] = 0
             response = in_time((H @ scipy.fft.rfft(force, axis=0)[at][:, :, None])[:, :, 0])
-            continued += SETTINGS.relaxation * (response[:len(continued)] - continued)
+            continued += SETTINGS.relaxation * (response[: len(continued)] - continued)
             continued[inside] = residual
     x = table.inverse[:, :, :N_Q] @ (size * e)[:, :, None]
     return in_time(table.deflection(x, np.zeros((len(x), 3, 1)))[:, :, 0])[inside]
@@ -200,7 +211,7 @@ def with_large_motion(motion: dict[str, RecordMotion], model: TableModel) -> dic
         q = one.deflection @ back.T
         q_dot = np.gradient(q, 1 / one.sample_rate_Hz, axis=0)
         late = round(model.delay_s * one.sample_rate_Hz)
-        u = np.concatenate([np.zeros((late, one.volts.shape[1])), one.volts])[:len(one.volts)]
+        u = np.concatenate([np.zeros((late, one.volts.shape[1])), one.volts])[: len(one.volts)]
         large, turned, reading = second_order(model.effective.rig, q, q_dot, u, model.sensors.names)
         found[name] = replace(one, large_force=large, turned_force=turned, turned_reading=reading)
     return found

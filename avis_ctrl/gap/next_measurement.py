@@ -40,12 +40,17 @@ SETTINGS = NextMeasurementSettings()
 
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     """How to separate two explanations: measure where the predictions of their refitted models differ most."""
-    for time_varying, quantity, advice in ((False, "amplitude", "at half and at twice the level"),
-                                           (True, "time", "over a longer time")):
+    for time_varying, quantity, advice in (
+        (False, "amplitude", "at half and at twice the level"),
+        (True, "time", "over a longer time"),
+    ):
         depends = [_depends(model, beside, time_varying) for model, beside in ((a, b), (b, a))]
         if any(depends):
-            why = f"they depend on {quantity} in different ways" if all(depends) else (
-                f"only one of them depends on {quantity}")
+            why = (
+                f"they depend on {quantity} in different ways"
+                if all(depends)
+                else (f"only one of them depends on {quantity}")
+            )
             return f"To distinguish {name} from {other}, record the same signals {advice}: {why}."
     frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), SETTINGS.points)
     omega, n_u = 2 * np.pi * frequency, len(a.actuators)
@@ -53,15 +58,20 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     k, i, j = np.unravel_index(int(np.argmax(difference)), difference.shape)
     low, high = _about(difference[:, i, j], int(k))
     band = f"{frequency[low]:.3g} to {frequency[high]:.3g} Hz"
-    return (f"To distinguish {name} from {other}, drive {a.actuators[j]} from {band} and measure {a.sensors.names[i]}: "
-            f"there their predictions differ most, by {difference.max():.2g} {a.sensors.unit}/V.")
+    return (
+        f"To distinguish {name} from {other}, drive {a.actuators[j]} from {band} and measure {a.sensors.names[i]}: "
+        f"there their predictions differ most, by {difference.max():.2g} {a.sensors.unit}/V."
+    )
 
 
 def _depends(model: TableModel, other: TableModel, time_varying: bool) -> bool:
     """Whether a model has effects that the other model lacks and that depend on time, or on amplitude."""
     common = {one.label for one in other.effects}
-    return any(one.effect.nonlinear and one.effect.time_varying == time_varying for one in model.effects
-               if one.label not in common)
+    return any(
+        one.effect.nonlinear and one.effect.time_varying == time_varying
+        for one in model.effects
+        if one.label not in common
+    )
 
 
 def _about(size: np.ndarray, k: int) -> tuple[int, int]:
@@ -75,21 +85,32 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     where = _where(places)
     growth = grows(records)
     if growth is None:
-        return (f"{where}Repeat the records at half and at twice the level, and "
-                "one record at rest with the floor measured: a residual in proportion to the drive is linear, one that "
-                "grows faster is not, and one that stays the same is noise or comes through the floor.")
+        return (
+            f"{where}Repeat the records at half and at twice the level, and "
+            "one record at rest with the floor measured: a residual in proportion to the drive is linear, one that "
+            "grows faster is not, and one that stays the same is noise or comes through the floor."
+        )
     power, std = growth
     rise = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
     if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
-        return (f"{rise}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
-                "search for other sources.")
+        return (
+            f"{rise}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
+            "search for other sources."
+        )
     if abs(power - 1) <= max(SETTINGS.within, 2 * std):
-        return (f"{rise}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
-                "where it acts.")
-    law = ("it grows more slowly than the drive, as with friction or backlash" if power < 1 else
-           "it grows faster than the drive, as with stiffening or saturation")
-    return (f"{rise}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
-            "lines in between, over the level, shows its law.")
+        return (
+            f"{rise}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
+            "where it acts."
+        )
+    law = (
+        "it grows more slowly than the drive, as with friction or backlash"
+        if power < 1
+        else "it grows faster than the drive, as with stiffening or saturation"
+    )
+    return (
+        f"{rise}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
+        "lines in between, over the level, shows its law."
+    )
 
 
 def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
@@ -100,12 +121,12 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
     of the gap. Each kind of record therefore has its own factor; all have the same exponent. None if the levels are too
     close, too few records exceed the noise, or the standard deviation is `unsure` or more.
     """
-    telling = [r for r in records if r.level_V > 0 and r.after ** 2 > SETTINGS.telling]
+    telling = [r for r in records if r.level_V > 0 and r.after**2 > SETTINGS.telling]
     kinds = sorted({r.kind for r in telling})
     if len(telling) < len(kinds) + 2:
         return None
     own = np.array([[r.kind == kind for kind in kinds] for r in telling], float)
-    level, residual = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after ** 2 - 1) for r in telling])
+    level, residual = np.log([r.level_V for r in telling]), np.log([np.sqrt(r.after**2 - 1) for r in telling])
     if max(np.ptp(level[of > 0]) for of in own.T) < np.log(SETTINGS.another_level):
         return None
     A = np.column_stack([own, level])
@@ -133,5 +154,7 @@ def _where(places: Sequence[Where]) -> str:
     band = [one for one in places if one.output == most]
     held = sum(one.share for one in band)
     band = [one for one in band if one.share > SETTINGS.part * held]
-    return (f"{100 * sum(one.share for one in band):.0f} % of the residual is at {most} from "
-            f"{min(one.from_Hz for one in band):.3g} to {max(one.to_Hz for one in band):.3g} Hz. ")
+    return (
+        f"{100 * sum(one.share for one in band):.0f} % of the residual is at {most} from "
+        f"{min(one.from_Hz for one in band):.3g} to {max(one.to_Hz for one in band):.3g} Hz. "
+    )

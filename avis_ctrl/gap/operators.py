@@ -49,12 +49,15 @@ class MountGeometry:
             return MountGeometry((), none, none, np.zeros(0), np.zeros(0), eom.K, eom.C)
         body = rig.mounted_body()
         mounts = body.mounts
-        return MountGeometry(tuple(f"{mount.name}.{axis}" for mount in mounts for axis in "xyz"),
-                             np.concatenate([point_map(mount.position) for mount in mounts]),
-                             np.concatenate([point_map(mount.chassis_point) for mount in mounts]),
-                             np.concatenate([np.diag(mount.stiffness) for mount in mounts]),
-                             np.concatenate([np.diag(mount.damping) for mount in mounts]),
-                             np.array(body.stiffness), np.array(body.damping))
+        return MountGeometry(
+            tuple(f"{mount.name}.{axis}" for mount in mounts for axis in "xyz"),
+            np.concatenate([point_map(mount.position) for mount in mounts]),
+            np.concatenate([point_map(mount.chassis_point) for mount in mounts]),
+            np.concatenate([np.diag(mount.stiffness) for mount in mounts]),
+            np.concatenate([np.diag(mount.damping) for mount in mounts]),
+            np.array(body.stiffness),
+            np.array(body.damping),
+        )
 
     def along(self, axis: str) -> np.ndarray:
         """Mask of the rows along an axis."""
@@ -126,8 +129,9 @@ class Operators:
         inertia = self.s[:, None, None] ** 2 * M
         return inertia if self.extra is None else inertia + self.extra
 
-    def add_impedance(self, dynamic_stiffness: np.ndarray, rows: np.ndarray,
-                      grounded: np.ndarray | None = None) -> None:
+    def add_impedance(
+        self, dynamic_stiffness: np.ndarray, rows: np.ndarray, grounded: np.ndarray | None = None
+    ) -> None:
         """Add elements along rows (m, 6) of dynamic stiffness (n, m) [N/m]; grounded (n, m): the part connected to the
         floor."""
         Z = np.einsum("nm,mi,mj->nij", dynamic_stiffness, rows, rows)
@@ -175,7 +179,7 @@ class Assembled:
         n_q, M, S = G.shape[1], mat.M, s[:, :, None]
         outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), n_q * n_q)
         D = (self.z_pp @ outer).reshape(-1, n_q, n_q)
-        D[:, :N_Q, :N_Q] += S ** 2 * M + mounts.rest_K + S * mounts.rest_C
+        D[:, :N_Q, :N_Q] += S**2 * M + mounts.rest_K + S * mounts.rest_C
         if ops.extra is not None:
             D[:, :N_Q, :N_Q] += ops.extra
         for k, one in enumerate(ops.added):
@@ -219,6 +223,7 @@ class Assembled:
 
         def of_body(force: np.ndarray) -> np.ndarray:
             return np.concatenate([force, np.zeros((n, self.n_q - N_Q, force.shape[2]))], axis=1)
+
         F = [np.broadcast_to(np.eye(self.n_q)[None, :, N_Q:], (n, self.n_q, self.n_q - N_Q)).astype(complex)]
         inside = np.flatnonzero(np.isfinite(ops.internal_omega))
         if inside.size:
@@ -246,8 +251,9 @@ class Assembled:
         n_impulses = (len(inner) - n_decays) // 2
         first = n_impulses - sum(one.shape[2] for one in ops.inner) - moves.shape[2]
         own = slice(first, first + moves.shape[2])
-        return (moves @ inner[:n_impulses][own])[:, :, None] + ops.s[:, None, None] * (
-            moves @ inner[n_impulses:][own])[:, :, None]
+        return (moves @ inner[:n_impulses][own])[:, :, None] + ops.s[:, None, None] * (moves @ inner[n_impulses:][own])[
+            :, :, None
+        ]
 
     def floor_force(self, w: np.ndarray) -> np.ndarray:
         """(n, n_q, m) force due to floor displacement w (n, 3, m)."""
@@ -298,5 +304,5 @@ def _with_internal_mass(s: np.ndarray, ops: Operators) -> tuple[np.ndarray, np.n
         return factor, factor
     a, b = 1 / ops.payload_share, 1 / (1 - ops.payload_share)
     g = factor + 2 * ops.internal_damping * s / w
-    through = g ** 2 / (g + (s / w) ** 2)
+    through = g**2 / (g + (s / w) ** 2)
     return a * g - a / b * through, through

@@ -86,8 +86,14 @@ class Lines:
 
     def some(self, keep: np.ndarray) -> Lines:
         """Some of the lines."""
-        return Lines(self.frequency_Hz[keep], self.Y[keep], self.left[keep], self.beyond[keep], self.columns[keep],
-                     self.noise[keep])
+        return Lines(
+            self.frequency_Hz[keep],
+            self.Y[keep],
+            self.left[keep],
+            self.beyond[keep],
+            self.columns[keep],
+            self.noise[keep],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +111,13 @@ class Split:
     effective: np.ndarray
 
 
-def power_shares(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader], model: TableModel,
-                 silent_noise: bool, sensors_rms: Mapping[str, float] | None) -> tuple[PowerShares, ...]:
+def power_shares(
+    errors: Sequence[PredictionError],
+    headers: Mapping[str, RecordHeader],
+    model: TableModel,
+    silent_noise: bool,
+    sensors_rms: Mapping[str, float] | None,
+) -> tuple[PowerShares, ...]:
     """Decomposition for each level, the lowest first; empty if no record drives the actuators on enough lines.
 
     Parameters
@@ -134,10 +145,23 @@ def power_shares(errors: Sequence[PredictionError], headers: Mapping[str, Record
     for (own, _), one in zip(found, splits, strict=True):
         noise = one.noise if how == "silent" else lowest if how == "levels" else one.left_incoherent
         parts = attributed(one, noise, sensors)
-        whole = {key: np.sum(value * (one.whole * one.lines[:, None]), axis=0)
-                 / np.sum(one.whole * one.lines[:, None], axis=0) for key, value in parts.items()}
-        made.append(PowerShares(float(np.mean([h.level_V for h in own])), own[0].excitation,
-                                tuple(sorted(h.name for h in own)), edges, names, parts, whole, how))
+        whole = {
+            key: np.sum(value * (one.whole * one.lines[:, None]), axis=0)
+            / np.sum(one.whole * one.lines[:, None], axis=0)
+            for key, value in parts.items()
+        }
+        made.append(
+            PowerShares(
+                float(np.mean([h.level_V for h in own])),
+                own[0].excitation,
+                tuple(sorted(h.name for h in own)),
+                edges,
+                names,
+                parts,
+                whole,
+                how,
+            )
+        )
     return tuple(made)
 
 
@@ -150,15 +174,21 @@ def attributed(one: Split, noise: np.ndarray, sensors: np.ndarray | None) -> dic
     scatter = incoherent < stats.f.isf(SETTINGS.scatter, 2 * one.effective, 2 * one.effective) * noise
     noise = np.where(scatter, incoherent, np.minimum(noise, incoherent))
     own = np.zeros_like(noise) if sensors is None else np.minimum(noise, sensors)
-    parts = {"model": one.whole - missing - incoherent, "missing": missing, "nonlinear": incoherent - noise,
-             "unmeasured": noise - own} | ({} if sensors is None else {"sensors": own})
+    parts = {
+        "model": one.whole - missing - incoherent,
+        "missing": missing,
+        "nonlinear": incoherent - noise,
+        "unmeasured": noise - own,
+    } | ({} if sensors is None else {"sensors": own})
     return {key: value / one.whole for key, value in parts.items()}
 
 
 def _levels(errors: Sequence[PredictionError], headers: Mapping[str, RecordHeader]) -> list[list[PredictionError]]:
     """Driven records grouped by level and excitation; the lowest level first."""
+
     def kind_and_level(e: PredictionError) -> tuple[str, float]:
         return headers[e.block.name].excitation, headers[e.block.name].level_V
+
     groups = of_one_level([e for e in errors if kind_and_level(e)[0] not in ("rest", "floor")], kind_and_level)
     return sorted(groups, key=lambda group: headers[group[0].block.name].level_V)
 
@@ -181,7 +211,7 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
         noise = np.real(np.einsum("nkk->nk", block.noise[:, 0]))
         Y = predicted + residual
         every = Lines(block.omega / (2 * np.pi), Y, residual, Y - columns.sum(axis=2), columns, noise)
-        made.append(every.some(power > FIT.silent_line ** 2 * power.max(initial=0.0)))
+        made.append(every.some(power > FIT.silent_line**2 * power.max(initial=0.0)))
     joined = Lines(*(np.concatenate([getattr(one, field) for one in made]) for field in Lines.__dataclass_fields__))
     return joined.some(np.argsort(joined.frequency_Hz, kind="stable"))
 
@@ -194,8 +224,11 @@ def bands(groups: Sequence[Lines]) -> np.ndarray:
     least = [SETTINGS.least_lines * _unknowns(one.columns) for one in groups]
 
     def enough(a: float, b: float) -> bool:
-        return all(np.searchsorted(one.frequency_Hz, b) - np.searchsorted(one.frequency_Hz, a) >= n
-                   for one, n in zip(groups, least, strict=True))
+        return all(
+            np.searchsorted(one.frequency_Hz, b) - np.searchsorted(one.frequency_Hz, a) >= n
+            for one, n in zip(groups, least, strict=True)
+        )
+
     edges = [low]
     for edge in grid[1:]:
         if enough(edges[-1], edge):
@@ -221,7 +254,7 @@ def split(lines: Lines, edges: np.ndarray) -> Split:
             found[:, b] += _window(lines, at)
         found[:, b] /= max(count[b], 1)
         noise = lines.noise[low:high]
-        alike[b] = np.sum(noise, axis=0) ** 2 / np.sum(noise ** 2, axis=0)
+        alike[b] = np.sum(noise, axis=0) ** 2 / np.sum(noise**2, axis=0)
     return Split(found[0], found[1], found[2], found[3], found[4], count, alike)
 
 
@@ -235,7 +268,7 @@ def _window(lines: Lines, at: np.ndarray) -> np.ndarray:
         A, model = A[:, np.any(A, axis=0)], A.sum(axis=1)
         sigma = np.sqrt(lines.noise[at, k])
         sums[0, k] = np.sum(np.abs(lines.Y[at, k]) ** 2)
-        sums[4, k] = np.sum(sigma ** 2)
+        sums[4, k] = np.sum(sigma**2)
         for row, e in ((1, lines.beyond[at, k]), (2, lines.left[at, k])):
             error, leverage = _smooth(A, e, x, sigma)
             if np.sum(np.abs(error / sigma) ** 2 / (1 - leverage)) > SETTINGS.excess * len(at):
@@ -262,8 +295,9 @@ def _smooth(A: np.ndarray, e: np.ndarray, x: np.ndarray, sigma: np.ndarray) -> t
     return e - sigma * (Q @ inside), _leverage(Q)
 
 
-def _with_poles(A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, plain: tuple[np.ndarray, np.ndarray]
-                ) -> tuple[np.ndarray, np.ndarray]:
+def _with_poles(
+    A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, plain: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """As `_smooth`, for a response whose poles differ from the model's: y = A b(x) / a(x), a of second degree.
 
     Iterated linear least squares (Sanathanan and Koerner, IEEE Trans. Autom. Control 8 (1963) 56-58). Returns `plain`
@@ -273,7 +307,7 @@ def _with_poles(A: np.ndarray, y: np.ndarray, x: np.ndarray, sigma: np.ndarray, 
     if len(y) < 2 * unknowns:
         return plain
     numerator = np.hstack([A, A * x[:, None]])
-    powers = np.stack([x, x ** 2], axis=1)
+    powers = np.stack([x, x**2], axis=1)
     a = np.ones(len(x), complex)
     best, least = plain, SETTINGS.gained * np.sum(np.abs(plain[0] / sigma) ** 2 / (1 - plain[1]))
     for _ in range(SETTINGS.pole_rounds):

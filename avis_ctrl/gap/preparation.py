@@ -73,9 +73,15 @@ class Prepared:
         return Data.of(blocks, levels_of((*self.halves.fitted.records, *self.halves.held_out.records)), lines)
 
 
-def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = None,
-            amplifier_corner_Hz: float | None = None, progress: Progress = lambda text: None,
-            each: Mapper = sequential_map, settings: GapSettings = SETTINGS) -> Prepared:
+def prepare(
+    campaign: Campaign,
+    rig: Rig,
+    band_Hz: tuple[float, float] | None = None,
+    amplifier_corner_Hz: float | None = None,
+    progress: Progress = lambda text: None,
+    each: Mapper = sequential_map,
+    settings: GapSettings = SETTINGS,
+) -> Prepared:
     """Compute spectra with noise from the records.
 
     Raises
@@ -93,8 +99,9 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     if amplifier_corner_Hz is not None and not 0 < amplifier_corner_Hz < np.inf:
         raise InputError("expected a frequency above zero", field="amplifier corner", value=amplifier_corner_Hz)
     apart = rig.with_channels_apart() if hasattr(rig, "with_channels_apart") else rig
-    base = ResponseModel.of(apart, default_parameters(apart), campaign.y_unit, campaign.y_names, campaign.u_names, True,
-                            amplifier_corner_Hz)
+    base = ResponseModel.of(
+        apart, default_parameters(apart), campaign.y_unit, campaign.y_names, campaign.u_names, True, amplifier_corner_Hz
+    )
     nominal = TableModel(base, nominal=base)
     progress(f"first fit, {band[0]:.3g} to {band[1]:.3g} Hz; held out: {halves.how}")
     rough = _rough(nominal, halves, band, settings)
@@ -108,15 +115,26 @@ def prepare(campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None = 
     return _ready(campaign, halves, nominal, rough, band, converter, clipped, progress, each, settings)
 
 
-def mended_with(prepared: Prepared, model: TableModel, progress: Progress, each: Mapper, settings: GapSettings
-                ) -> Prepared:
+def mended_with(
+    prepared: Prepared, model: TableModel, progress: Progress, each: Mapper, settings: GapSettings
+) -> Prepared:
     """Repair the clipped samples again, with the prediction of a better model."""
     assert prepared.clipped is not None
     expected = predicted(prepared.clipped, model, each)
     campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
     rough = replace(prepared.rough, effects=())
-    return _ready(campaign, divide(campaign), prepared.nominal, rough, prepared.band_Hz, prepared.faults.converter,
-                  prepared.clipped, progress, each, settings)
+    return _ready(
+        campaign,
+        divide(campaign),
+        prepared.nominal,
+        rough,
+        prepared.band_Hz,
+        prepared.faults.converter,
+        prepared.clipped,
+        progress,
+        each,
+        settings,
+    )
 
 
 def with_noise_from(prepared: Prepared, model: TableModel, each: Mapper) -> Prepared:
@@ -131,18 +149,32 @@ def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSetti
     """Raise InputError for a band in which the records are not excited, or have too few lines."""
     low, high = excited_band(campaign)
     if band[1] <= low or band[0] >= high:
-        raise InputError(f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz",
-                         field="band_Hz", value=band)
+        raise InputError(
+            f"expected a band in which the records are excited, {low:.3g} to {high:.3g} Hz", field="band_Hz", value=band
+        )
     for record in campaign.records:
         lines = int((band[1] - band[0]) * record.header.duration_s)
         if lines < settings.fewest_lines:
-            raise InputError(f"expected a wider band or longer records: {lines} lines of record {record.header.name} "
-                             f"lie in it, and a fit needs {settings.fewest_lines}", field="band_Hz", value=band)
+            raise InputError(
+                f"expected a wider band or longer records: {lines} lines of record {record.header.name} "
+                f"lie in it, and a fit needs {settings.fewest_lines}",
+                field="band_Hz",
+                value=band,
+            )
 
 
-def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: TableModel, band: tuple[float, float],
-           converter: tuple[ConverterFinding, ...], clipped: Campaign | None, progress: Progress, each: Mapper,
-           settings: GapSettings) -> Prepared:
+def _ready(
+    campaign: Campaign,
+    halves: Halves,
+    nominal: TableModel,
+    rough: TableModel,
+    band: tuple[float, float],
+    converter: tuple[ConverterFinding, ...],
+    clipped: Campaign | None,
+    progress: Progress,
+    each: Mapper,
+    settings: GapSettings,
+) -> Prepared:
     """Remove hum; compute spectra with noise, and the motion of every record with its second-order terms."""
     residual = time_residuals(campaign, rough, each)
     raw_held = blocks_of(halves.held_out, rough, band)
@@ -159,9 +191,20 @@ def _ready(campaign: Campaign, halves: Halves, nominal: TableModel, rough: Table
     (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, residual, rough, band)
     parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
     motion = with_large_motion(motion_of(parts, rough, campaign, each), rough)
-    return Prepared(campaign, halves, band, tuple(fitted), tuple(held_out), tuple(unmasked), how,
-                    replace(nominal, motion=motion), with_second_order(replace(rough, motion=motion)),
-                    SignalFaults(converter, hum), residual, clipped)
+    return Prepared(
+        campaign,
+        halves,
+        band,
+        tuple(fitted),
+        tuple(held_out),
+        tuple(unmasked),
+        how,
+        replace(nominal, motion=motion),
+        with_second_order(replace(rough, motion=motion)),
+        SignalFaults(converter, hum),
+        residual,
+        clipped,
+    )
 
 
 def with_second_order(model: TableModel) -> TableModel:
@@ -169,8 +212,13 @@ def with_second_order(model: TableModel) -> TableModel:
     return model.with_effect(active(LargeMotion(), model, "payload", BY_PHYSICS))
 
 
-def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, residual: tuple[RecordResidual, ...],
-           model: TableModel, band: tuple[float, float]) -> tuple[list[list[SpectralBlock]], str]:
+def _noise(
+    groups: Sequence[list[SpectralBlock]],
+    halves: Halves,
+    residual: tuple[RecordResidual, ...],
+    model: TableModel,
+    band: tuple[float, float],
+) -> tuple[list[list[SpectralBlock]], str]:
     """Groups of blocks with the noise of the fitted records, from the residual of a model in time; and a sentence."""
     of, records = {one.header.name: one for one in residual}, []
     for source in halves.fitted.records:
@@ -180,7 +228,7 @@ def _noise(groups: Sequence[list[SpectralBlock]], halves: Halves, residual: tupl
     every = [block for group in groups for block in group]
     made, how = with_noise(every, halves.fitted, replace(halves.fitted, records=tuple(records)), model, band)
     ends = np.cumsum([len(group) for group in groups])
-    return [made[end - len(group):end] for group, end in zip(groups, ends, strict=True)], how
+    return [made[end - len(group) : end] for group, end in zip(groups, ends, strict=True)], how
 
 
 def _rough(model: TableModel, halves: Halves, band: tuple[float, float], settings: GapSettings) -> TableModel:

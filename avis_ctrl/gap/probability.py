@@ -77,6 +77,9 @@ def probability_of(step: Step, settings: GapSettings) -> tuple[float, tuple[str,
             outside = settings.outside_odds if one.model.effects[-1].effect.outside else 1.0
             odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against_fit(mine, one) / outside)
     probability = 1 / (1 + sum(odds.values()))
-    rivals = [name for (name, _), one in sorted(odds.items(), key=lambda item: -item[1])
-              if name not in ("", own[0]) and one * probability > settings.rival]
+    rivals = [
+        name
+        for (name, _), one in sorted(odds.items(), key=lambda item: -item[1])
+        if name not in ("", own[0]) and one * probability > settings.rival
+    ]
     return min(probability, settings.most_sure), tuple(dict.fromkeys(rivals))

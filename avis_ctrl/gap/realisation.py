@@ -29,12 +29,24 @@ from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 
 # Effects that act through rig parameters, sensors, drives or the chassis; they need no addition.
-_ELSEWHERE = {"com_offset", "product_of_inertia", "geophone_corner", "sensor_gain", "sensor_misalignment",
-              "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay", "base_compliance"}
+_ELSEWHERE = {
+    "com_offset",
+    "product_of_inertia",
+    "geophone_corner",
+    "sensor_gain",
+    "sensor_misalignment",
+    "tilt_coupling",
+    "actuator_gain",
+    "actuator_lag",
+    "loop_delay",
+    "base_compliance",
+}
 # Effects that vanish in a linear loop about rest.
 _AT_REST = {"cubic_stiffness": "linear at rest: left out", "actuator_saturation": "no effect below its limit: left out"}
-_NOTES = {"contact_friction": "motion far below slip: a spring at every motor",
-          "structural_damping": "a ladder of passive branches, causal"}
+_NOTES = {
+    "contact_friction": "motion far below slip: a spring at every motor",
+    "structural_damping": "a ladder of passive branches, causal",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +93,10 @@ def notes_on(model: TableModel) -> tuple[str, ...]:
         elif name in _NOTES:
             found.append(f"{one.label}: {_NOTES[name]}")
         if name == "structural_damping" and one.place.endswith("complex"):
-            found.append(f"{one.label}: no causal system has a constant loss at every frequency; the causal law "
-                         "with the same loss is in its place")
+            found.append(
+                f"{one.label}: no causal system has a constant loss at every frequency; the causal law "
+                "with the same loss is in its place"
+            )
     return tuple(found)
 
 
@@ -111,13 +125,20 @@ def with_effects(rig: StateSpace, model: TableModel, keep: Sequence[str], when: 
     floor = [f"floor_{a}_dot" for a in names]
     base = [one for one in model.effects if one.effect.name == "base_compliance"]
     moves = [f"chassis_{a}_dot" for a in names]
-    parts["chassis"] = chassis(table, base[0].by_name, floor, [f"{a}_ddot" for a in names], moves) if base else gain(
-        np.eye(len(names)), floor, moves)
-    parts["drives"] = append(*(drive.renamed([name], [f"acting_{name}"])
-                               for name, drive in zip(actuators, _drives(model), strict=True)))
+    parts["chassis"] = (
+        chassis(table, base[0].by_name, floor, [f"{a}_ddot" for a in names], moves)
+        if base
+        else gain(np.eye(len(names)), floor, moves)
+    )
+    parts["drives"] = append(
+        *(drive.renamed([name], [f"acting_{name}"]) for name, drive in zip(actuators, _drives(model), strict=True))
+    )
     n = len(names)
-    parts["forces"] = gain(np.hstack([np.eye(n), np.eye(n)]), [f"force_{a}" for a in names] + [
-        f"added_{a}" for a in names], [f"total_{a}" for a in names])
+    parts["forces"] = gain(
+        np.hstack([np.eye(n), np.eye(n)]),
+        [f"force_{a}" for a in names] + [f"added_{a}" for a in names],
+        [f"total_{a}" for a in names],
+    )
     parts["sensors"] = _sensors(table, names)
     outputs = [name for name in rig.outputs if name.startswith("z:")]
     outputs += [f"{a}_{kind}" for kind in ("rel", "dot", "ddot") for a in names]
@@ -130,8 +151,9 @@ def _rig_part(rig: StateSpace, names: list[str], actuators: list[str]) -> StateS
     unchanged."""
     new = {f"floor_{a}_dot": f"chassis_{a}_dot" for a in names} | {f"force_{a}": f"total_{a}" for a in names}
     new |= {name: f"acting_{name}" for name in actuators}
-    outputs = [n for n in rig.outputs if n.startswith("z:")] + [f"{a}_{k}" for k in ("rel", "dot", "ddot")
-                                                               for a in names]
+    outputs = [n for n in rig.outputs if n.startswith("z:")] + [
+        f"{a}_{k}" for k in ("rel", "dot", "ddot") for a in names
+    ]
     return rig.select(outputs, None).renamed(new)
 
 
@@ -142,8 +164,10 @@ def _additions(table: ReducedTable, names: list[str]) -> StateSpace:
         if made is not None:
             total = total + made
     inputs = [f"{a}_rel" for a in names] + [f"{a}_dot" for a in names] + [f"chassis_{a}_dot" for a in names]
-    return total.renamed([*inputs, *(f"acting_{name}" for name in table.model.actuators)],
-                         [*(f"added_{a}" for a in names), *(f"bent_{name}" for name in table.model.sensors.names)])
+    return total.renamed(
+        [*inputs, *(f"acting_{name}" for name in table.model.actuators)],
+        [*(f"added_{a}" for a in names), *(f"bent_{name}" for name in table.model.sensors.names)],
+    )
 
 
 def _drives(model: TableModel) -> list[StateSpace]:
@@ -158,8 +182,10 @@ def _drives(model: TableModel) -> list[StateSpace]:
             each = np.broadcast_to(time_constants(one.by_name), len(found))
             common = [-1 / tau] if first else []
             if len(one.values) > 1 or not first:
-                found = [cascade(common, [-1 / own], (tau if first else 1.0) / own) @ before
-                         for own, before in zip(each, found, strict=True)]
+                found = [
+                    cascade(common, [-1 / own], (tau if first else 1.0) / own) @ before
+                    for own, before in zip(each, found, strict=True)
+                ]
             first = False
     return [lag.scaled(factors[name]) for lag, name in zip(found, model.actuators, strict=True)]
 
@@ -179,8 +205,10 @@ def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
         feels = filters.scaled(1.0, np.hstack([tilt, np.zeros((n_y, n_y))]))
     both = append(total, feels).scaled(1.0, np.vstack([np.eye(n + n_y)] * 2))
     sensors = model.sensors.names
-    return both.renamed([*(f"{a}_dot" for a in names), *(f"bent_{name}" for name in sensors)],
-                        [*(f"deviation_{name}" for name in sensors), *(f"tilt_{name}" for name in sensors)])
+    return both.renamed(
+        [*(f"{a}_dot" for a in names), *(f"bent_{name}" for name in sensors)],
+        [*(f"deviation_{name}" for name in sensors), *(f"tilt_{name}" for name in sensors)],
+    )
 
 
 def _changed_by(model: TableModel, *names: str) -> Operators:
@@ -234,16 +262,21 @@ def realise(model: TableModel, pade_order: int | None = None, when: float = 0.0)
     omega = 2 * np.pi * np.geomspace(*SETTINGS.check_Hz)
     order = pade_order or sufficient_order(loop_lag(model)[0], float(omega.max()), 1e-3, 10)[0]
     effective, names = model.effective, [edge_name(name) for name in COORDINATES]
-    parts = {"table": with_effects(uncertain_rig(effective.rig, [], COORDINATES).system, model, COORDINATES, when),
-             "chains": _chains(ReducedTable(model, COORDINATES, when), names), "loop": _loop(model, order),
-             "floor": gain(np.eye(len(names), 3), FLOOR, [f"floor_{a}_dot" for a in names]),
-             "no force": gain(np.zeros((len(names), 3)), FLOOR, [f"force_{a}" for a in names])}
+    parts = {
+        "table": with_effects(uncertain_rig(effective.rig, [], COORDINATES).system, model, COORDINATES, when),
+        "chains": _chains(ReducedTable(model, COORDINATES, when), names),
+        "loop": _loop(model, order),
+        "floor": gain(np.eye(len(names), 3), FLOOR, [f"floor_{a}_dot" for a in names]),
+        "no force": gain(np.zeros((len(names), 3)), FLOOR, [f"force_{a}" for a in names]),
+    }
     unused = [name for name in effective.rig.equations_of_motion().actuators if name not in model.actuators]
     if unused:
         parts["at rest"] = gain(np.zeros((len(unused), 3)), FLOOR, unused)
-    system = connect(parts, [*(f"{name}_command" for name in model.actuators), *FLOOR],
-                     [*(f"{a}_dot" for a in names), *model.sensors.names]
-                     ).renamed({f"{name}_command": name for name in model.actuators})
+    system = connect(
+        parts,
+        [*(f"{name}_command" for name in model.actuators), *FLOOR],
+        [*(f"{a}_dot" for a in names), *model.sensors.names],
+    ).renamed({f"{name}_command": name for name in model.actuators})
     if model.nonlinear:
         same = realise(model.linear, pade_order, when)
         error, folded = same.error, same.aliases
@@ -293,20 +326,25 @@ def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
     model, n_y = table.model, table.n_y
     nominal, chain = table.rows(table.matrices.R), model.sensors.chain
     if chain is None and np.any(_tilt_rows(table)):
-        raise InputError("expected sensors with a high-pass: ideal ones would integrate gravity twice",
-                         field="tilt_coupling", value=GRAVITY)
+        raise InputError(
+            "expected sensors with a high-pass: ideal ones would integrate gravity twice",
+            field="tilt_coupling",
+            value=GRAVITY,
+        )
     S, tilt = np.diag(model.sensors.sensitivity), gain([[0.0]])
     if chain is None:
         chain = gain([[1.0]])
     else:
         # Without the zeros at the origin: from the rate of acceleration to the output of the chain.
-        tilt = cascade([], list(np.roots(model.sensors.transient_poles[::-1])),
-                       float(np.prod(np.abs(model.sensors.low_pass))))
+        tilt = cascade(
+            [], list(np.roots(model.sensors.transient_poles[::-1])), float(np.prod(np.abs(model.sensors.low_pass)))
+        )
     motion = append(*[chain] * n_y).scaled(S, np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
     felt = append(*[tilt] * n_y).scaled(S, np.hstack([np.zeros((n_y, len(names) + n_y)), np.eye(n_y)]))
     sensors = model.sensors.names
-    return (motion + felt).renamed([*(f"{a}_dot" for a in names), *(f"deviation_{k}" for k in sensors),
-                                    *(f"tilt_{k}" for k in sensors)], sensors)
+    return (motion + felt).renamed(
+        [*(f"{a}_dot" for a in names), *(f"deviation_{k}" for k in sensors), *(f"tilt_{k}" for k in sensors)], sensors
+    )
 
 
 def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:
@@ -314,7 +352,7 @@ def _without_aliases(model: TableModel, omega: np.ndarray) -> np.ndarray:
     if not model.period_s:
         return model.response(omega)
     G = replace(model, base=replace(model.base, period_s=0.0)).response(omega)
-    G[:, :, :len(model.actuators)] *= hold(omega, model.period_s)[:, None, None]
+    G[:, :, : len(model.actuators)] *= hold(omega, model.period_s)[:, None, None]
     return G
 
 

@@ -93,16 +93,16 @@ class RecordMotion:
     @cached_property
     def largest_volts(self) -> float:
         """Largest r.m.s. voltage of a drive [V]."""
-        return float(np.sqrt(np.mean(self.volts ** 2, axis=0)).max())
+        return float(np.sqrt(np.mean(self.volts**2, axis=0)).max())
 
     @cached_property
     def rms_deflections(self) -> np.ndarray:
         """(n_g,) r.m.s. over the record [m]."""
-        return np.sqrt(np.mean(self.deflection ** 2, axis=0))
+        return np.sqrt(np.mean(self.deflection**2, axis=0))
 
     def spectrum(self, samples: np.ndarray, omega: np.ndarray) -> np.ndarray:
         """(n, channels) spectrum of (samples, channels) on the block's lines, scaled like a `SpectralBlock`."""
-        own = samples[self.before:]
+        own = samples[self.before :]
         if not len(own):
             return np.zeros((len(omega), samples.shape[1]), complex)
         lines = np.rint(omega * len(own) / (2 * np.pi * self.sample_rate_Hz)).astype(int)
@@ -113,8 +113,9 @@ class RecordMotion:
         where = (key, len(omega), float(omega[0]), float(omega[-1]), float(np.sum(omega)))
         return self._spectra.of(where, lambda: self.spectrum(samples(), omega))
 
-    def interpolated(self, key: str, value: float, omega: np.ndarray, samples: Callable[[float], np.ndarray]
-                     ) -> np.ndarray:
+    def interpolated(
+        self, key: str, value: float, omega: np.ndarray, samples: Callable[[float], np.ndarray]
+    ) -> np.ndarray:
         """`spectrum` of samples(value), value > 0, by cubic interpolation over log(value) between cached spectra.
 
         A fit needs many closely spaced values, and differences between them.
@@ -123,6 +124,7 @@ class RecordMotion:
         nodes = np.floor(at) + np.arange(-1, 3)
 
         def at_node(node: float) -> np.ndarray:
-            return self.kept(f"{key} {node:g}", omega, lambda: samples(SETTINGS.node_ratio ** node))
+            return self.kept(f"{key} {node:g}", omega, lambda: samples(SETTINGS.node_ratio**node))
+
         weights = [np.prod([(at - other) / (node - other) for other in nodes if other != node]) for node in nodes]
         return np.asarray(sum(weight * at_node(node) for weight, node in zip(weights, nodes, strict=True)))

@@ -90,15 +90,19 @@ def _banded(e: PredictionError, edges: np.ndarray) -> tuple[np.ndarray, np.ndarr
     inside = (np.digitize(e.block.omega / (2 * np.pi), edges) - 1)[:, None] == np.arange(len(edges) - 1)
     along = np.abs(np.einsum("nb,nk,ni->bki", inside, white, np.conj(U), optimize=True)) ** 2
     strength = (inside.T @ np.abs(U) ** 2)[:, None]
-    return (inside.T @ np.abs(white) ** 2, np.sum(inside, axis=0)[:, None],
-            np.divide(along, strength, out=np.zeros(along.shape), where=strength > 0))
+    return (
+        inside.T @ np.abs(white) ** 2,
+        np.sum(inside, axis=0)[:, None],
+        np.divide(along, strength, out=np.zeros(along.shape), where=strength > 0),
+    )
 
 
 def places(residual: ModelResidual) -> tuple[Where, ...]:
     """Bands and outputs where the residual exceeds the noise significantly, each with the most coherent input."""
     edges = edges_of(residual.errors)
-    power, lines, found = (np.sum(parts, axis=0) for parts in zip(*(_banded(e, edges) for e in residual.errors),
-                                                                  strict=True))
+    power, lines, found = (
+        np.sum(parts, axis=0) for parts in zip(*(_banded(e, edges) for e in residual.errors), strict=True)
+    )
     dof = min(e.block.dof for e in residual.errors)
     excess, count = np.maximum(power - lines, 0.0), max(np.count_nonzero(lines) * power.shape[1], 1)
     made = []
@@ -108,14 +112,18 @@ def places(residual: ModelResidual) -> tuple[Where, ...]:
         # lines.
         known = min(dof * max(n / 60, 1), max(dof, 2 * n))
         for k, output in enumerate(residual.outputs if n else ()):
-            p = count * float(stats.f.sf(power[b, k] / n, 2 * n, 2 * known) if np.isfinite(dof)
-                              else stats.chi2.sf(2 * power[b, k], 2 * n))
+            p = count * float(
+                stats.f.sf(power[b, k] / n, 2 * n, 2 * known)
+                if np.isfinite(dof)
+                else stats.chi2.sf(2 * power[b, k], 2 * n)
+            )
             if p < SETTINGS.place_alarm:
                 best = int(np.argmax(found[b, k]))
                 source = residual.inputs[best] if found[b, k, best] > 0.1 * power[b, k] else ""
-                made.append(Where(low, high, source, output, float(excess[b, k] / excess.sum()),
-                                  float(power[b, k] / n), p))
-    return tuple(sorted(made, key=lambda w: -w.share)[:SETTINGS.most_places])
+                made.append(
+                    Where(low, high, source, output, float(excess[b, k] / excess.sum()), float(power[b, k] / n), p)
+                )
+    return tuple(sorted(made, key=lambda w: -w.share)[: SETTINGS.most_places])
 
 
 def heat_map(before: ModelResidual, after: ModelResidual) -> HeatMap:
@@ -126,12 +134,14 @@ def heat_map(before: ModelResidual, after: ModelResidual) -> HeatMap:
         banded = [_banded(e, edges) for e in residual.errors]
         with np.errstate(invalid="ignore"):  # a band without lines has no ratio
             return np.hstack([power / lines for power, lines, _ in banded])
+
     columns = tuple(f"{e.block.name}: {output}" for e in before.errors for output in before.outputs)
     return HeatMap(edges, columns, ratios(before), ratios(after))
 
 
-def every_record(prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
-           ) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
+def every_record(
+    prepared: Prepared, before: TableModel, after: TableModel, sensors_rms: Mapping[str, float] | None
+) -> tuple[tuple[RecordGap, ...], tuple[PowerShares, ...]]:
     """Residual of the models in each record, including fitted ones, and decomposition of the outputs' power; on
     `shown_lines` of each record."""
     held = {block.name for block in prepared.held_out}
@@ -142,8 +152,18 @@ def every_record(prepared: Prepared, before: TableModel, after: TableModel, sens
 
     def ratio(e: PredictionError) -> float:
         return float(np.sqrt(e.chi2 / e.dof))
-    records = [RecordGap(name, headers[name].level_V, headers[name].start_s, name in held, ratio(a), ratio(b),
-                         f"{headers[name].excitation}, {b.block.kind}")
-               for name, a, b in ((a.block.name, a, b) for a, b in zip(first, last, strict=True))]
+
+    records = [
+        RecordGap(
+            name,
+            headers[name].level_V,
+            headers[name].start_s,
+            name in held,
+            ratio(a),
+            ratio(b),
+            f"{headers[name].excitation}, {b.block.kind}",
+        )
+        for name, a, b in ((a.block.name, a, b) for a, b in zip(first, last, strict=True))
+    ]
     shares = power_shares(last, headers, after, all_silent(prepared.halves.fitted, blocks), sensors_rms)
     return tuple(sorted(records, key=lambda one: one.name)), shares

@@ -48,11 +48,14 @@ class NamedEffect:
 
     def to_json(self) -> dict[str, Any]:
         """As defined in the contract."""
-        return {"name": self.name, "location": self.location,
-                "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit}
-                               for key, p in self.parameters.items()},
-                "probability": self.probability, "indistinguishable_from": list(self.indistinguishable_from),
-                **({} if self.share is None else {"share": self.share})}
+        return {
+            "name": self.name,
+            "location": self.location,
+            "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit} for key, p in self.parameters.items()},
+            "probability": self.probability,
+            "indistinguishable_from": list(self.indistinguishable_from),
+            **({} if self.share is None else {"share": self.share}),
+        }
 
     def in_words(self) -> str:
         """Title with place, probability, and the first parameters that differ from zero by two standard deviations;
@@ -60,8 +63,11 @@ class NamedEffect:
         own = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")]
         certain = [(name, p) for name, p in own if not (p.std or 0.0) > abs(p.value) / 2]
         sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in (certain or own)[:3])
-        ties = (f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"
-                if self.indistinguishable_from else "")
+        ties = (
+            f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"
+            if self.indistinguishable_from
+            else ""
+        )
         return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
 
 
@@ -88,8 +94,8 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the search, on held-out data: r.m.s. residual over r.m.s. y, and chi-square over degrees of freedom.
-    """
+    """A stage of the search, on held-out data: r.m.s. residual over r.m.s. y, and chi-square over degrees of
+    freedom."""
 
     name: str
     nrmse: float
@@ -246,14 +252,22 @@ class Gap:
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""
         return {
-            "format": "avis-gap", "version": 1, "verdict": self.verdict,
+            "format": "avis-gap",
+            "version": 1,
+            "verdict": self.verdict,
             "effects": [one.to_json() for one in self.effects],
             "traces": [one.to_json() for one in self.traces],
             "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
             "where": _places(self.remaining if self.verdict != "none" else ()),
-            "remaining": None if self.left is None else {
-                "nrmse": self.left.nrmse, "over_noise": self.left.over_noise, "share": self.left.share,
-                "where": _places(self.remaining), "grows_with_level": self.left.grows_with_level},
+            "remaining": None
+            if self.left is None
+            else {
+                "nrmse": self.left.nrmse,
+                "over_noise": self.left.over_noise,
+                "share": self.left.share,
+                "where": _places(self.remaining),
+                "grows_with_level": self.left.grows_with_level,
+            },
             "tolerances": [one.to_json() for one in self.tolerances],
             "next_experiment": self.next_experiment,
             "seconds": self.seconds,
@@ -261,5 +275,7 @@ class Gap:
 
 
 def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
-    return [{"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output, "share": one.share}
-            for one in places]
+    return [
+        {"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output, "share": one.share}
+        for one in places
+    ]

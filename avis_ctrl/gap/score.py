@@ -162,8 +162,9 @@ class Score:
         self.kept: dict[Hashable, Any] = {}
         self.parts = [Part(model, block) for block in blocks]
         self.e = np.concatenate([part.real((part.block.Y - part.response.Y)[None])[0] for part in self.parts])
-        J = np.concatenate([part.real(model.answer(part.block, part.body, inner=part.inner).dY)
-                            for part in self.parts], axis=1)
+        J = np.concatenate(
+            [part.real(model.answer(part.block, part.body, inner=part.inner).dY) for part in self.parts], axis=1
+        )
         J = J * model.scales()[:, None]
         size = np.linalg.norm(J, axis=1)
         _, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
@@ -193,8 +194,9 @@ class Score:
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
             added = self.model.with_effect(effect)
-            return self.directions([(added.answer(part.block, part.body, False).Y - part.response.Y)[None]
-                                    for part in self.parts])
+            return self.directions(
+                [(added.answer(part.block, part.body, False).Y - part.response.Y)[None] for part in self.parts]
+            )
         models = []
         for j in linear:
             values = list(effect.values)
@@ -228,8 +230,10 @@ class EvidenceScore(Score):
         rig = tuple(name for name in full.base.names if name in default_parameters(full.rig))
         nominal = full.nominal and replace(full.nominal, names=rig)
         self.model, self.kept = replace(full, base=replace(full.base, names=rig), nominal=nominal), {}
-        blocks = [with_distortion(block, level, fitted.variances, settings)
-                  for block, level in zip(data.blocks, data.levels, strict=True)]
+        blocks = [
+            with_distortion(block, level, fitted.variances, settings)
+            for block, level in zip(data.blocks, data.levels, strict=True)
+        ]
         self.parts = [Part(self.model, block) for block in blocks]
         self.profile = Profile(fitted, data, settings)
         self.basis, self.e = self.profile.basis, self.profile.e
@@ -242,5 +246,6 @@ class EvidenceScore(Score):
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N + n) as those of `Score`, with the rows of the priors."""
-        return self.profile.free(np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)],
-                                                axis=1))
+        return self.profile.free(
+            np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        )

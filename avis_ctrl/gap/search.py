@@ -46,8 +46,9 @@ class Candidate:
     others: tuple[ActiveEffect, ...] = ()
 
 
-def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings,
-               each: Mapper = sequential_map) -> list[Candidate]:
+def candidates(
+    fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper = sequential_map
+) -> list[Candidate]:
     """Every effect at every place with its best seed, the largest reduction first.
 
     Effects that add a resonance with many parameters take long to initialise. They are searched only if a resonance
@@ -64,10 +65,13 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], settings: 
         for place in effect.places(model):
             if (effect.name, place.partition("/")[0]) not in taken:
                 best = seeds(effect, score, place)
-                starts = [active(effect, model, place, values)
-                          for values in dict.fromkeys(one.values for one in best[:settings.starts])]
+                starts = [
+                    active(effect, model, place, values)
+                    for values in dict.fromkeys(one.values for one in best[: settings.starts])
+                ]
                 found += [Candidate(starts[0], best[0].chi2, best[0].p_value, tuple(starts[1:]))] if best else []
         return found
+
     resonant = [one for one in effects if one.resonant]
     found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]
     most = max((one.reduction for one in found), default=0.0)
@@ -82,7 +86,7 @@ def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candida
     for one in found:
         if one.p_value * len(found) < math.exp(-settings.certain):
             chosen.setdefault(one.effect.effect.name, one)
-    return list(chosen.values())[:settings.refits]
+    return list(chosen.values())[: settings.refits]
 
 
 def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -> list[Candidate]:
@@ -100,8 +104,10 @@ def extensions(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> lis
         if isinstance(law, HasExtendedModels):
             whole = without_path_errors(one, data, settings)
             last = whole.model.effects[-1]
-            found += [Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
-                      for place, values in law.extended_models(EvidenceScore(whole, data, settings), last)]
+            found += [
+                Candidate(active(last.effect, one.model, place, values), 0.0, 0.0)
+                for place, values in law.extended_models(EvidenceScore(whole, data, settings), last)
+            ]
     return found
 
 
@@ -143,17 +149,25 @@ def _with_known(priors: Priors, known: Mapping[str, tuple[float, float]]) -> Pri
     return replace(priors, mean=mean, sigma=sigma)
 
 
-def _try(fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
-         ) -> Fitted | None:
+def _try(
+    fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
+) -> Fitted | None:
     try:
         return fit(model, priors, z, data, fitted.variances, settings)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):
         return None
 
 
-def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
-           progress: Progress = lambda text: None, each: Mapper = sequential_map,
-           enough: Callable[[Step], bool] = lambda step: False, starts: Sequence[ActiveEffect] = ()) -> list[Step]:
+def search(
+    base: Fitted,
+    data: Data,
+    effects: Sequence[Effect],
+    settings: GapSettings = SETTINGS,
+    progress: Progress = lambda text: None,
+    each: Mapper = sequential_map,
+    enough: Callable[[Step], bool] = lambda step: False,
+    starts: Sequence[ActiveEffect] = (),
+) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
     they show in how far one of them had to move, hardly in the residual.
 
@@ -176,6 +190,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
             progress(f"  best model: {', '.join(step.fitted.labels)}")
             if enough(step):
                 return
+
     more(effects, enough)
     for _ in range(settings.revisions):
         progress("comparison of each effect with its rivals, given the effects found later")
@@ -187,8 +202,14 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], settings: GapSet
     return steps
 
 
-def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings = SETTINGS,
-             progress: Progress = lambda text: None, each: Mapper = sequential_map) -> tuple[list[Step], Fitted]:
+def outliers(
+    now: Fitted,
+    data: Data,
+    effects: Sequence[Effect],
+    settings: GapSettings = SETTINGS,
+    progress: Progress = lambda text: None,
+    each: Mapper = sequential_map,
+) -> tuple[list[Step], Fitted]:
     """Values of the rig file beyond their tolerance that stand out because the other values moved by much less than
     their tolerances; and the last fit, with the tolerances as stated.
 
@@ -200,8 +221,10 @@ def outliers(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSe
     progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
     narrow, beyond = _with_spread(now, rows, size, data, settings), [one for one in effects if one.name in BEYOND]
-    while len(narrow.labels) < settings.longest and (
-            step := next_effect(narrow, data, beyond, settings, each)) is not None:
+    while (
+        len(narrow.labels) < settings.longest
+        and (step := next_effect(narrow, data, beyond, settings, each)) is not None
+    ):
         steps.append(step)
         narrow = step.fitted
     return steps, _with_spread(narrow, rows, 1 / size, data, settings) if steps else now
@@ -229,14 +252,15 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
         one = again.tried[label]
         full = fit(one.model, one.priors, one.z, data, one.variances, settings)
         steps[k] = replace(again, fitted=full.bare(), label=label)
-        steps[k + 1:], best = backward_elimination(steps[k + 1:], full, data, settings)
+        steps[k + 1 :], best = backward_elimination(steps[k + 1 :], full, data, settings)
         steps[-1] = replace(steps[-1], fitted=best)
         return True
     return False
 
 
-def backward_elimination(steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
-                     ) -> tuple[list[Step], Fitted]:
+def backward_elimination(
+    steps: Sequence[Step], best: Fitted, data: Data, settings: GapSettings
+) -> tuple[list[Step], Fitted]:
     """Remove, one by one, effects whose removal lowers the evidence by less than a name requires. Returns the remaining
     steps and the fit."""
     kept = []
@@ -280,8 +304,14 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
-def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper,
-                starts: Sequence[ActiveEffect] = ()) -> Step | None:
+def next_effect(
+    now: Fitted,
+    data: Data,
+    effects: Sequence[Effect],
+    settings: GapSettings,
+    each: Mapper,
+    starts: Sequence[ActiveEffect] = (),
+) -> Step | None:
     """The effect with the largest evidence; None if no effect improves the current model enough.
 
     starts : effects with values at which fits start in addition to those of the score test.
@@ -299,8 +329,12 @@ def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], settings: Ga
         more, before = _tried(begun, further, data, settings, each), tried
         tried = _likelier([*before.values(), *more.values()])
         best = _likeliest(tried)
-        better = {label: one for label, one in more.items() if label not in before or (
-            label == best and one.log_evidence - before[label].log_evidence > settings.certain)}
+        better = {
+            label: one
+            for label, one in more.items()
+            if label not in before
+            or (label == best and one.log_evidence - before[label].log_evidence > settings.certain)
+        }
     start = tried[best]
     if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
         return None
@@ -317,8 +351,9 @@ class _Begun:
     reduction: float
 
 
-def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Mapper
-           ) -> dict[str, Fitted]:
+def _tried(
+    now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Mapper
+) -> dict[str, Fitted]:
     """Fits of candidates by label. First the parameters of each effect alone are fitted, the others following to first
     order; then, for candidates that are not far behind, all parameters."""
     if not chosen:
@@ -349,22 +384,32 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSe
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
     # shows what an effect can achieve.
-    near += [one.effect for one, end in made if at_full_strength(one.effect)
-             or (one.reduction >= 2 * settings.not_far_behind * most
-                 and (end is None or end.reduction < settings.least_promised * one.reduction))]
+    near += [
+        one.effect
+        for one, end in made
+        if at_full_strength(one.effect)
+        or (
+            one.reduction >= 2 * settings.not_far_behind * most
+            and (end is None or end.reduction < settings.least_promised * one.reduction)
+        )
+    ]
     return _likelier(_joint_fits(now, near, data, settings, each))
 
 
-def _joint_fits(now: Fitted, effects: Sequence[ActiveEffect], data: Data, settings: GapSettings, each: Mapper
-                ) -> list[Fitted]:
+def _joint_fits(
+    now: Fitted, effects: Sequence[ActiveEffect], data: Data, settings: GapSettings, each: Mapper
+) -> list[Fitted]:
     """Fits of all parameters with one more effect each. Excluded are fits that fail, that end at values which physics
     forbids, or that end within a tolerance."""
+
     def ended(one: ActiveEffect) -> Fitted | None:
         return _small(with_effect(now, one, data, settings.quick))
+
     found = [_whole(one, now) for one in each(ended, effects) if one is not None]
     stated = tolerances_of(now.model.rig)
-    return [one for one in found if not implausible(one)
-            and not within_tolerance(one.model.effects[-1], stated, settings)]
+    return [
+        one for one in found if not implausible(one) and not within_tolerance(one.model.effects[-1], stated, settings)
+    ]
 
 
 def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:
@@ -416,8 +461,12 @@ def at_the_edge(effect: ActiveEffect) -> str:
     empty if there is none."""
     for parameter, value in zip(effect.parameters, effect.values, strict=True):
         span = parameter.high - parameter.low
-        if not parameter.linear and not parameter.optional and (value > parameter.high - 1e-6 * span
-                                                                or value < parameter.low + 1e-6 * span):
-            return (f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its "
-                    "range")
+        if (
+            not parameter.linear
+            and not parameter.optional
+            and (value > parameter.high - 1e-6 * span or value < parameter.low + 1e-6 * span)
+        ):
+            return (
+                f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its range"
+            )
     return ""

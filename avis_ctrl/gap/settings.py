@@ -126,8 +126,7 @@ class GapSettings(FitSettings):
     @property
     def quick(self) -> GapSettings:
         """Settings of a fit that only compares candidates, or only gives a figure."""
-        return replace(self, rounds=self.quick_rounds, iterations=self.quick_iterations,
-                       converged=self.quick_converged)
+        return replace(self, rounds=self.quick_rounds, iterations=self.quick_iterations, converged=self.quick_converged)
 
 
 SETTINGS = GapSettings()

@@ -36,8 +36,7 @@ class SignalFaults:
     @property
     def resolution_V(self) -> dict[str, float]:
         """Steps of the channels whose converter is coarser than stated, by name [V]."""
-        return {one.channel: one.parameters["resolution_V"].value for one in self.converter
-                if one.kind == "resolution"}
+        return {one.channel: one.parameters["resolution_V"].value for one in self.converter if one.kind == "resolution"}
 
     @property
     def raised(self) -> tuple[str, ...]:
@@ -59,8 +58,10 @@ def predicted(campaign: Campaign, model: TableModel, each: Mapper = sequential_m
 
     def read(record: RecordSource) -> np.ndarray:
         h = record.header
-        return simulate(model, *model_inputs(model.base, record.load()), h.sample_rate_Hz, start_s=h.start_s,
-                        campaign_s=clock).y
+        return simulate(
+            model, *model_inputs(model.base, record.load()), h.sample_rate_Hz, start_s=h.start_s, campaign_s=clock
+        ).y
+
     return dict(zip((record.header.name for record in campaign.records), each(read, campaign.records), strict=True))
 
 
@@ -69,8 +70,12 @@ def time_residuals(campaign: Campaign, model: TableModel, each: Mapper = sequent
     return record_residuals(campaign, predicted(campaign, model, each))
 
 
-def levels(residual: tuple[RecordResidual, ...], model: TableModel, hum: HumFinding | None,
-           converter: tuple[ConverterFinding, ...]) -> NoiseLevels | None:
+def levels(
+    residual: tuple[RecordResidual, ...],
+    model: TableModel,
+    hum: HumFinding | None,
+    converter: tuple[ConverterFinding, ...],
+) -> NoiseLevels | None:
     """Noise of floor and sensors; None if the records or the rig file do not allow an estimate."""
     n_u, steps = len(model.actuators), SignalFaults(converter).resolution_V
     try:
@@ -93,14 +98,37 @@ def without_hum(campaign: Campaign, hum: HumFinding, residual: tuple[RecordResid
 def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects found in the signals, with the names of the contract."""
     rows: list[tuple[str, str, str, ConverterFinding | HumFinding | FloorLevel]] = [
-        ("sensor_quantisation", one.channel, f"the converter of {one.channel} is coarser than the rig file says"
-         if one.kind == "resolution" else f"the converter of {one.channel} clips below its nominal range", one)
-        for one in faults.converter]
+        (
+            "sensor_quantisation",
+            one.channel,
+            f"the converter of {one.channel} is coarser than the rig file says"
+            if one.kind == "resolution"
+            else f"the converter of {one.channel} clips below its nominal range",
+            one,
+        )
+        for one in faults.converter
+    ]
     if faults.hum is not None:
-        rows.append(("mains_hum", "geophones", f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics in "
-                     f"{', '.join(faults.hum.channels)}", faults.hum))
+        rows.append(
+            (
+                "mains_hum",
+                "geophones",
+                f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics in {', '.join(faults.hum.channels)}",
+                faults.hum,
+            )
+        )
     if faults.noise is not None and faults.noise.ground_motion is not None:
-        rows.append(("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured",
-                     faults.noise.ground_motion))
-    return [NamedEffect(name, place, title, one.parameters, min(one.confidence, settings.most_sure),
-                        confirmation=one.sentence) for name, place, title, one in rows]
+        rows.append(
+            (
+                "ground_motion",
+                "floor",
+                "the floor moves more than the rig file says, unmeasured",
+                faults.noise.ground_motion,
+            )
+        )
+    return [
+        NamedEffect(
+            name, place, title, one.parameters, min(one.confidence, settings.most_sure), confirmation=one.sentence
+        )
+        for name, place, title, one in rows
+    ]

@@ -52,8 +52,15 @@ class Simulated:
     defect: float = 0.0
 
 
-def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_rate_Hz: float, *,
-             start_s: float = 0.0, campaign_s: tuple[float, float] = (0.0, 1.0)) -> Simulated:
+def simulate(
+    model: TableModel,
+    u: np.ndarray,
+    floor: np.ndarray | None,
+    sample_rate_Hz: float,
+    *,
+    start_s: float = 0.0,
+    campaign_s: tuple[float, float] = (0.0, 1.0),
+) -> Simulated:
     """The sensor signals before the converter: without rounding or clipping.
 
     Parameters
@@ -86,8 +93,9 @@ def simulate(model: TableModel, u: np.ndarray, floor: np.ndarray | None, sample_
 def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     u = np.asarray(u, float)
     if u.ndim != 2 or u.shape[1] != len(model.actuators) or len(u) < 2:
-        raise InputError(f"expected (samples, {len(model.actuators)}) volts, two samples at least", field="u",
-                         value=u.shape)
+        raise InputError(
+            f"expected (samples, {len(model.actuators)}) volts, two samples at least", field="u", value=u.shape
+        )
     if floor is not None:
         floor = np.asarray(floor, float)
         if floor.shape != (len(u), 3):
@@ -99,8 +107,13 @@ def _checked(model: TableModel, u: np.ndarray, floor: np.ndarray | None) -> tupl
     return np.clip(u, -limit, limit), floor
 
 
-def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, floor: np.ndarray | None,
-                 effects: Sequence[ActiveEffect]) -> Simulated:
+def _with_forces(
+    model: TableModel,
+    lines: LineResponse,
+    record: RecordMotion,
+    floor: np.ndarray | None,
+    effects: Sequence[ActiveEffect],
+) -> Simulated:
     """Step through time, then apply the forces to the whole record. Two residuals enter the next pass: non-causal parts
     of the response (as of a constant loss factor), and the second-order terms of large rotations, which are weak."""
     marching = [one for one in effects if not isinstance(one.effect, LargeMotion)]
@@ -126,16 +139,18 @@ def _with_forces(model: TableModel, lines: LineResponse, record: RecordMotion, f
             more = np.asarray(weak.effect.force(known, weak.place, weak.by_name))
             reading = weak.effect.reading(known, weak.place, weak.by_name)
             missing, slow = lines.in_time(by_force.whole(more - slow)), more
-        size = float(np.sqrt(np.mean(record.deflection ** 2))) or 1.0
+        size = float(np.sqrt(np.mean(record.deflection**2))) or 1.0
         defect = float(np.sqrt(np.mean(((residual + missing) @ by_force.shape.T) ** 2))) / size
         if defect <= SETTINGS.defect:
-            moved = by_force.whole(push + slow)[:, :by_force.n_x]
+            moved = by_force.whole(push + slow)[:, : by_force.n_x]
             return Simulated(*lines.record_response(record.volts, floor, moved, reading), defect)
         if not np.isfinite(defect):
             break
         correction = correction + residual
-    raise ComputationError("the forces of " + ", ".join(one.label for one in effects) + " do not converge",
-                           measured=f"residual of the equation of motion {defect:.2g} of the deflection after "
-                                    f"at most {SETTINGS.most_passes} passes, deflection {size:.3g} m r.m.s.",
-                           cause="rotations that are not small, or a force that depends on what comes later",
-                           next_step="a lower level, or leave the effect out of the simulation")
+    raise ComputationError(
+        "the forces of " + ", ".join(one.label for one in effects) + " do not converge",
+        measured=f"residual of the equation of motion {defect:.2g} of the deflection after "
+        f"at most {SETTINGS.most_passes} passes, deflection {size:.3g} m r.m.s.",
+        cause="rotations that are not small, or a force that depends on what comes later",
+        next_step="a lower level, or leave the effect out of the simulation",
+    )

@@ -100,7 +100,7 @@ def impedance(table: ReducedTable, K: np.ndarray, h: StateSpace, of: str = "r") 
     V, sizes = V[:, felt], sizes[felt]
     read, push = np.zeros((len(sizes), table.shape[1])), np.zeros((table.shape[0], len(sizes)))
     read[:, getattr(table, of)] = V.T
-    push[:table.n] = -V * sizes
+    push[: table.n] = -V * sizes
     if not len(sizes):
         return gain(np.zeros(table.shape))
     return append(*[h] * len(sizes)).scaled(push, read)
@@ -109,9 +109,9 @@ def impedance(table: ReducedTable, K: np.ndarray, h: StateSpace, of: str = "r") 
 def _static(table: ReducedTable, K: np.ndarray, C: np.ndarray | None = None) -> StateSpace:
     """Force -K r - C (v - v_c)."""
     D = np.zeros(table.shape)
-    D[:table.n, table.r] = -K
+    D[: table.n, table.r] = -K
     if C is not None:
-        D[:table.n, table.v], D[:table.n, table.v_c] = -C, C
+        D[: table.n, table.v], D[: table.n, table.v_c] = -C, C
     return gain(D)
 
 
@@ -127,8 +127,12 @@ def _structural(table: ReducedTable, place: str, values: Values) -> StateSpace:
     G, k = table.G, table.mounts.stiffness
     rest, corners, ratios = ladder(2 / np.pi * np.arctan(values["loss_factor"]))
     # rest - 1 + sum of ratio s/(s + w) = rest - 1 + sum(ratio) - sum of ratio w/(s + w)
-    h = StateSpace(-np.diag(corners), np.sqrt(corners)[:, None], -(ratios * np.sqrt(corners))[None],
-                   np.array([[rest - 1 + ratios.sum()]]))
+    h = StateSpace(
+        -np.diag(corners),
+        np.sqrt(corners)[:, None],
+        -(ratios * np.sqrt(corners))[None],
+        np.array([[rest - 1 + ratios.sum()]]),
+    )
     return impedance(table, G.T @ (k[:, None] * G), h)
 
 
@@ -165,23 +169,23 @@ def _surge(table: ReducedTable, place: str, values: Values) -> StateSpace:
     a, b = 1 / share, 1 / (1 - share)
     total = gain(np.zeros(table.shape))
     for g, k, w in zip(G, stiffness, omega, strict=True):
-        m, c = (a + b) * k / w ** 2, 2 * zeta * k / w
-        A = np.array([[0.0, 1.0], [-w ** 2, -2 * zeta * w]])
+        m, c = (a + b) * k / w**2, 2 * zeta * k / w
+        A = np.array([[0.0, 1.0], [-(w**2), -2 * zeta * w]])
         B, D = np.zeros((2, table.shape[1])), np.zeros(table.shape)
         B[0, table.v_c] = -g
         B[1, table.r], B[1, table.v] = a * k / m * g, a * c / m * g
         B[1, table.v_c] = b * c / m * g
         C = np.zeros((table.shape[0], 2))
-        C[:table.n] = np.outer(g, [a * k, a * c])
+        C[: table.n] = np.outer(g, [a * k, a * c])
         outer = np.outer(g, g)
-        D[:table.n, table.r], D[:table.n, table.v] = -(a - 1) * k * outer, -a * c * outer
+        D[: table.n, table.r], D[: table.n, table.v] = -(a - 1) * k * outer, -a * c * outer
         total = total + StateSpace(A, B, C, D)
     return total
 
 
 def _leveling(table: ReducedTable, place: str, values: Values) -> StateSpace:
     """Payload relative to chassis, as measured by the valves."""
-    own = np.flatnonzero(table.mounts.along("z"))[:LIBRARY.leveled]
+    own = np.flatnonzero(table.mounts.along("z"))[: LIBRARY.leveled]
     G, k = table.G[own], table.mounts.stiffness[own] * shares(values)
     poles, size = [0.0], 2 * np.pi * values["rate_Hz"]
     if "valve_corner_Hz" in values:
@@ -220,7 +224,7 @@ def _oscillator(table: ReducedTable, place: str, values: Values) -> StateSpace:
     total, zeta = gain(np.zeros(table.shape)), values["damping"]
     for row, mass, frequency in elements(place, values):
         w, g = 2 * np.pi * frequency, table.rows(row)
-        poles = np.roots([1.0, 2 * zeta * w, w ** 2])
+        poles = np.roots([1.0, 2 * zeta * w, w**2])
         h = cascade([0.0, -w / (2 * zeta)], poles, 2 * zeta * w * mass)
         total = total + impedance(table, g.T @ g, h, "v")
     return total
@@ -237,24 +241,36 @@ def _flexible(table: ReducedTable, place: str, values: Values) -> StateSpace:
     at_actuators, at_sensors = shape_rows(table.model.rig, table.model.actuators, table.model.sensors.names)
     G, k, c, n = table.G, table.mounts.stiffness, table.mounts.damping, len(own)
     constants = np.linalg.norm(table.matrices.T[:3], axis=0)
-    A = np.block([[np.zeros((n, n)), np.eye(n)],
-                  [-np.diag(w ** 2) - (shape * k) @ shape.T, -np.diag(2 * zeta * w) - (shape * c) @ shape.T]])
+    A = np.block(
+        [
+            [np.zeros((n, n)), np.eye(n)],
+            [-np.diag(w**2) - (shape * k) @ shape.T, -np.diag(2 * zeta * w) - (shape * c) @ shape.T],
+        ]
+    )
     B, C = np.zeros((2 * n, table.shape[1])), np.zeros((table.shape[0], 2 * n))
     B[n:, table.r], B[n:, table.v], B[n:, table.v_c] = -(shape * k) @ G, -(shape * c) @ G, (shape * c) @ G
     B[n:, table.u] = (shape @ at_actuators.T) * constants
-    C[:table.n, :n], C[:table.n, n:] = -G.T @ (shape * k).T, -G.T @ (shape * c).T
-    C[table.n:, n:] = at_sensors @ shape.T
+    C[: table.n, :n], C[: table.n, n:] = -G.T @ (shape * k).T, -G.T @ (shape * c).T
+    C[table.n :, n:] = at_sensors @ shape.T
     return StateSpace(A, B, C, np.zeros(table.shape))
 
 
 _MADE: dict[str, Addition] = {
-    "mount_relaxation": _relaxation, "structural_damping": _structural, "mount_surge": _surge,
-    "leveling_loop": _leveling, "contact_friction": _friction, "stiffness_drift": _drift, "cable_stiffness": _cable,
-    "attached_oscillator": _oscillator, "payload_flexible_mode": _flexible}
+    "mount_relaxation": _relaxation,
+    "structural_damping": _structural,
+    "mount_surge": _surge,
+    "leveling_loop": _leveling,
+    "contact_friction": _friction,
+    "stiffness_drift": _drift,
+    "cable_stiffness": _cable,
+    "attached_oscillator": _oscillator,
+    "payload_flexible_mode": _flexible,
+}
 
 
-def chassis(table: ReducedTable, values: Values, floor: list[str], accelerations: list[str],
-            moves: list[str]) -> StateSpace:
+def chassis(
+    table: ReducedTable, values: Values, floor: list[str], accelerations: list[str], moves: list[str]
+) -> StateSpace:
     """Velocity of a chassis on a soft base, from the velocity of the floor and the acceleration of the payload.
 
     M_c v_c' = -K_b x - C_b (v_c - v_f) - M a,  x' = v_c - v_f, with M the payload's mass matrix, in the kept
@@ -268,8 +284,11 @@ def chassis(table: ReducedTable, values: Values, floor: list[str], accelerations
         raise InputError("expected a chassis with a mass", field="base_compliance.mass_kg", value=values["mass_kg"])
     n = table.n
     mass, damping, stiffness = (table.rows(table.rows(of_q).T) for of_q in of_chassis(values))
-    free = [a for a, name in enumerate(table.keep) if (f"r{name[-1]}_Hz" if name.startswith("phi") else f"{name}_Hz")
-            in values]
+    free = [
+        a
+        for a, name in enumerate(table.keep)
+        if (f"r{name[-1]}_Hz" if name.startswith("phi") else f"{name}_Hz") in values
+    ]
     own = np.ix_(free, free)
     by_mass = np.linalg.inv(mass[own]) if free else np.zeros((0, 0))
     m, follow = len(free), np.eye(n)[free]

@@ -140,8 +140,9 @@ class TableModel:
     @cached_property
     def _free(self) -> list[tuple[int, int]]:
         """(effect, parameter) of each free parameter of the effects."""
-        return [(k, j) for k, one in enumerate(self.effects) if one.label not in self.held
-                for j in range(len(one.names))]
+        return [
+            (k, j) for k, one in enumerate(self.effects) if one.label not in self.held for j in range(len(one.names))
+        ]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,8 +157,11 @@ class TableModel:
     @property
     def priors(self) -> dict[str, tuple[float, float]]:
         """(mean, standard deviation) of free parameters that records need not determine (`Effect.priors`)."""
-        known = {f"{one.label}.{name}": prior for one in self.effects
-                 for name, prior in one.effect.priors(self, one.place, one.by_name).items()}
+        known = {
+            f"{one.label}.{name}": prior
+            for one in self.effects
+            for name, prior in one.effect.priors(self, one.place, one.by_name).items()
+        }
         return {name: prior for name, prior in known.items() if name in self.names}
 
     @property
@@ -198,7 +202,7 @@ class TableModel:
         k, j = self._free[index]
         values = list(self.effects[k].values)
         values[j] = value
-        return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1:]))
+        return replace(self, effects=(*self.effects[:k], self.effects[k].at(values), *self.effects[k + 1 :]))
 
     def with_effect(self, effect: ActiveEffect) -> TableModel:
         """The model with one more effect, which comes last."""
@@ -206,8 +210,13 @@ class TableModel:
 
     def only(self, effect: ActiveEffect) -> TableModel:
         """The model with one more effect; only the parameters of this effect are free."""
-        return replace(self, base=replace(self.base, names=()), nominal=replace(self.nominal or self.base, names=()),
-                       effects=(*self.effects, effect), held=frozenset(one.label for one in self.effects))
+        return replace(
+            self,
+            base=replace(self.base, names=()),
+            nominal=replace(self.nominal or self.base, names=()),
+            effects=(*self.effects, effect),
+            held=frozenset(one.label for one in self.effects),
+        )
 
     def effect(self, label: str) -> ActiveEffect:
         """An effect by label."""
@@ -319,15 +328,26 @@ class TableModel:
         parameters."""
         return self._driven(np.asarray(omega, float), U, None, derivative)
 
-    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
-               inner: np.ndarray | None = None) -> Driven:
+    def answer(
+        self,
+        block: SpectralBlock,
+        body: np.ndarray | None = None,
+        derivative: bool = True,
+        inner: np.ndarray | None = None,
+    ) -> Driven:
         """As `ResponseModel.answer`: response of a record, including effects that depend on its motion in time; inner
         (n_t,): initial values of the states of `inner_transients`."""
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
         return self._driven(block.omega, U, block if self.nonlinear else None, derivative, inner)
 
-    def _driven(self, omega: np.ndarray, U: np.ndarray, block: SpectralBlock | None, derivative: bool,
-                inner: np.ndarray | None = None) -> Driven:
+    def _driven(
+        self,
+        omega: np.ndarray,
+        U: np.ndarray,
+        block: SpectralBlock | None,
+        derivative: bool,
+        inner: np.ndarray | None = None,
+    ) -> Driven:
         made = self.assembled(omega)
         response = TableResponse(made, self.acting(U, block, inner))
         if not derivative:
@@ -342,17 +362,19 @@ class TableModel:
             return Acting(U, inner=inner)
         record = self.motion.get(block.name)
         if record is None:
-            raise InputError("expected the record's motion in time for an effect that depends on it",
-                             field=f"block {block.name}")
+            raise InputError(
+                "expected the record's motion in time for an effect that depends on it", field=f"block {block.name}"
+            )
         added = [_added(one, record, block.omega) for one in self.effects]
         volts, force, reading, output = (_sum(some) for some in zip(*added, strict=True))
         if volts is not None:
             U = U.copy()
-            U[:, :len(self.actuators)] += volts
+            U[:, : len(self.actuators)] += volts
         return Acting(U, force, reading, output, inner)
 
-    def _by_effects(self, omega: np.ndarray, block: SpectralBlock | None, made: Assembled, response: TableResponse,
-                    dY: np.ndarray) -> None:
+    def _by_effects(
+        self, omega: np.ndarray, block: SpectralBlock | None, made: Assembled, response: TableResponse, dY: np.ndarray
+    ) -> None:
         """Central differences with respect to the effects' parameters. For an effect that depends on the record they
         are taken of its contribution, in which the response is linear; for an effect that changes the table, of the
         whole response."""
@@ -362,11 +384,12 @@ class TableModel:
                 assert block is not None
                 record = self.motion[block.name]
                 up, down = (_added(other, record, omega) for other in others)
-                volts, *rest = (None if a is None or b is None else (a - b) / width
-                                for a, b in zip(up, down, strict=True))
+                volts, *rest = (
+                    None if a is None or b is None else (a - b) / width for a, b in zip(up, down, strict=True)
+                )
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
                 if volts is not None:
-                    change[:, :len(self.actuators)] = volts
+                    change[:, : len(self.actuators)] = volts
                 side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
@@ -408,7 +431,7 @@ def _added(one: ActiveEffect, record: RecordMotion, omega: np.ndarray) -> Added:
         return Added()
     found = one.effect.spectra(record, one.place, one.by_name, omega)
     if found.reading is not None:
-        found = found._replace(reading=-found.reading / (omega ** 2)[:, None])
+        found = found._replace(reading=-found.reading / (omega**2)[:, None])
     return Added(*(None if each is None else each[:, :, None] for each in found))
 
 

@@ -37,14 +37,14 @@ class DrivenTable:
         self.s = s = ops.s[:, None, None]
         commanded = U[:, :n_u]
         self.volts = made.volts[:, :, None] * commanded
-        self.w = U[:, n_u:n_u + 3] / s
+        self.w = U[:, n_u : n_u + 3] / s
         self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
         self.sense, self.is_driven = ops.sense[:, :, None], bool(np.any(self.folded))
         total = made.T @ self.volts if self.is_driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
         if np.any(self.w):
             total = total + made.floor_force(self.w)
         if U.shape[1] > n_u + 3:
-            total[:, :N_Q] += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
+            total[:, :N_Q] += U[:, n_u + 3 : n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q :]
         if acting.force is not None:
             total[:, :N_Q] += acting.force
         if acting.inner is not None and acting.inner.size:
@@ -91,23 +91,41 @@ class TableResponse(DrivenTable):
         """(n_p + more, n, n_y, m) derivative with respect to the rig's free parameters, followed by zeros; d :
         derivatives of the matrices, zero for stiffness and damping of mounts."""
         if "loop_delay_s" in model.names:
-            raise InputError("expected the effect loop_delay in the place of this parameter", field="parameters",
-                             value="loop_delay_s")
+            raise InputError(
+                "expected the effect loop_delay in the place of this parameter",
+                field="parameters",
+                value="loop_delay_s",
+            )
         made, ops, s, per_force = self.made, self.made.ops, self.s, self.left
         own = made.G @ self.x
         through = per_force @ made.G.T
         inertial = per_force[:, :, :N_Q]
         if ops.recoil is not None:
             inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
-        operands = Operands(ops.base.sensors, model.matrices, s, per_force[:, :, :N_Q], inertial,
-                            self.gain * self.sense, self.gain * self.alias, made.hold[:, None, None], self.folded,
-                            self.x[:, :N_Q], made.follow(self.w), made.chassis(self.x, self.w), self.Y)
+        operands = Operands(
+            ops.base.sensors,
+            model.matrices,
+            s,
+            per_force[:, :, :N_Q],
+            inertial,
+            self.gain * self.sense,
+            self.gain * self.alias,
+            made.hold[:, None, None],
+            self.folded,
+            self.x[:, :N_Q],
+            made.follow(self.w),
+            made.chassis(self.x, self.w),
+            self.Y,
+        )
         dY = operands.derivative(model.names, d, more)
         moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.acting.inner)
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         for kind in "kc":
-            found = [(j, rows[f"isolator{match[1]}.{match[3]}"]) for j, name in enumerate(model.names)
-                     if (match := MOUNT.fullmatch(name)) and match[2] == kind]
+            found = [
+                (j, rows[f"isolator{match[1]}.{match[3]}"])
+                for j, name in enumerate(model.names)
+                if (match := MOUNT.fullmatch(name)) and match[2] == kind
+            ]
             if not found:
                 continue
             j, k = np.array(found).T

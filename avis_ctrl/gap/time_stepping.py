@@ -58,7 +58,7 @@ class ForceResponse:
         if recoils:
             self.shape = np.hstack([table.G, table.ops.mounts.chassis])
         theta = response.omega / response.sample_rate_Hz
-        alias, by_mass = _folded(theta) / response.sample_rate_Hz ** 2, np.linalg.inv(table.M)
+        alias, by_mass = _folded(theta) / response.sample_rate_Hz**2, np.linalg.inv(table.M)
         hold = np.sinc(theta / (2 * np.pi))[:, None, None] ** 2
         by_force = hold * np.concatenate([_by_force(part, recoils) for part in response.parts])
         by_force[:, :N_Q] += alias[:, None, None] * by_mass
@@ -70,7 +70,7 @@ class ForceResponse:
         self.own = scipy.fft.rfft(impulse[:window], 2 * window, axis=0)
         self.window, self.levels, length = window, [], window
         while length < max(response.samples, 2 * window):
-            self.levels.append(scipy.fft.rfft(impulse[:2 * length], 2 * length, axis=0))
+            self.levels.append(scipy.fft.rfft(impulse[: 2 * length], 2 * length, axis=0))
             length *= 2
 
     def whole(self, force: np.ndarray) -> np.ndarray:
@@ -98,8 +98,8 @@ def _by_force(table: Assembled, recoils: bool) -> np.ndarray:
 def _folded(theta: np.ndarray) -> np.ndarray:
     """(n,) sampled double integrator with a linear hold minus its continuous term, over T^2."""
     safe = np.maximum(theta, 0.1)
-    exact = -(4 + 2 * np.cos(safe)) / (12 * (1 - np.cos(safe))) + np.sinc(safe / (2 * np.pi)) ** 2 / safe ** 2
-    return np.where(theta < 0.1, -theta ** 2 / 720, exact)
+    exact = -(4 + 2 * np.cos(safe)) / (12 * (1 - np.cos(safe))) + np.sinc(safe / (2 * np.pi)) ** 2 / safe**2
+    return np.where(theta < 0.1, -(theta**2) / 720, exact)
 
 
 class WindowForce:
@@ -117,8 +117,12 @@ class WindowForce:
 
     def _of(self, start: int, stop: int) -> np.ndarray:
         r = self.record
-        part = replace(r, start_s=r.start_s + start / r.sample_rate_Hz, volts=r.volts[start:stop],
-                       deflection=r.deflection[start:stop])
+        part = replace(
+            r,
+            start_s=r.start_s + start / r.sample_rate_Hz,
+            volts=r.volts[start:stop],
+            deflection=r.deflection[start:stop],
+        )
         force = self.one.effect.force(part, self.one.place, self.one.by_name)
         return np.zeros((stop - start, N_Q)) if force is None else force
 
@@ -147,8 +151,9 @@ class FrictionForce(WindowForce):
         self.contacts.friction(start, stop, keep=True)
 
 
-def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion,
-          beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def march(
+    by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEffect], record: RecordMotion, beyond: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Solve z = free + h * f(z) from rest: z (samples, c), and the force (samples, 6) that it causes.
 
     Parameters
@@ -168,8 +173,7 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
         """(samples, 6) force of all effects; an effect with memory starts from its state at the start of the window."""
         found = np.zeros((here.stop - here.start, N_Q))
         for force in forces:
-            found += (force(here.start, here.stop) if force.local else
-                      force(start, here.stop)[here.start - start:])
+            found += force(here.start, here.stop) if force.local else force(start, here.stop)[here.start - start :]
         return found
 
     def solved(start: int, stop: int, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -193,13 +197,14 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
             else:
                 return None
         return moved, push
+
     for start in range(0, samples, W):
         stop = min(start + W, samples)
         if start:
             level = (start // W & -(start // W)).bit_length() - 1
             B = W << level
             end = min(start + B, samples)
-            z[start:end] += by_force.after(total[start - B:start], level)[:end - start]
+            z[start:end] += by_force.after(total[start - B : start], level)[: end - start]
         done = next(filter(None, (solved(start, stop, max(W // piece, 1)) for piece in SETTINGS.pieces)), None)
         if done is None:
             raise _without_bound(effects, record, start)
@@ -212,8 +217,9 @@ def march(by_force: ForceResponse, free: np.ndarray, effects: Sequence[ActiveEff
 def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start: int) -> ComputationError:
     peak = float(np.max(np.abs(record.deflection[:start]), initial=0.0))
     values = ", ".join(f"{one.label} {one.by_name}" for one in effects)
-    return ComputationError(f"the table with {values} finds no motion at {start / record.sample_rate_Hz:.3g} s",
-                            measured=f"up to {peak:.3g} m of deflection before; {SETTINGS.most_iterations} iterations "
-                                     "a sample",
-                            cause="an effect that pushes harder the farther the table moves, or that is far stiffer "
-                                  "than a mount", next_step="other values of the effect's parameters, or a lower level")
+    return ComputationError(
+        f"the table with {values} finds no motion at {start / record.sample_rate_Hz:.3g} s",
+        measured=f"up to {peak:.3g} m of deflection before; {SETTINGS.most_iterations} iterations a sample",
+        cause="an effect that pushes harder the farther the table moves, or that is far stiffer than a mount",
+        next_step="other values of the effect's parameters, or a lower level",
+    )

@@ -24,8 +24,11 @@ BEYOND: Mapping[str, tuple[Callable[[Tolerances], tuple[float, ...]], tuple[str,
     "sensor_misalignment": (lambda t: (float(np.degrees(t.direction_rad)),) * 2, ("direction.{place}.",)),
     "com_offset": (lambda t: (t.centre_of_mass_m,) * 3, ("com_",)),
     "product_of_inertia": (lambda t: (t.product_of_inertia_kgm2,), ("{product}",)),
-    "geophone_corner": (lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100),
-                        ("corner.{place}", "damping.{place}"))}
+    "geophone_corner": (
+        lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100),
+        ("corner.{place}", "damping.{place}"),
+    ),
+}
 
 
 def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
@@ -72,8 +75,11 @@ def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:
     """
     own = {k for one in fitted.model.effects for k in tolerances_behind(one, fitted.priors.names)}
     determined = 1 - np.diag(fitted.covariance)
-    rows = [k for k in map(fitted.priors.names.index, with_tolerance(fitted)) if k not in own
-            and determined[k] > settings.determined]
+    rows = [
+        k
+        for k in map(fitted.priors.names.index, with_tolerance(fitted))
+        if k not in own and determined[k] > settings.determined
+    ]
     if not rows:
         return [], 1.0
     size = np.sqrt(np.sum(fitted.z[rows] ** 2) / np.sum(determined[rows]))
@@ -94,8 +100,12 @@ def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings
         none = np.array([p.none for p in effect.parameters])
         away = np.array(effect.values) - none
         # The logarithm of a positive value has the normal prior.
-        z = np.array([none[k] * np.log1p(away[k] / none[k]) if priors.positive[k] else away[k]
-                      for k in range(len(behind))]) / size
+        z = (
+            np.array(
+                [none[k] * np.log1p(away[k] / none[k]) if priors.positive[k] else away[k] for k in range(len(behind))]
+            )
+            / size
+        )
         values, slopes = priors.values(z), priors.slopes(z)
         for k, name in enumerate(behind):
             found[name] = replace(found[name], value=float(values[k]), std=float(std[k] * slopes[k]), moved=float(z[k]))
@@ -118,8 +128,12 @@ def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSetting
         sigma = np.array([settings.second_order_percent, *[settings.turning_percent] * 2]) / 100
         return Priors(effect.names, np.array(effect.values), sigma, np.zeros(3, bool))
     mean = np.array([p.none if p.linear else v for p, v in zip(effect.parameters, effect.values, strict=True)])
-    sigma = np.array([settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
-                      for p, v in zip(effect.parameters, effect.values, strict=True)])
+    sigma = np.array(
+        [
+            settings.effect_sizes * p.size if p.linear else max(settings.shape_spread * abs(v), p.size)
+            for p, v in zip(effect.parameters, effect.values, strict=True)
+        ]
+    )
     if effect.effect.name in BEYOND:
         sigma = settings.beyond_tolerance * tolerance_of(effect, tolerances)
     low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))

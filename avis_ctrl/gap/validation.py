@@ -60,9 +60,13 @@ class Half:
         return float(stats.chi2.sf(self.chi2, self.dof))
 
 
-def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
-           parts: Sequence[tuple[str, np.ndarray]] | None = None, absent: Mapping[str, float] | None = None
-           ) -> list[Half]:
+def halves(
+    fitted: Fitted,
+    names: Sequence[str],
+    settings: GapSettings,
+    parts: Sequence[tuple[str, np.ndarray]] | None = None,
+    absent: Mapping[str, float] | None = None,
+) -> list[Half]:
     """An effect's parameters from halves of the data: lower and upper band, low and high levels.
 
     Each half gives one Gauss-Newton step from the fit to the whole. A parameter that changes with the band or the level
@@ -82,8 +86,9 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
     away = np.abs(values - [absent.get(fitted.priors.names[row], 0.0) for row in rows])
     found = []
     if parts is None:
-        parts = [(words, np.concatenate([fitted.rows[group] for group in groups]))
-                 for words, groups in _parts(fitted, rows)]
+        parts = [
+            (words, np.concatenate([fitted.rows[group] for group in groups])) for words, groups in _parts(fitted, rows)
+        ]
     for words, at in parts:
         J, e = fitted.J[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
@@ -93,9 +98,9 @@ def halves(fitted: Fitted, names: Sequence[str], settings: GapSettings,
         size, V = np.linalg.eigh((half + half.T) / 2)
         known = (size > 1 + settings.least_difference) & (size < settings.most_of_half)
         into, along = root @ V[:, known], (V.T @ step)[known]
-        chi2 = float(np.sum(along ** 2 / (size[known] - 1)))
-        difference, variance = into @ along, into ** 2 @ (size[known] - 1)
-        p = np.minimum(len(rows) * stats.chi2.sf(difference ** 2 / np.maximum(variance, 1e-300), 1), 1.0)
+        chi2 = float(np.sum(along**2 / (size[known] - 1)))
+        difference, variance = into @ along, into**2 @ (size[known] - 1)
+        p = np.minimum(len(rows) * stats.chi2.sf(difference**2 / np.maximum(variance, 1e-300), 1), 1.0)
         change = np.abs(difference * slope) / np.maximum(away, 1e-300)
         largest = float(change.max(initial=0.0, where=p < settings.law_p_value))
         if len(effect):
@@ -116,11 +121,14 @@ def _departure(fitted: Fitted, absent: Mapping[str, float]) -> np.ndarray:
 
 def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
     """Halves of the groups, by band and by level, each with about half of the information on the parameters."""
-    information: dict[Group, float] = {group: float(np.sum(fitted.J[rows][:, at] ** 2))
-                                       for group, at in fitted.rows.items()}
+    information: dict[Group, float] = {
+        group: float(np.sum(fitted.J[rows][:, at] ** 2)) for group, at in fitted.rows.items()
+    }
     found = []
-    for k, words in ((1, ("the lower part of the band", "the upper part of the band")),
-                     (0, ("low levels", "high levels"))):
+    for k, words in (
+        (1, ("the lower part of the band", "the upper part of the band")),
+        (0, ("low levels", "high levels")),
+    ):
         by: dict[float, float] = {}
         for group, value in information.items():
             by[group[k]] = by.get(group[k], 0.0) + value

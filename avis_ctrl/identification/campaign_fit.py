@@ -91,10 +91,12 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
             campaign.named(name)
         rest = tuple(name for name in names if name not in hold_out)
         if not rest or not hold_out:
-            raise InputError(f"expected some of the records {', '.join(names)}, but not all", field="hold out",
-                             value=list(hold_out))
-        return Split(campaign.only(rest), campaign.only(tuple(hold_out)),
-                     f"records {', '.join(hold_out)} held out, as specified")
+            raise InputError(
+                f"expected some of the records {', '.join(names)}, but not all", field="hold out", value=list(hold_out)
+            )
+        return Split(
+            campaign.only(rest), campaign.only(tuple(hold_out)), f"records {', '.join(hold_out)} held out, as specified"
+        )
     active = {record.header.name: power for record in campaign.records if np.any(power := drive_power(record))}
     for name in reversed(active):
         others = [power for other, power in active.items() if other != name]
@@ -103,9 +105,11 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
             rest = tuple(other for other in names if other != name)
             return Split(campaign.only(rest), campaign.only((name,)), f"record {name} held out")
     parts = [divided(record) for record in campaign.records]
-    return Split(replace(campaign, records=tuple(first for first, _ in parts)),
-                 replace(campaign, records=tuple(last for _, last in parts)),
-                 "the last third of every record held out, because too few records excite every input")
+    return Split(
+        replace(campaign, records=tuple(first for first, _ in parts)),
+        replace(campaign, records=tuple(last for _, last in parts)),
+        "the last third of every record held out, because too few records excite every input",
+    )
 
 
 def of_one_level(items: Sequence[Item], kind_and_level: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
@@ -146,10 +150,10 @@ def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
     decides.
     """
     power, V = np.linalg.eigh(one)
-    excited = power > SETTINGS.silent_line ** 2 * power[-1]
+    excited = power > SETTINGS.silent_line**2 * power[-1]
     root = V[:, excited] * np.sqrt(power[excited])
     # A combination that the others do not excite at all gets a large, not an infinite variance.
-    rest = others + SETTINGS.silent_line ** 2 * np.linalg.eigvalsh(others)[-1] * np.eye(len(others))
+    rest = others + SETTINGS.silent_line**2 * np.linalg.eigvalsh(others)[-1] * np.eye(len(others))
     ratio = np.linalg.eigvalsh(root.T @ np.linalg.solve(rest, root))[-1]
     return bool(ratio * SETTINGS.least_excited < 1)
 
@@ -167,8 +171,9 @@ def divided(record: RecordSource) -> tuple[Portion, Portion]:
     """
     h = record.header
     if h.samples < 300:
-        raise InputError("expected at least 300 samples, of which a third is held out", value=h.samples,
-                         field=f"record {h.name}")
+        raise InputError(
+            "expected at least 300 samples, of which a third is held out", value=h.samples, field=f"record {h.name}"
+        )
     at = 2 * h.samples // 3
     if h.period_samples and h.periods >= 2:
         at = max(round(2 * h.periods / 3), 1) * h.period_samples
@@ -201,13 +206,14 @@ def _fewer(block: SpectralBlock, share: float, crowded: bool, rng: np.random.Gen
     power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
     if not crowded or not np.any(power):
         return block
-    driven = np.flatnonzero(power > SETTINGS.silent_line ** 2 * power.max())
+    driven = np.flatnonzero(power > SETTINGS.silent_line**2 * power.max())
     count = max(round(share * len(driven)), min(len(driven), 10))
     return block.lines(np.sort(rng.choice(driven, min(count, len(driven)), replace=False)))
 
 
-def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]
-                    ) -> tuple[list[SpectralBlock], list[str]]:
+def campaign_blocks(
+    campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float]
+) -> tuple[list[SpectralBlock], list[str]]:
     """Spectral blocks of all records, long ones in pieces, and sentences on what was omitted."""
     width = band_Hz[1] - band_Hz[0]
     lines = [record.header.duration_s * width for record in campaign.records]
@@ -225,19 +231,25 @@ def campaign_blocks(campaign: Campaign, model: ResponseModel, band_Hz: tuple[flo
     if not useful:
         raise InputError("expected a record that drives an actuator, or one with the floor measured", field="records")
     quiet = sorted({b.name for b in blocks} - {b.name for b in useful})
-    said = [f"records at rest without measured floor motion ({', '.join(quiet)}) are used for the noise only"
-            ] if quiet else []
+    said = (
+        [f"records at rest without measured floor motion ({', '.join(quiet)}) are used for the noise only"]
+        if quiet
+        else []
+    )
     if crowded:
         chosen = f", of which {100 * share:.3g} % were drawn at random" if share < 1 else ""
-        said.append(f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} spectral lines are fitted: the "
-                    f"excited ones{chosen}")
+        said.append(
+            f"{sum(len(block.omega) for block in useful)} of {sum(lines):.0f} spectral lines are fitted: the "
+            f"excited ones{chosen}"
+        )
     return useful, said
 
 
-def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
-             ) -> tuple[list[SpectralBlock], str, bool]:
-    """The blocks with noise measured by a local model, independent of the rig's; a sentence, and whether it succeeded.
-    """
+def weighted(
+    blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
+) -> tuple[list[SpectralBlock], str, bool]:
+    """The blocks with noise measured by a local model, independent of the rig's; a sentence, and whether it
+    succeeded."""
     known: dict[str, tuple[np.ndarray, SpectralBlock]] = {}
     try:
         found = []
@@ -250,16 +262,23 @@ def weighted(blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple
             assert like.noise is not None
             found.append(block.with_noise(like.noise[np.searchsorted(omega, block.omega)], like.dof))
     except AvisError as error:
-        return relative_noise(blocks), (f"no measured noise covariance ({error}); the first fit gives all lines equal "
-                                        "weight"), False
-    return found, (f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom "
-                   "per line"), True
+        return (
+            relative_noise(blocks),
+            (f"no measured noise covariance ({error}); the first fit gives all lines equal weight"),
+            False,
+        )
+    return (
+        found,
+        (f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom per line"),
+        True,
+    )
 
 
 def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
     """A block of the same kind on other lines, without data."""
-    return replace(block, omega=omega, U=np.zeros((len(omega), block.U.shape[1], 1)),
-                   Y=np.zeros((len(omega), block.Y.shape[1], 1)))
+    return replace(
+        block, omega=omega, U=np.zeros((len(omega), block.U.shape[1], 1)), Y=np.zeros((len(omega), block.Y.shape[1], 1))
+    )
 
 
 def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
@@ -278,8 +297,9 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
     campaign = campaign.only(tuple(header.name for header in rest or alike))
     frequency = block.omega / (2 * np.pi)
     at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
-    noise = noise_covariance(campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3,
-                             longest_piece=SETTINGS.longest_piece)
+    noise = noise_covariance(
+        campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=SETTINGS.longest_piece
+    )
     above = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
     return block.with_noise(noise.covariance[above], float(np.median(noise.dof)))
 
@@ -328,9 +348,17 @@ class CampaignFit:
         return self.fit.information.of_some(self.start.names).along(self.first.information)
 
 
-def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, band_Hz: tuple[float, float],
-                 priors: Mapping[str, Prior] | None = None, starts: int = 1, seed: int = 1, reweights: int = 2,
-                 progress: Progress | None = None, tolerances: Tolerances | None = None) -> CampaignFit:
+def fit_campaign(
+    campaign: Campaign | FrequencyResponse,
+    model: ResponseModel,
+    band_Hz: tuple[float, float],
+    priors: Mapping[str, Prior] | None = None,
+    starts: int = 1,
+    seed: int = 1,
+    reweights: int = 2,
+    progress: Progress | None = None,
+    tolerances: Tolerances | None = None,
+) -> CampaignFit:
     """The most likely parameters, first with measured noise, then with the noise of the residuals.
 
     tolerances : of the values of the rig file, which are then fitted together with the parameters; only for records of
@@ -342,10 +370,12 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
     """
     say = progress or (lambda text: None)
     if isinstance(campaign, FrequencyResponse):
-        found = fit(model, [response_block(campaign.between(*band_Hz), model)], priors, starts, seed=seed,
-                    progress=progress)
-        return CampaignFit(found, found, band_Hz, (f"frequency responses: {campaign.method or 'as measured'}",
-                                                   *_bounds(found)), model)
+        found = fit(
+            model, [response_block(campaign.between(*band_Hz), model)], priors, starts, seed=seed, progress=progress
+        )
+        return CampaignFit(
+            found, found, band_Hz, (f"frequency responses: {campaign.method or 'as measured'}", *_bounds(found)), model
+        )
     raw, notes = campaign_blocks(campaign, model, band_Hz)
     blocks, said, known = weighted(raw, campaign, band_Hz)
     within = tolerances if isinstance(model.rig, AvisTable) else None
@@ -377,8 +407,10 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
         weighed = noise_from_residuals(found.residuals, [one.block for one in found.residuals], found.model)
         if k == reweights - 1:
             added = terms(campaign, blocks, found.model)
-            weighed = [replace(block, Y=one.Y) for block, one in
-                       zip(weighed, without(blocks, [one[0] for one in added]), strict=True)]
+            weighed = [
+                replace(block, Y=one.Y)
+                for block, one in zip(weighed, without(blocks, [one[0] for one in added]), strict=True)
+            ]
         found = fit(found.model, weighed, priors, seed=seed, about=model)
         say(f"weights from the residuals, {k + 1} of {reweights}: {found.iterations} iterations")
     return CampaignFit(replace(found, starts=first.starts), first, band_Hz, (*notes, *_bounds(found)), model, known)
@@ -386,8 +418,10 @@ def fit_campaign(campaign: Campaign | FrequencyResponse, model: ResponseModel, b
 
 def _share(blocks: Sequence[SpectralBlock], added: Sequence[np.ndarray]) -> str:
     """Size of the second-order terms relative to the outputs, in words."""
-    share = [np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2)) for block, one in
-             zip(blocks, added, strict=True)]
+    share = [
+        np.linalg.norm(one, axis=(0, 2)) / np.linalg.norm(block.Y, axis=(0, 2))
+        for block, one in zip(blocks, added, strict=True)
+    ]
     return f"they contribute up to {100 * float(np.max(share)):.2g} % of a sensor's signal in a record"
 
 
@@ -397,10 +431,14 @@ def _bounds(found: LikelihoodFit[ResponseModel]) -> tuple[str, ...]:
     low = [name for name in found.held if name not in moments]
     said = []
     if low:
-        said.append(f"the best fit would need values below the physical limit for {', '.join(low)}; they are held just "
-                    "above zero, where their standard deviations are not meaningful")
+        said.append(
+            f"the best fit would need values below the physical limit for {', '.join(low)}; they are held just "
+            "above zero, where their standard deviations are not meaningful"
+        )
     if moments:
-        said.append(f"the best fit would need a larger {', '.join(moments)} than a rigid body can have; the value is "
-                    "held at the sum of the other two moments of inertia. Either a value that was taken as known is "
-                    "wrong, or these data hardly determine this moment of inertia")
+        said.append(
+            f"the best fit would need a larger {', '.join(moments)} than a rigid body can have; the value is "
+            "held at the sum of the other two moments of inertia. Either a value that was taken as known is "
+            "wrong, or these data hardly determine this moment of inertia"
+        )
     return tuple(said)

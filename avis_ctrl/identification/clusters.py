@@ -19,8 +19,9 @@ import numpy as np
 from avis_ctrl.identification.weights import Group
 
 
-def cluster_moves(P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray],
-                  least_elsewhere: float = 0.0) -> np.ndarray:
+def cluster_moves(
+    P: np.ndarray, J: np.ndarray, e: np.ndarray, clusters: Sequence[np.ndarray], least_elsewhere: float = 0.0
+) -> np.ndarray:
     """(n_c, n) shift delta of each cluster.
 
     P : (n, n) covariance of standardised parameters, inv(J J^T + I). J : (n, N) negative derivative of e (N,).

@@ -54,8 +54,15 @@ class Directions:
     coverage: float
 
 
-def directions_that_matter(rig: Rig, names: Sequence[str], factor: np.ndarray, keep: Sequence[str],
-                           omega: np.ndarray, confidence: float = 0.95, negligible: float = NEGLIGIBLE) -> Directions:
+def directions_that_matter(
+    rig: Rig,
+    names: Sequence[str],
+    factor: np.ndarray,
+    keep: Sequence[str],
+    omega: np.ndarray,
+    confidence: float = 0.95,
+    negligible: float = NEGLIGIBLE,
+) -> Directions:
     """Minimum number of directions such that the rest changes the kept coordinates' response by less than `negligible`.
 
     Parameters
@@ -88,10 +95,13 @@ def directions_that_matter(rig: Rig, names: Sequence[str], factor: np.ndarray, k
         rest, rest_floor = (ball * _ball_gain(part[q:]) for part in (driven, floor))
         if max(np.max(rest, initial=0.0), np.max(rest_floor, initial=0.0)) <= negligible:
             break
-    effect = box * np.max(np.maximum(np.linalg.norm(driven[:q], ord=2, axis=(2, 3)),
-                                     np.linalg.norm(floor[:q], ord=2, axis=(2, 3))), axis=1)
-    return Directions(tuple(names), box * turned[:, :q].T, effect, rest, rest_floor, np.asarray(omega, float), box,
-                      ball, confidence)
+    effect = box * np.max(
+        np.maximum(np.linalg.norm(driven[:q], ord=2, axis=(2, 3)), np.linalg.norm(floor[:q], ord=2, axis=(2, 3))),
+        axis=1,
+    )
+    return Directions(
+        tuple(names), box * turned[:, :q].T, effect, rest, rest_floor, np.asarray(omega, float), box, ball, confidence
+    )
 
 
 def half_widths(q: int, r: int, confidence: float) -> tuple[float, float]:
@@ -102,8 +112,9 @@ def half_widths(q: int, r: int, confidence: float) -> tuple[float, float]:
     return float(norm.ppf((1 + each) / 2)), float(np.sqrt(chi2.ppf(each ** (r - q), r - q))) if q < r else 0.0
 
 
-def relative_sensitivity(rig: Rig, names: Sequence[str], keep: Sequence[str], omega: np.ndarray
-                         ) -> tuple[np.ndarray, np.ndarray]:
+def relative_sensitivity(
+    rig: Rig, names: Sequence[str], keep: Sequence[str], omega: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Relative change of the kept coordinates' responses by each parameter, (n_p, n, k, k) each, per its unit.
 
     With B = K + jw C - w^2 M and F = K + jw C: inv(G) dG = -dB inv(B) of the response to forces, input-multiplicative,
@@ -115,21 +126,24 @@ def relative_sensitivity(rig: Rig, names: Sequence[str], keep: Sequence[str], om
 
 def matrix_slopes(rig: Rig, names: Sequence[str], keep: Sequence[str]) -> list[KeptMatrices]:
     """Derivatives of M, C, K, T of the kept coordinates by each parameter, per its unit."""
+
     def matrices_of(one: Rig) -> KeptMatrices:
         return kept_matrices(one, keep, rig.edge_m)
+
     return [(M, C, K, T) for M, C, K, T in (central_differences(matrices_of, rig, name) for name in names)]
 
 
-def relative_changes(base: KeptMatrices, changes: Sequence[KeptMatrices], omega: np.ndarray,
-                     allocation: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def relative_changes(
+    base: KeptMatrices, changes: Sequence[KeptMatrices], omega: np.ndarray, allocation: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """`relative_sensitivity` for changes of M, C, K, T; allocation (n_u, k): A, by default the inverse of T."""
     (M, C, K, T), s = base, 1j * np.asarray(omega, float)[:, None, None]
     allocation, F = np.linalg.pinv(T) if allocation is None else allocation, K + s * C
-    inverse = np.linalg.inv(F + s ** 2 * M)
+    inverse = np.linalg.inv(F + s**2 * M)
     driven, floor = [], []
     for dM, dC, dK, dT in changes:
         dF = dK + s * dC
-        dB = dF + s ** 2 * dM
+        dB = dF + s**2 * dM
         driven.append(dT @ allocation - dB @ inverse)
         floor.append(np.linalg.solve(F, dF - dB @ inverse @ F))
     shape = (len(changes), len(s), len(M), len(M))

@@ -75,15 +75,24 @@ class ParameterFilter:
         f_sigma = 0.0 if self.floor is None else np.sqrt(self.floor.density / (2 * self.floor.rate))
         W[n_p:, n_p:] = np.diag(np.repeat([settings.q_sigma, settings.v_sigma, f_sigma], [n_q, n_q, self.n_f]))
         self.state.x[:] = 0.0
-        self.state.x[n_q:2 * n_q] = np.linalg.pinv(self.model.H[:, n_q:]) @ y0
+        self.state.x[n_q : 2 * n_q] = np.linalg.pinv(self.model.H[:, n_q:]) @ y0
 
     def filter(self, u: np.ndarray, y: np.ndarray, keep: int) -> tuple[Trace, int]:
         """Filter one record from the present state: its trace, and how many samples were filtered before a failure."""
         n, n_p, n_x, kept = len(y), len(self.model.names), len(self.state.x), -(-len(y) // keep)
         trace = Trace(np.zeros((n, y.shape[1])), np.zeros((kept, n_p)), np.zeros((kept, n_p)), np.zeros((kept, n_x)))
         plant, A, noise = self._shaped()
-        done = run(plant, self.state, noise_root(A, noise, self.period_s), self.R, np.ascontiguousarray(u),
-                   np.ascontiguousarray(y), self.period_s, keep, trace)
+        done = run(
+            plant,
+            self.state,
+            noise_root(A, noise, self.period_s),
+            self.R,
+            np.ascontiguousarray(u),
+            np.ascontiguousarray(y),
+            self.period_s,
+            keep,
+            trace,
+        )
         return trace, done
 
     def _shaped(self) -> tuple[Plant, np.ndarray, np.ndarray]:
@@ -98,7 +107,8 @@ class ParameterFilter:
         noise[n_q:n_x, n_q:n_x] = (self.settings.Q or 0.0) * np.eye(n_q)
         if self.floor is not None and self.rig is not None:
             G, direct = self.floor.acceleration(
-                self.rig.with_parameters(dict(zip(model.names, self.theta.tolist(), strict=True))))
+                self.rig.with_parameters(dict(zip(model.names, self.theta.tolist(), strict=True)))
+            )
             A[n_q:n_x, n_x:], A[n_x:, n_x:] = G, -self.floor.rate * np.eye(n_f)
             entry = np.vstack([np.zeros((n_q, n_f)), direct, np.eye(n_f)])
             noise += self.floor.density * entry @ entry.T
@@ -124,8 +134,13 @@ def noise_root(A: np.ndarray, noise: np.ndarray, h: float) -> np.ndarray:
     return np.ascontiguousarray(np.linalg.qr(root * size, mode="r"))
 
 
-def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings: EkfSettings = SOURCE_SETTINGS,
-                 names: Sequence[str] | None = None, progress: Callable[[str], None] | None = None) -> EkfResult:
+def identify_ekf(
+    rig0: Rig,
+    records: Campaign | Sequence[RecordSource],
+    settings: EkfSettings = SOURCE_SETTINGS,
+    names: Sequence[str] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> EkfResult:
     """Parameters of a rig from its records, by the filter of chapter 3.
 
     Parameters
@@ -145,12 +160,13 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
     if header.u_unit != "V":
         raise InputError("expected commanded voltages in V", field=f"record {header.name}: u_unit", value=header.u_unit)
     inverse = sensor_inverse(rig0, header.y_names, header.y_unit)
-    model = linear_model(rig0, source_parameters(rig0) if names is None else names, header.y_names, header.u_names,
-                         inverse.motion)
+    model = linear_model(
+        rig0, source_parameters(rig0) if names is None else names, header.y_names, header.u_names, inverse.motion
+    )
     R = measurement_variance(settings, rig0, header.y_names, header.y_unit)
     kalman = ParameterFilter(model, settings, R, 1 / header.sample_rate_Hz, floor_noise(settings, rig0), rig0)
     keep = max(1, round(settings.history_s * header.sample_rate_Hz))
-    for source in campaign.records[:settings.warm_up]:
+    for source in campaign.records[: settings.warm_up]:
         _through(kalman, source, inverse, rig0.loop_delay_s, keep)
     kalman.forget()
     kalman.state.guarded[:] = 0
@@ -163,14 +179,25 @@ def identify_ekf(rig0: Rig, records: Campaign | Sequence[RecordSource], settings
         statistics.append(innovation_statistics(trace.innovation))
         ends.append(ends[-1] + len(trace.innovation) * kalman.period_s)
         if progress:
-            progress(f"record {source.header.name}: normalised innovation squared "
-                     f"{statistics[-1].nis_per_output:.3g} per output (1 expected)")
+            progress(
+                f"record {source.header.name}: normalised innovation squared "
+                f"{statistics[-1].nis_per_output:.3g} per output (1 expected)"
+            )
     time, theta, lower, upper = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
     history = EkfHistory(time, theta, lower, upper, np.array(ends))
     n_p = len(model.names)
     units = tuple(rig0.parameters()[name].unit for name in model.names)
-    return EkfResult(model.names, units, model.values, kalman.theta, kalman.covariance[:n_p, :n_p], history,
-                     tuple(statistics), kalman.state.guarded.copy(), settings)
+    return EkfResult(
+        model.names,
+        units,
+        model.values,
+        kalman.theta,
+        kalman.covariance[:n_p, :n_p],
+        history,
+        tuple(statistics),
+        kalman.state.guarded.copy(),
+        settings,
+    )
 
 
 def _through(kalman: ParameterFilter, source: RecordSource, inverse: SensorInverse, delay_s: float, keep: int) -> Trace:
@@ -186,5 +213,6 @@ def _through(kalman: ParameterFilter, source: RecordSource, inverse: SensorInver
             f"the extended Kalman filter diverged in record {source.header.name}",
             measured=f"after {done * kalman.period_s:.4g} s of {len(y) * kalman.period_s:.4g} s{moved}",
             cause="R or Q too small for the errors at the start, or records of another rig",
-            next_step="raise R or Q")
+            next_step="raise R or Q",
+        )
     return trace

@@ -65,8 +65,9 @@ class Trace(NamedTuple):
 
 
 @njit(cache=True, fastmath=FAST)
-def flow(plant: Plant, s: np.ndarray, x: np.ndarray, u: np.ndarray, h: float
-         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flow(
+    plant: Plant, s: np.ndarray, x: np.ndarray, u: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x after a sample of h seconds at held volts u (n_u,), Phi (n_x, n_x) and Psi (n_x, n_p).
 
     The terms (A h)^k / k! of the state, of its derivatives and of the transition are computed together. x is NaN if a
@@ -85,16 +86,16 @@ def flow(plant: Plant, s: np.ndarray, x: np.ndarray, u: np.ndarray, h: float
     inverse, A = np.linalg.inv(matrices[0]), np.zeros((n_x, n_x))
     for i in range(n_q):
         A[i, n_q + i] = 1.0
-    A[n_q:2 * n_q, :n_q] = -np.dot(inverse, matrices[2])
-    A[n_q:2 * n_q, n_q:2 * n_q] = -np.dot(inverse, matrices[1])
-    A[n_q:2 * n_q, 2 * n_q:] = plant.G
+    A[n_q : 2 * n_q, :n_q] = -np.dot(inverse, matrices[2])
+    A[n_q : 2 * n_q, n_q : 2 * n_q] = -np.dot(inverse, matrices[1])
+    A[n_q : 2 * n_q, 2 * n_q :] = plant.G
     term, power, moved = x, np.eye(n_x), np.zeros((n_x, n_p))
     after, Phi, Psi = x.copy(), np.eye(n_x), np.zeros((n_x, n_p))
     for k in range(1, 5):
         slope, moved = np.dot(A, term), np.dot(A, moved)
         if k == 1:
-            slope[n_q:2 * n_q] += np.dot(inverse, np.dot(plant.T, u))
-        moved[n_q:2 * n_q] -= np.dot(inverse, _forces(plant, slope, term))
+            slope[n_q : 2 * n_q] += np.dot(inverse, np.dot(plant.T, u))
+        moved[n_q : 2 * n_q] -= np.dot(inverse, _forces(plant, slope, term))
         term, moved, power = slope * (h / k), moved * (h / k), np.dot(A, power) * (h / k)
         after, Phi, Psi = after + term, Phi + power, Psi + moved
     for i in range(2 * n_q, n_x):
@@ -152,8 +153,9 @@ def update(W: np.ndarray, h: np.ndarray, r: float, gain: np.ndarray) -> float:
 
 
 @njit(cache=True)
-def _measure(plant: Plant, state: Filter, y: np.ndarray, R: np.ndarray, gain: np.ndarray, innovation: np.ndarray
-             ) -> bool:
+def _measure(
+    plant: Plant, state: Filter, y: np.ndarray, R: np.ndarray, gain: np.ndarray, innovation: np.ndarray
+) -> bool:
     """Process all measurements of one sample, one by one; False if an innovation is not finite."""
     n_p = state.s.shape[0]
     for i in range(y.shape[0]):
@@ -171,8 +173,17 @@ def _measure(plant: Plant, state: Filter, y: np.ndarray, R: np.ndarray, gain: np
 
 
 @njit(cache=True)
-def run(plant: Plant, state: Filter, W_Q: np.ndarray, R: np.ndarray, u: np.ndarray, y: np.ndarray, h: float, keep: int,
-        trace: Trace) -> int:
+def run(
+    plant: Plant,
+    state: Filter,
+    W_Q: np.ndarray,
+    R: np.ndarray,
+    u: np.ndarray,
+    y: np.ndarray,
+    h: float,
+    keep: int,
+    trace: Trace,
+) -> int:
     """Filter a record: measurement update, then propagation to the next sample. Returns the number of samples
     processed; fewer than all means failure.
 

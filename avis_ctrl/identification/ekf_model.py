@@ -48,7 +48,7 @@ class LinearModel(NamedTuple):
         """A (2 n_q, 2 n_q) and B (2 n_q, n_u) of x' = A x + B u."""
         (M, C, K), n = self.matrices(theta), self.n_q
         lower = np.linalg.solve(M, np.hstack([-K, -C, self.T]))
-        return np.vstack([np.eye(n, 2 * n, n), lower[:, :2 * n]]), np.vstack([0 * self.T, lower[:, 2 * n:]])
+        return np.vstack([np.eye(n, 2 * n, n), lower[:, : 2 * n]]), np.vstack([0 * self.T, lower[:, 2 * n :]])
 
 
 def source_parameters(rig: Rig) -> tuple[str, ...]:
@@ -61,16 +61,29 @@ def source_parameters(rig: Rig) -> tuple[str, ...]:
     """
     known = rig.parameters()
     isolators = range(1, 1 + sum(name.endswith(".k_x") for name in known))
-    names = ["mass", "J1", "J2", "J3", *(f"isolator{i}.{kind}_{axis}" for kind in "ck" for i in isolators
-                                         for axis in "xyz" if (i, axis) != (1, "x"))]
+    names = [
+        "mass",
+        "J1",
+        "J2",
+        "J3",
+        *(f"isolator{i}.{kind}_{axis}" for kind in "ck" for i in isolators for axis in "xyz" if (i, axis) != (1, "x")),
+    ]
     if missing := [name for name in names if name not in known]:
-        raise InputError(f"the rig {rig.name} has no {', '.join(missing)}: name the parameters to be estimated",
-                         field="names", value=None)
+        raise InputError(
+            f"the rig {rig.name} has no {', '.join(missing)}: name the parameters to be estimated",
+            field="names",
+            value=None,
+        )
     return tuple(names)
 
 
-def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | None = None,
-                 actuators: Sequence[str] | None = None, motion: str = "velocity") -> LinearModel:
+def linear_model(
+    rig: Rig,
+    names: Sequence[str],
+    measurements: Sequence[str] | None = None,
+    actuators: Sequence[str] | None = None,
+    motion: str = "velocity",
+) -> LinearModel:
     """The model of a rig in the parameters `names`.
 
     Parameters
@@ -92,18 +105,26 @@ def linear_model(rig: Rig, names: Sequence[str], measurements: Sequence[str] | N
     for name, value, *of in zip(names, theta, *slopes, strict=True):
         M, C, K, _, _, T, R = (np.any(one) for one in of)
         if not value > 0:
-            raise InputError("expected a positive starting value: the filter's prior is a fraction of it", field=name,
-                             value=value)
+            raise InputError(
+                "expected a positive starting value: the filter's prior is a fraction of it", field=name, value=value
+            )
         if T or R:
-            raise InputError("this parameter also moves actuators or sensors; the filter takes those as known and "
-                             "estimates parameters of M, C and K only", field="names", value=name)
+            raise InputError(
+                "this parameter also moves actuators or sensors; the filter takes those as known and "
+                "estimates parameters of M, C and K only",
+                field="names",
+                value=name,
+            )
         if not (M or C or K):
             raise InputError("M, C and K do not depend on this parameter", field="names", value=name)
     of_body = np.moveaxis(np.array(slopes[:3]), 1, -1)
     constant, moved = np.array(known[:3]) - of_body @ theta, np.array(model.at(1.2 * theta).matrices[:3])
     size = LINEARITY * np.max(np.abs(moved), axis=(1, 2), keepdims=True)
     if np.any(np.abs(moved - constant - of_body @ (1.2 * theta)) > size):
-        raise InputError("M, C and K must be linear in the parameters of this filter; they are not linear in these",
-                         field="names", value=list(names))
+        raise InputError(
+            "M, C and K must be linear in the parameters of this filter; they are not linear in these",
+            field="names",
+            value=list(names),
+        )
     rows = np.hstack([np.zeros_like(known.R), known.R])
     return LinearModel(names, theta, constant, of_body, known.T, rows if motion == "velocity" else np.roll(rows, 6, 1))

@@ -42,8 +42,8 @@ class Innovations:
 
     @property
     def consistent(self) -> bool:
-        """The mean normalised innovation squared lies in its interval, and at most 10 % of the lags exceed the bound.
-        """
+        """The mean normalised innovation squared lies in its interval, and at most 10 % of the lags exceed the
+        bound."""
         low, high = self.nis_interval
         return low <= self.nis <= high and self.outside <= 0.10
 
@@ -55,12 +55,16 @@ def innovation_statistics(innovation: np.ndarray) -> Innovations:
     """
     n, n_y = innovation.shape
     low, high = chi2.ppf((0.0005, 0.9995), n * n_y) / n
-    power = np.sum(innovation ** 2, axis=0)
+    power = np.sum(innovation**2, axis=0)
     lags = range(1, min(LAGS, n - 1) + 1)
     with np.errstate(invalid="ignore"):
         correlation = np.array([np.einsum("ij,ij->j", innovation[k:], innovation[:-k]) / power for k in lags])
-    return Innovations(float(np.mean(np.sum(innovation ** 2, axis=1))), (float(low), float(high)),
-                       np.nan_to_num(correlation), float(1.96 / np.sqrt(n)))
+    return Innovations(
+        float(np.mean(np.sum(innovation**2, axis=1))),
+        (float(low), float(high)),
+        np.nan_to_num(correlation),
+        float(1.96 / np.sqrt(n)),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +115,7 @@ class EkfResult:
         """Posterior over prior variance (k,), and orthonormal combinations (n_p, k) in relative changes, for the
         combinations that keep at least half of the prior variance. With the source's reset it refers to the last
         record."""
-        values, vectors = np.linalg.eigh(self.scaled_covariance / self.settings.prior_share ** 2)
+        values, vectors = np.linalg.eigh(self.scaled_covariance / self.settings.prior_share**2)
         return values[values >= 0.5], vectors[:, values >= 0.5]
 
 
@@ -119,6 +123,14 @@ def kinds(result: EkfResult) -> dict[str, list[int]]:
     """Parameters by figure, as in figs. 3.1 to 3.3: mass and inertia, damping, stiffness, others."""
     groups: dict[str, list[int]] = {"Mass and inertia": [], "Damping": [], "Stiffness": [], "Other parameters": []}
     for j, unit in enumerate(result.units):
-        groups[{"kg": "Mass and inertia", "kg m^2": "Mass and inertia", "N s/m": "Damping", "N/m": "Stiffness",
-                "N m s/rad": "Damping", "N m/rad": "Stiffness"}.get(unit, "Other parameters")].append(j)
+        groups[
+            {
+                "kg": "Mass and inertia",
+                "kg m^2": "Mass and inertia",
+                "N s/m": "Damping",
+                "N/m": "Stiffness",
+                "N m s/rad": "Damping",
+                "N m/rad": "Stiffness",
+            }.get(unit, "Other parameters")
+        ].append(j)
     return {title: index for title, index in groups.items() if index}

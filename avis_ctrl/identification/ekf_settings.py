@@ -1,5 +1,5 @@
-"""Settings of the filter: those of the source (Rademakers, TU/e 2005, section 3.3), and settings from the actual noise.
-"""
+"""Settings of the filter: those of the source (Rademakers, TU/e 2005, section 3.3), and settings from the
+actual noise."""
 
 from __future__ import annotations
 
@@ -90,11 +90,15 @@ def measurement_variance(settings: EkfSettings, rig: Rig, y_names: Sequence[str]
         return np.full(len(y_names), settings.R)
     g, a = rig.geophones, rig.acquisition
     if unit != "V" or g is None or a is None or rig.ambient is None:
-        raise InputError("the sensor noise is known only for geophones in V of a rig file with acquisition and ambient "
-                         "noise; state R", field="R", value=None)
+        raise InputError(
+            "the sensor noise is known only for geophones in V of a rig file with acquisition and ambient "
+            "noise; state R",
+            field="R",
+            value=None,
+        )
     rounding = Converter(a.adc_bits, a.adc_range_V, a.sample_rate_Hz).noise_rms_V
     gain = np.array([g.sensitivity_Vs_per_m[g.names.index(name)] for name in y_names]) * g.preamplifier_gain
-    return (rig.ambient.sensor_noise_rms_V ** 2 + rounding ** 2) / gain ** 2
+    return (rig.ambient.sensor_noise_rms_V**2 + rounding**2) / gain**2
 
 
 @dataclass(frozen=True)
@@ -127,5 +131,5 @@ def floor_noise(settings: EkfSettings, rig: Rig) -> FloorNoise | None:
         return None
     if rig.ambient is None or not rig.ambient.floor_velocity_rms_m_per_s > 0:
         raise InputError("the rig file has no ambient floor motion; state Q", field="Q", value=None)
-    density = rig.ambient.floor_velocity_rms_m_per_s ** 2 / (2 * (FLOOR_BAND_Hz[1] - FLOOR_BAND_Hz[0]))
+    density = rig.ambient.floor_velocity_rms_m_per_s**2 / (2 * (FLOOR_BAND_Hz[1] - FLOOR_BAND_Hz[0]))
     return FloorNoise(density, np.pi * settings.highpass_Hz)

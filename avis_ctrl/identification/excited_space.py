@@ -43,13 +43,17 @@ class ExcitedSpace:
         said = []
         if silent := [name for name in self.names if name not in self.driven]:
             its, it = ("their", "them") if len(silent) > 1 else ("its", "it")
-            said.append(f"no record drives {', '.join(silent)}: {its} response is not measured, and the rig file's "
-                        f"values for {it} are taken as exact")
+            said.append(
+                f"no record drives {', '.join(silent)}: {its} response is not measured, and the rig file's "
+                f"values for {it} are taken as exact"
+            )
         if not self.full:
             k, d = len(self.driven), len(self.unplayed)
             combinations = "; ".join(combination_text(zip(self.driven, row, strict=True)) for row in self.unplayed)
-            said.append(f"the records excite {k - d} of {k} independent combinations of {', '.join(self.driven)}; not "
-                        f"excited: {combinations}. The fit does not need the response to each drive separately")
+            said.append(
+                f"the records excite {k - d} of {k} independent combinations of {', '.join(self.driven)}; not "
+                f"excited: {combinations}. The fit does not need the response to each drive separately"
+            )
         return "; ".join(said)
 
 
@@ -71,7 +75,7 @@ def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSp
         return ExcitedSpace(names, (), np.zeros((0, 0)))
     size = size[driven]
     values, vectors = np.linalg.eigh(gram[np.ix_(driven, driven)] / np.outer(size, size))
-    missing = vectors[:, values < SETTINGS.span_tolerance ** 2]
+    missing = vectors[:, values < SETTINGS.span_tolerance**2]
     # w with w^T u = 0: in volts the entries are divided by the sizes.
     rows = [whole_numbers(row) for row in sparse_rows(missing / size[:, None], 1e-4)] if missing.size else []
     return ExcitedSpace(names, tuple(names[j] for j in driven), np.reshape(rows, (-1, len(driven))))

@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from avis_ctrl.identification.experiments import (
-    Added,
-    Drive,
-    Noise,
-    changed,
-    predicted_information,
-)
+from avis_ctrl.identification.experiments import Added, Drive, Noise, changed, predicted_information
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
 from avis_ctrl.identification.identifiability_text import combination_text, listed, number
 from avis_ctrl.identification.information import Information
@@ -24,8 +18,10 @@ from avis_ctrl.identification.structure import structural_null_space, structure_
 
 _FLOOR_SHAKEN = 1e-4
 _BENCH = 0.02
-CAUTION = ("These predictions include noise only: added masses, changed positions and added channels count as exactly "
-           "known, and the model as correct.")
+CAUTION = (
+    "These predictions include noise only: added masses, changed positions and added channels count as exactly "
+    "known, and the model as correct."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +68,11 @@ class Outcome:
     def words(self) -> str:
         """What the experiment adds, as a sentence."""
         if not self.gained:
-            sharper = f"the known standard deviations decrease by a factor of {number(self.tighter)}" \
-                if self.tighter > 1.005 else "no standard deviation decreases"
+            sharper = (
+                f"the known standard deviations decrease by a factor of {number(self.tighter)}"
+                if self.tighter > 1.005
+                else "no standard deviation decreases"
+            )
             return f"{self.experiment.words}: determines no further combination; {sharper}."
         many = "combination" if self.gained == 1 else "combinations"
         return f"{self.experiment.words}: determines {self.gained} more {many}{_alone_text(self.alone)}."
@@ -103,16 +102,31 @@ def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
     found = [Experiment("Record four times as long", replace(drive, duration_s=3 * drive.duration_s))]
     level = min(3 * drive.level_V, float(np.min(model.rig.drive_limits_V())) / 4)
     if level > drive.level_V:
-        found.append(Experiment(f"Record once more with {number(level)} V r.m.s. at each actuator",
-                                replace(drive, level_V=level)))
-    found.append(Experiment(f"Record once more over {number(low / 5)}-{number(low)} Hz, below the present band",
-                            replace(drive, band_Hz=(low / 5, low))))
+        found.append(
+            Experiment(
+                f"Record once more with {number(level)} V r.m.s. at each actuator", replace(drive, level_V=level)
+            )
+        )
+    found.append(
+        Experiment(
+            f"Record once more over {number(low / 5)}-{number(low)} Hz, below the present band",
+            replace(drive, band_Hz=(low / 5, low)),
+        )
+    )
     if 3 * high < 0.45 * rate:
-        found.append(Experiment(f"Record once more over {number(high)}-{number(3 * high)} Hz, above the present band",
-                                replace(drive, band_Hz=(high, 3 * high))))
+        found.append(
+            Experiment(
+                f"Record once more over {number(high)}-{number(3 * high)} Hz, above the present band",
+                replace(drive, band_Hz=(high, 3 * high)),
+            )
+        )
     for axis in FLOOR:
-        found.append(Experiment(f"Shake the floor along {axis[-1]} (0.1 mm/s r.m.s.) and measure its velocity",
-                                replace(drive, level_V=0.0, floor_m_per_s={axis: _FLOOR_SHAKEN})))
+        found.append(
+            Experiment(
+                f"Shake the floor along {axis[-1]} (0.1 mm/s r.m.s.) and measure its velocity",
+                replace(drive, level_V=0.0, floor_m_per_s={axis: _FLOOR_SHAKEN}),
+            )
+        )
     return (*found, *_changed_rigs(model, drive), *_more_channels(model, drive), *_bench(model))
 
 
@@ -120,10 +134,14 @@ def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
     body = model.rig.mounted_body()
     kg, corner = round(0.1 * body.mass, 3), body.mounts[0].position
     at = ", ".join(f"{v:g}" for v in corner)
-    found = [Experiment(f"Record once more with a known mass of {kg:g} kg fixed at ({at}) m", drive,
-                        {"masses": [(kg, corner)]})]
-    numbers = sorted({int(name[8:-4]) for name in model.rig.parameters()
-                      if name.startswith("isolator") and name.endswith(".p_x")})
+    found = [
+        Experiment(
+            f"Record once more with a known mass of {kg:g} kg fixed at ({at}) m", drive, {"masses": [(kg, corner)]}
+        )
+    ]
+    numbers = sorted(
+        {int(name[8:-4]) for name in model.rig.parameters() if name.startswith("isolator") and name.endswith(".p_x")}
+    )
     for axis in "xyz":
         for picked in ([1], [1, 3]):
             if not set(picked) <= set(numbers):
@@ -131,8 +149,11 @@ def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
             shifts = {f"isolator{i}.p_{axis}": 0.05 for i in picked}
             who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
             how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
-            found.append(Experiment(f"Record once more with {who} {how}, with the motors and sensors in it", drive,
-                                    {"shifts": shifts}))
+            found.append(
+                Experiment(
+                    f"Record once more with {who} {how}, with the motors and sensors in it", drive, {"shifts": shifts}
+                )
+            )
     return found
 
 
@@ -141,13 +162,21 @@ def _more_channels(model: ResponseModel, drive: Drive) -> list[Experiment]:
     top, found = (-x, -y, -z), []
     for axis, direction in {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}.items():
         sensor = Added(f"added sensor {axis}", top, direction)
-        found.append(Experiment(f"Add a calibrated sensor along {axis} on the payload at "
-                                f"({', '.join(f'{v:g}' for v in top)}) m and record once more", drive,
-                                {"sensors": [sensor]}))
+        found.append(
+            Experiment(
+                f"Add a calibrated sensor along {axis} on the payload at "
+                f"({', '.join(f'{v:g}' for v in top)}) m and record once more",
+                drive,
+                {"sensors": [sensor]},
+            )
+        )
     constant = float(np.max(np.abs(model.matrices.T)))
     motor = Added("added actuator", top, (0.0, 0.0, 1.0), constant)
-    found.append(Experiment("Add a calibrated vertical actuator at the same place and record once more", drive,
-                            {"actuators": [motor]}))
+    found.append(
+        Experiment(
+            "Add a calibrated vertical actuator at the same place and record once more", drive, {"actuators": [motor]}
+        )
+    )
     return found
 
 
@@ -159,8 +188,11 @@ def _bench(model: ResponseModel) -> list[Experiment]:
     mounts = [name for name in picked if name.rpartition(".")[2].startswith(("k_", "c_"))]
     found = []
     if mounts:
-        found.append(Experiment(f"Measure single mounts on a bench, to 2 % each: {listed(mounts)}",
-                                bench=dict.fromkeys(mounts, _BENCH)))
+        found.append(
+            Experiment(
+                f"Measure single mounts on a bench, to 2 % each: {listed(mounts)}", bench=dict.fromkeys(mounts, _BENCH)
+            )
+        )
     if "mass" in model.names:
         found.append(Experiment("Weigh the payload to 0.5 %", bench={"mass": 0.005}))
     sensors = [name for name in model.names if name.startswith("sensor.")]
@@ -175,7 +207,7 @@ def _bench(model: ResponseModel) -> list[Experiment]:
 def _independent(rows: np.ndarray) -> list[int]:
     """Columns, as many as rows, in which no combination of the rows vanishes except the zero combination."""
     scaled = rows / np.max(np.abs(rows), axis=1, keepdims=True)
-    return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][:len(rows)].tolist())
+    return sorted(scipy.linalg.qr(scaled, mode="r", pivoting=True)[1][: len(rows)].tolist())
 
 
 def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: Noise) -> Predictions:
@@ -185,20 +217,26 @@ def predicted(model: ResponseModel, experiments: Sequence[Experiment], noise: No
 
 def compared(information: Information, added: Predictions) -> tuple[Outcome, ...]:
     """Effect of each experiment by itself, the best first: most combinations, then the smallest errors."""
+
     def rank(one: Outcome) -> tuple[float, ...]:
         error = float(np.median(list(one.alone.values()))) if one.alone else np.inf
         return -one.gained, -len(one.alone), error, -one.tighter
+
     return tuple(sorted((_outcome(information, one, extra) for one, extra in added), key=rank))
 
 
 def _outcome(before: Information, experiment: Experiment, added: Information) -> Outcome:
     after = before.plus(added)
     new = after.known & ~before.known
-    alone = {name: float(sigma / size) for name, sigma, size, is_new
-             in zip(after.names, after.standard_deviation, after.scale, new, strict=True) if is_new}
+    alone = {
+        name: float(sigma / size)
+        for name, sigma, size, is_new in zip(after.names, after.standard_deviation, after.scale, new, strict=True)
+        if is_new
+    }
     V = before.directions[1][:, before.determined]
-    ratios = [before.of(row)[1] / after.of(row)[1] for row in (V / before.scale[:, None]).T
-              if np.isfinite(after.of(row)[1])]
+    ratios = [
+        before.of(row)[1] / after.of(row)[1] for row in (V / before.scale[:, None]).T if np.isfinite(after.of(row)[1])
+    ]
     tighter = float(np.median(ratios)) if ratios else 1.0
     return Outcome(experiment, after, after.rank, after.rank - before.rank, alone, tighter)
 
@@ -216,9 +254,14 @@ def planned(information: Information, added: Predictions) -> tuple[Outcome, ...]
     return tuple(chosen)
 
 
-def needed_experiment(information: Information, model: ResponseModel, drive: Drive, noise: Noise,
-                      experiments: Sequence[Experiment] | None = None,
-                      report: IdentifiabilityReport | None = None) -> tuple[str, ...]:
+def needed_experiment(
+    information: Information,
+    model: ResponseModel,
+    drive: Drive,
+    noise: Noise,
+    experiments: Sequence[Experiment] | None = None,
+    report: IdentifiabilityReport | None = None,
+) -> tuple[str, ...]:
     """Sentences: what determines the missing combinations, what does not, and the shortest sequence found for all of
     them."""
     report = report or identifiability_report(information, model)
@@ -238,14 +281,22 @@ def needed_experiment(information: Information, model: ResponseModel, drive: Dri
         order = " Then: ".join(one.experiment.words + "." for one in steps)
         worst = np.max(after.standard_deviation / after.scale)
         rest = len(after.names) - after.rank
-        said.append(f"Shortest sequence found: {order} "
-                    + (f"Every parameter is then determined individually, the least precise to {number(100 * worst)} %."
-                       if not rest else f"{rest} combinations remain undetermined."))
+        said.append(
+            f"Shortest sequence found: {order} "
+            + (
+                f"Every parameter is then determined individually, the least precise to {number(100 * worst)} %."
+                if not rest
+                else f"{rest} combinations remain undetermined."
+            )
+        )
         left = after
     else:
         left = information
     if left.rank < len(left.names):
         still = identifiability_report(left)
-        said.append("None of these experiments determines: " + "; ".join(
-            combination_text(row.items()) for row in still.unseen[:8]) + ".")
+        said.append(
+            "None of these experiments determines: "
+            + "; ".join(combination_text(row.items()) for row in still.unseen[:8])
+            + "."
+        )
     return (*said, CAUTION)

@@ -70,16 +70,29 @@ class ChangedModel(ResponseModel):
 
     def _own(self) -> ResponseModel:
         """The model with only the rig's own channels and parameters."""
-        n_y, n_u = (len(all_) - len(more) for all_, more in ((self.sensors.names, self.more_sensors),
-                                                             (self.actuators, self.more_actuators)))
+        n_y, n_u = (
+            len(all_) - len(more)
+            for all_, more in ((self.sensors.names, self.more_sensors), (self.actuators, self.more_actuators))
+        )
         names = tuple(name for name in self.names if name in self.rig.parameters())
-        return ResponseModel(self.rig, names, self.sensors.picked(range(n_y)), self.actuators[:n_u], self.period_s,
-                             self.delay_s, self.amplifier_corner_Hz)
+        return ResponseModel(
+            self.rig,
+            names,
+            self.sensors.picked(range(n_y)),
+            self.actuators[:n_u],
+            self.period_s,
+            self.delay_s,
+            self.amplifier_corner_Hz,
+        )
 
 
-def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
-            masses: Sequence[tuple[float, Place]] = (), sensors: Sequence[Added] = (),
-            actuators: Sequence[Added] = ()) -> ChangedModel:
+def changed(
+    model: ResponseModel,
+    shifts: Mapping[str, float] | None = None,
+    masses: Sequence[tuple[float, Place]] = (),
+    sensors: Sequence[Added] = (),
+    actuators: Sequence[Added] = (),
+) -> ChangedModel:
     """The model of the changed rig, with the same free parameters.
 
     shifts : known changes of parameters of the rig, in their units (isolator1.p_z and so on). Raises InputError for
@@ -91,14 +104,33 @@ def changed(model: ResponseModel, shifts: Mapping[str, float] | None = None,
     rig = model.rig.with_parameters({name: known[name].value + shift for name, shift in (shifts or {}).items()})
     own = len(model.sensors.names)
     # Added sensors are of the kind of the first one, with the mean sensitivity of that kind.
-    gain = float(np.mean([value for value, motion in zip(model.sensors.sensitivity, model.sensors.motions, strict=True)
-                          if motion == model.sensors.motions[0]]))
-    bank = replace(model.sensors.picked([*range(own), *([0] * len(sensors))]),
-                   names=(*model.sensors.names, *(one.name for one in sensors)),
-                   sensitivity=np.concatenate([model.sensors.sensitivity, np.full(len(sensors), gain)]))
-    return ChangedModel(rig, model.names, bank, (*model.actuators, *(one.name for one in actuators)), model.period_s,
-                        model.delay_s, model.amplifier_corner_Hz, model.turning, tuple(masses), tuple(sensors),
-                        tuple(actuators))
+    gain = float(
+        np.mean(
+            [
+                value
+                for value, motion in zip(model.sensors.sensitivity, model.sensors.motions, strict=True)
+                if motion == model.sensors.motions[0]
+            ]
+        )
+    )
+    bank = replace(
+        model.sensors.picked([*range(own), *([0] * len(sensors))]),
+        names=(*model.sensors.names, *(one.name for one in sensors)),
+        sensitivity=np.concatenate([model.sensors.sensitivity, np.full(len(sensors), gain)]),
+    )
+    return ChangedModel(
+        rig,
+        model.names,
+        bank,
+        (*model.actuators, *(one.name for one in actuators)),
+        model.period_s,
+        model.delay_s,
+        model.amplifier_corner_Hz,
+        model.turning,
+        tuple(masses),
+        tuple(sensors),
+        tuple(actuators),
+    )
 
 
 class Noise(NamedTuple):
@@ -141,10 +173,14 @@ class Drive:
     floor_m_per_s: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.duration_s) and self.duration_s > 0 and np.isfinite(self.level_V)
-                and self.level_V >= 0):
-            raise InputError("expected a positive duration and a level of zero or more", field="drive",
-                             value=(self.level_V, self.duration_s))
+        if not (
+            np.isfinite(self.duration_s) and self.duration_s > 0 and np.isfinite(self.level_V) and self.level_V >= 0
+        ):
+            raise InputError(
+                "expected a positive duration and a level of zero or more",
+                field="drive",
+                value=(self.level_V, self.duration_s),
+            )
         if not 0 < self.band_Hz[0] < self.band_Hz[1] < np.inf:
             raise InputError("expected increasing positive frequencies", field="drive: band_Hz", value=self.band_Hz)
         if unknown := [axis for axis in self.floor_m_per_s if axis not in FLOOR]:

@@ -45,8 +45,12 @@ class IdentifiabilityReport:
     sentences: tuple[str, ...]
 
 
-def identifiability_report(information: Information, model: ResponseModel | None = None, floor: bool = False,
-                           priors: Mapping[str, float] | None = None) -> IdentifiabilityReport:
+def identifiability_report(
+    information: Information,
+    model: ResponseModel | None = None,
+    floor: bool = False,
+    priors: Mapping[str, float] | None = None,
+) -> IdentifiabilityReport:
     """Rank, combinations and sentences.
 
     Parameters
@@ -61,8 +65,11 @@ def identifiability_report(information: Information, model: ResponseModel | None
     InputError : a model of other parameters.
     """
     if model is not None and model.names != information.names:
-        raise InputError(f"expected a model with the free parameters {', '.join(information.names)}", field="model",
-                         value=model.names)
+        raise InputError(
+            f"expected a model with the free parameters {', '.join(information.names)}",
+            field="model",
+            value=model.names,
+        )
     values, units, names = information.values, information.units, information.names
     if model is None:
         null, own = information.null_space, information.null_space
@@ -71,15 +78,17 @@ def identifiability_report(information: Information, model: ResponseModel | None
         own = _orthonormal(structural_null_space(model, floor) * (model.scales() / information.scale)[:, None])
         null = _left_dark(information, own)
         # The structure uses relative units of the values.
-        structure = structure_of(_orthonormal(null * (information.scale / size_of(values))[:, None]), values, units,
-                                 names)
+        structure = structure_of(
+            _orthonormal(null * (information.scale / size_of(values))[:, None]), values, units, names
+        )
     combinations = _combinations(information, structure)
     unseen = tuple(_by_name(row, names) for group in structure.groups for row in group.unseen)
     said = _sentences(information, structure, combinations)
     if model is not None and own.shape[1] > null.shape[1]:
         said = (*said, _prior_sentence(own.shape[1] - null.shape[1], priors or {}))
-    return IdentifiabilityReport(information, information.rank, information.condition, structure, combinations, unseen,
-                                 said)
+    return IdentifiabilityReport(
+        information, information.rank, information.condition, structure, combinations, unseen, said
+    )
 
 
 def _orthonormal(basis: np.ndarray) -> np.ndarray:
@@ -93,7 +102,7 @@ def _left_dark(information: Information, null: np.ndarray) -> np.ndarray:
     inside = null.T @ information.relative @ null
     values, vectors = np.linalg.eigh((inside + inside.T) / 2)
     floor = 4 * len(null) * np.finfo(float).eps * np.max(np.linalg.eigvalsh(information.relative))
-    return null @ vectors[:, values <= max(1 / UNDETERMINED ** 2, floor)]
+    return null @ vectors[:, values <= max(1 / UNDETERMINED**2, floor)]
 
 
 def _combinations(information: Information, structure: Structure) -> tuple[Combination, ...]:
@@ -137,18 +146,26 @@ def _by_name(row: np.ndarray, names: Sequence[str]) -> dict[str, float]:
 def _sentences(information: Information, structure: Structure, combinations: Sequence[Combination]) -> tuple[str, ...]:
     names, count = information.names, len(information.names)
     alone = [name for name, known in zip(names, information.known, strict=True) if known]
-    said = [f"The data determine {information.rank} combinations of the {count} parameters; the relative standard "
-            f"deviations of the most and the least precise one differ by a factor of "
-            f"{number(np.sqrt(information.condition))}."
-            if information.rank else f"The data determine none of the combinations of the {count} parameters."]
+    said = [
+        f"The data determine {information.rank} combinations of the {count} parameters; the relative standard "
+        f"deviations of the most and the least precise one differ by a factor of "
+        f"{number(np.sqrt(information.condition))}."
+        if information.rank
+        else f"The data determine none of the combinations of the {count} parameters."
+    ]
     if len(alone) == count:
         said.append("Every parameter is determined individually.")
     elif alone:
         said.append(f"Determined individually ({len(alone)}): {', '.join(alone)}.")
     said += [scaling_sentence(one, information) for one in structure.scalings]
     if structure.scalings:
-        shared = [text for text in (_combination(information, structure, row).words
-                                    for row in np.eye(count)[list(structure.singles)]) if text not in names]
+        shared = [
+            text
+            for text in (
+                _combination(information, structure, row).words for row in np.eye(count)[list(structure.singles)]
+            )
+            if text not in names
+        ]
         if shared:
             said.append(f"Determined as such ratios and products ({len(shared)}): {', '.join(shared)}.")
     by_text = {one.words: one for one in combinations}
@@ -157,10 +174,13 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
         said.append(group_sentence([names[j] for j in group.members], own))
     poor = [one for one in combinations if not one.determined]
     if poor:
-        said.append(f"Identifiable by the equations, but not determined by these data (standard deviation above the "
-                    f"value itself): {', '.join(one.words for one in poor)}.")
-    weak = sorted((one for one in combinations if one.determined and one.relative > WEAK),
-                  key=lambda one: -one.relative)
+        said.append(
+            f"Identifiable by the equations, but not determined by these data (standard deviation above the "
+            f"value itself): {', '.join(one.words for one in poor)}."
+        )
+    weak = sorted(
+        (one for one in combinations if one.determined and one.relative > WEAK), key=lambda one: -one.relative
+    )
     said += [weak_sentence(one) for one in weak]
     sigma, V = information.directions
     last = information.rank - 1
@@ -171,5 +191,7 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
 
 def _prior_sentence(count: int, priors: Mapping[str, float]) -> str:
     named = f" on {', '.join(priors)}" if 0 < len(priors) <= 6 else ""
-    return (f"{count} of the combinations are determined by the priors{named} alone: these data contain no information "
-            "on them, and more data of the same kind would not, either.")
+    return (
+        f"{count} of the combinations are determined by the priors{named} alone: these data contain no information "
+        "on them, and more data of the same kind would not, either."
+    )

@@ -10,10 +10,16 @@ from avis_ctrl import uncertain_value
 from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.structure import Scaling
 
-_KINDS = {"kg": ("mass", "masses"), "kg m^2": ("inertia", "inertias"), "N/m": ("stiffness", "stiffnesses"),
-          "N m/rad": ("rotational stiffness", "rotational stiffnesses"), "N s/m": ("damping", "dampings"),
-          "N m s/rad": ("rotational damping", "rotational dampings"), "N/V": ("force constant", "force constants"),
-          "m": ("length", "lengths")}
+_KINDS = {
+    "kg": ("mass", "masses"),
+    "kg m^2": ("inertia", "inertias"),
+    "N/m": ("stiffness", "stiffnesses"),
+    "N m/rad": ("rotational stiffness", "rotational stiffnesses"),
+    "N s/m": ("damping", "dampings"),
+    "N m s/rad": ("rotational damping", "rotational dampings"),
+    "N/V": ("force constant", "force constants"),
+    "m": ("length", "lengths"),
+}
 
 
 def number(value: float) -> str:
@@ -22,7 +28,7 @@ def number(value: float) -> str:
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
-    """"a, b and c"."""
+    """ "a, b and c"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
@@ -64,13 +70,18 @@ def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
     """How a group of correlated parameters is determined: the combinations that these data determine."""
     if not seen:
         one = len(members) == 1
-        return (f"{listed(members)} {'has' if one else 'have'} no influence on the responses to these inputs and "
-                f"{'is' if one else 'are'} not determined.")
+        return (
+            f"{listed(members)} {'has' if one else 'have'} no influence on the responses to these inputs and "
+            f"{'is' if one else 'are'} not determined."
+        )
     few = listed(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
     if len(seen) == 1:
         plain = all(weight in seen[0].words for weight in members) and " - " not in seen[0].words
-        sort = "their sum" if plain and not any(ch.isdigit() and ch != "0" for ch in _coefficients(seen[0])) \
+        sort = (
+            "their sum"
+            if plain and not any(ch.isdigit() and ch != "0" for ch in _coefficients(seen[0]))
             else "one combination"
+        )
         return f"{few} {'is' if len(members) == 1 else 'are'} determined only as {sort}: {known_text(seen[0])}."
     shown = "; ".join(known_text(one) for one in seen[:8]) + ("; .." if len(seen) > 8 else "")
     return f"{few} ({len(members)}) are determined only through {len(seen)} combinations: {shown}."
@@ -107,24 +118,35 @@ def scaling_sentence(scaling: Scaling, information: Information) -> str:
     """A common factor that changes no response, and the parameter that fixes it."""
     sizes = sorted(set(scaling.exponents[scaling.exponents != 0].tolist()), reverse=True)
     if sizes == [1.0]:
-        return (f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} are determined only as ratios: a common "
-                f"factor of all of them changes no response. If {information.names[scaling.pin]} is known, the factor "
-                "is known.")
+        return (
+            f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} are determined only as ratios: a common "
+            f"factor of all of them changes no response. If {information.names[scaling.pin]} is known, the factor "
+            "is known."
+        )
     if sizes == [1.0, -1.0]:
         up, down = (kinds(scaling.exponents, information, sign) for sign in (1.0, -1.0))
-        return (f"{_upper(listed(up))} and {listed(down)} are determined only as products: larger {listed(up)} with "
-                f"smaller {listed(down)} change no response. If {information.names[scaling.pin]} is known, the factor "
-                "is known.")
-    parts = [f"{listed(kinds(scaling.exponents, information, size))} by the factor"
-             + (f" to the power {size:g}" if size != 1 else "") for size in sizes]
-    return (f"Multiplying {'; '.join(parts)} changes no response. If {information.names[scaling.pin]} is known, the "
-            "factor is known.")
+        return (
+            f"{_upper(listed(up))} and {listed(down)} are determined only as products: larger {listed(up)} with "
+            f"smaller {listed(down)} change no response. If {information.names[scaling.pin]} is known, the factor "
+            "is known."
+        )
+    parts = [
+        f"{listed(kinds(scaling.exponents, information, size))} by the factor"
+        + (f" to the power {size:g}" if size != 1 else "")
+        for size in sizes
+    ]
+    return (
+        f"Multiplying {'; '.join(parts)} changes no response. If {information.names[scaling.pin]} is known, the "
+        "factor is known."
+    )
 
 
 def weak_sentence(one: Combination) -> str:
     """Precision of a combination that is determined poorly."""
-    return (f"{one.words} is determined only to {number(100 * one.relative)} %: "
-            f"{uncertain_value.text(one.value, one.standard_deviation, one.unit)}.")
+    return (
+        f"{one.words} is determined only to {number(100 * one.relative)} %: "
+        f"{uncertain_value.text(one.value, one.standard_deviation, one.unit)}."
+    )
 
 
 def main_members(names: Sequence[str], direction: np.ndarray) -> list[tuple[str, float]]:

@@ -70,8 +70,9 @@ class Information:
         for field, shape in (("values", (n,)), ("matrix", (n, n)), ("scale", (n,))):
             array = np.asarray(getattr(self, field), float)
             if array.shape != shape or not np.all(np.isfinite(array)):
-                raise InputError(f"expected finite numbers of shape {shape}", field=f"information: {field}",
-                                 value=array.shape)
+                raise InputError(
+                    f"expected finite numbers of shape {shape}", field=f"information: {field}", value=array.shape
+                )
             object.__setattr__(self, field, array)
         if np.any(self.scale <= 0):
             raise InputError("expected positive sizes", field="information: scale", value=self.scale.tolist())
@@ -152,8 +153,9 @@ class Information:
     def plus(self, other: Information) -> Information:
         """The information with that of independent data added."""
         if other.names != self.names:
-            raise InputError(f"expected the same parameters, {', '.join(self.names)}", field="information",
-                             value=other.names)
+            raise InputError(
+                f"expected the same parameters, {', '.join(self.names)}", field="information", value=other.names
+            )
         return replace(self, matrix=self.matrix + other.matrix)
 
     def with_priors(self, deviations: Mapping[str, float]) -> Information:
@@ -163,7 +165,7 @@ class Information:
             if name not in self.names:
                 raise InputError(f"expected some of {', '.join(self.names)}", field="priors", value=name)
             require_positive(sigma, f"prior of {name}")
-            diagonal[self.names.index(name)] = 1 / sigma ** 2
+            diagonal[self.names.index(name)] = 1 / sigma**2
         return replace(self, matrix=self.matrix + np.diag(diagonal))
 
     def of_some(self, names: Sequence[str]) -> Information:
@@ -173,8 +175,9 @@ class Information:
         across = self.relative[np.ix_(keep, rest)]
         left = self.relative[np.ix_(keep, keep)] - across @ np.linalg.solve(self.relative[np.ix_(rest, rest)], across.T)
         scale = self.scale[keep]
-        return Information(tuple(names), self.values[keep], tuple(self.units[k] for k in keep),
-                           left / np.outer(scale, scale), scale)
+        return Information(
+            tuple(names), self.values[keep], tuple(self.units[k] for k in keep), left / np.outer(scale, scale), scale
+        )
 
     def along(self, other: Information) -> Information:
         """Information restricted to the directions that another information on the same parameters determines."""

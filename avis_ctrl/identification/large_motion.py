@@ -26,10 +26,14 @@ class Turning(NamedTuple):
     @property
     def sentence(self) -> str:
         """Description in words."""
+
         def of(share: float) -> str:
             return "turn with the table" if share > 0.5 else "keep their direction in space"
-        return (f"the model includes second-order terms of the table's rotations, in which the motors' axes "
-                f"{of(self.motors)} and the sensors' axes {of(self.sensors)}")
+
+        return (
+            f"the model includes second-order terms of the table's rotations, in which the motors' axes "
+            f"{of(self.motors)} and the sensors' axes {of(self.sensors)}"
+        )
 
 
 AS_SIMULATED = Turning()
@@ -42,8 +46,9 @@ def sensors_of(rig: Rig, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray
     return place, direction
 
 
-def second_order(rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sensors: tuple[str, ...]
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def second_order(
+    rig: Rig, q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, sensors: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Second-order force of the table (samples, 6), force added by turned motors (samples, 6), and acceleration
     (samples, n_y) added to the readings of turned sensors.
 
@@ -70,8 +75,9 @@ def _along(q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, arrays: RigArrays) -
 
 
 @njit(cache=True)
-def _turned_readings(q: np.ndarray, q_dot: np.ndarray, q_ddot: np.ndarray, place: np.ndarray, direction: np.ndarray
-                     ) -> np.ndarray:
+def _turned_readings(
+    q: np.ndarray, q_dot: np.ndarray, q_ddot: np.ndarray, place: np.ndarray, direction: np.ndarray
+) -> np.ndarray:
     out = np.empty((len(q), len(place)))
     for k in range(len(q)):
         turned_reading(out[k], q[k], q_dot[k], q_ddot[k], place, direction)
@@ -97,8 +103,9 @@ def turned_force(out: np.ndarray, q: np.ndarray, u: np.ndarray, arrays: RigArray
 
 
 @njit(cache=True)
-def turned_reading(out: np.ndarray, q: np.ndarray, q_dot: np.ndarray, q_ddot: np.ndarray, place: np.ndarray,
-                   direction: np.ndarray) -> None:
+def turned_reading(
+    out: np.ndarray, q: np.ndarray, q_dot: np.ndarray, q_ddot: np.ndarray, place: np.ndarray, direction: np.ndarray
+) -> None:
     """out (n_y,): acceleration that sensors on the payload measure in addition to the linear one: their axes turn by
     its rotation, and their positions move with its square (3-2-1 angles, as in `rigs.nonlinear`)."""
     a, v, w = q[3:], q_dot[3:], q_ddot[3:]
@@ -112,10 +119,14 @@ def turned_reading(out: np.ndarray, q: np.ndarray, q_dot: np.ndarray, q_ddot: np
         a0 = q_ddot[0] + q_ddot[4] * p[2] - q_ddot[5] * p[1]
         a1 = q_ddot[1] + q_ddot[5] * p[0] - q_ddot[3] * p[2]
         a2 = q_ddot[2] + q_ddot[3] * p[1] - q_ddot[4] * p[0]
-        out[k] = ((q[4] * d[2] - q[5] * d[1]) * a0 + (q[5] * d[0] - q[3] * d[2]) * a1
-                  + (q[3] * d[1] - q[4] * d[0]) * a2
-                  + d[0] * (s12 * p[1] + s13 * p[2] - (s22 + s33) / 2 * p[0])
-                  + d[1] * (s23 * p[2] - (s11 + s33) / 2 * p[1]) - d[2] * (s11 + s22) / 2 * p[2])
+        out[k] = (
+            (q[4] * d[2] - q[5] * d[1]) * a0
+            + (q[5] * d[0] - q[3] * d[2]) * a1
+            + (q[3] * d[1] - q[4] * d[0]) * a2
+            + d[0] * (s12 * p[1] + s13 * p[2] - (s22 + s33) / 2 * p[0])
+            + d[1] * (s23 * p[2] - (s11 + s33) / 2 * p[1])
+            - d[2] * (s11 + s22) / 2 * p[2]
+        )
 
 
 class SteppedTable(NamedTuple):
@@ -143,8 +154,18 @@ class SteppedTable(NamedTuple):
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
-def step_through(drive: np.ndarray, volts: np.ndarray, floor: np.ndarray, x: np.ndarray, before: np.ndarray,
-                 started: bool, table: SteppedTable, arrays: RigArrays, states: np.ndarray, beside: np.ndarray) -> None:
+def step_through(
+    drive: np.ndarray,
+    volts: np.ndarray,
+    floor: np.ndarray,
+    x: np.ndarray,
+    before: np.ndarray,
+    started: bool,
+    table: SteppedTable,
+    arrays: RigArrays,
+    states: np.ndarray,
+    beside: np.ndarray,
+) -> None:
     """Step through a piece of a record.
 
     drive : (n, N) contribution of the inputs to the state over a period. volts (n, n_u), floor (n, 3): acting at its

@@ -114,8 +114,10 @@ class Fitted:
         at = [self.priors.names.index(name) for name in names]
         values, slopes = self.priors.values(self.z), self.priors.slopes(self.z)
         std = np.sqrt(np.max([one.diagonal() for one in (self.covariance, *self._by_clusters)], axis=0))
-        found = [Tolerance(name, float(values[k]), float(std[k] * slopes[k]), float(self.z[k]), units[name])
-                 for name, k in zip(names, at, strict=True)]
+        found = [
+            Tolerance(name, float(values[k]), float(std[k] * slopes[k]), float(self.z[k]), units[name])
+            for name, k in zip(names, at, strict=True)
+        ]
         return tuple(sorted(found, key=lambda one: -abs(one.moved)))
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
@@ -154,6 +156,7 @@ class Fitted:
                 return self.covariance
             moves = cluster_moves(self.covariance, self.J, self.e, rows, self.settings.least_elsewhere)
             return np.asarray(self.covariance @ self.covariance + moves.T @ moves)
+
         by_octave, by_level = clusterings(list(self.weights.rows), self.settings.bands_per_octave)
         return np.mean([robust(parts) for parts in by_octave], axis=0), robust(by_level)
 
@@ -167,8 +170,8 @@ def first_variances(data: Data, settings: FitSettings) -> Variances:
         own = bands(block.omega, settings.bands_per_octave)
         for band in np.unique(own):
             at, group = own == band, (level, int(band))
-            path[int(band)] = np.full(block.Y.shape[1], settings.first_error ** 2)
-            power = settings.first_error ** 2 * np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
+            path[int(band)] = np.full(block.Y.shape[1], settings.first_error**2)
+            power = settings.first_error**2 * np.sum(np.abs(block.Y[at, :, 0]) ** 2, axis=0)
             distortion[group] = distortion.get(group, 0.0) + settings.first_distortion * power
             count[group] = count.get(group, 0) + int(at.sum())
     return Variances(path, {group: value / count[group] for group, value in distortion.items()})
@@ -195,8 +198,9 @@ class _Expand(Protocol):
         """Expansion at z; without derivative only the sum of squares. Raises InputError if no rig has these values."""
 
 
-def descent(expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
-            ) -> tuple[_Expansion, int]:
+def descent(
+    expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
+) -> tuple[_Expansion, int]:
     """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and the number of
     steps.
 
@@ -241,8 +245,9 @@ def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.n
     free = ~((z <= low) & (slope < 0) | (z >= high) & (slope > 0))
     while np.any(free):
         moved = z - at.z
-        z[free] = at.z[free] + np.linalg.solve(M[np.ix_(free, free)],
-                                               slope[free] - M[np.ix_(free, ~free)] @ moved[~free])
+        z[free] = at.z[free] + np.linalg.solve(
+            M[np.ix_(free, free)], slope[free] - M[np.ix_(free, ~free)] @ moved[~free]
+        )
         beyond = free & ((z < low) | (z > high))
         if not np.any(beyond):
             break
@@ -255,14 +260,15 @@ def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[flo
     """Dampings to try: none; then increasing from somewhat below the last one needed, until almost nothing of a
     Gauss-Newton step remains."""
     yield 0.0
-    damping, most = max(last / settings.damping ** 2, 1.0), (1 + np.linalg.norm(H, 2)) / settings.shortest_step
+    damping, most = max(last / settings.damping**2, 1.0), (1 + np.linalg.norm(H, 2)) / settings.shortest_step
     while damping < most:
         yield damping
         damping *= settings.damping
 
 
-def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
-        ) -> Fitted:
+def fit(
+    model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
+) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances."""
     steps, best, noise = 0, None, mean_noise(data.blocks, data.levels, settings)
     model = model.at(priors.values(z))
@@ -270,11 +276,13 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
 
-        def expand(z: np.ndarray, derivative: bool = True, model: Any = model, weights: Weights = weights
-                   ) -> _Expansion:
+        def expand(
+            z: np.ndarray, derivative: bool = True, model: Any = model, weights: Weights = weights
+        ) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, data, weights, derivative)
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
+
         at, more = descent(expand, z, priors, settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
         reached = -0.5 * (at.whole + weights.log_determinant) + log_prior(variances, noise, settings)
@@ -292,8 +300,19 @@ def fit(model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Varian
     # By eigenvalues: with poorly determined directions, round-off makes `inv` neither symmetric nor positive definite.
     size, vectors = np.linalg.eigh(H)
     root = vectors / np.sqrt(np.maximum(size, 1.0))  # the priors contribute at least 1
-    return Fitted(at.model, priors, at.z, root @ root.T, variances, float(log_evidence), by_group, steps,
-                  settings, weights, at.now)
+    return Fitted(
+        at.model,
+        priors,
+        at.z,
+        root @ root.T,
+        variances,
+        float(log_evidence),
+        by_group,
+        steps,
+        settings,
+        weights,
+        at.now,
+    )
 
 
 def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:
@@ -303,11 +322,16 @@ def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETT
     The evidence is not comparable with that of other fits.
     """
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
-    path = {band: np.full_like(v, settings.least_error ** 2) for band, v in fitted.variances.path.items()}
-    left = fitted.white.left or [block_residual(fitted.model, block, np.sqrt(2) * np.eye(block.Y.shape[1])[None, None],
-                                                derivative=False)[2].error[:, :, 0] for block in data.blocks]
-    variances = estimated(left, data.blocks, data.levels, paths, Variances(path, fitted.variances.distortion), settings,
-                          hold_path=True)
+    path = {band: np.full_like(v, settings.least_error**2) for band, v in fitted.variances.path.items()}
+    left = fitted.white.left or [
+        block_residual(fitted.model, block, np.sqrt(2) * np.eye(block.Y.shape[1])[None, None], derivative=False)[
+            2
+        ].error[:, :, 0]
+        for block in data.blocks
+    ]
+    variances = estimated(
+        left, data.blocks, data.levels, paths, Variances(path, fitted.variances.distortion), settings, hold_path=True
+    )
     return fit(fitted.model, fitted.priors, fitted.z, data, variances, replace(settings, rounds=0))
 
 
@@ -330,8 +354,8 @@ class Profile:
         self.e = self.free(fitted.white.e[None], -fitted.z)[0]
 
     def free(self, white: np.ndarray, prior: np.ndarray | float = 0.0) -> np.ndarray:
-        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), after projecting out the fit's parameters.
-        """
+        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), after projecting out the fit's
+        parameters."""
         rows = self.fitted.weights.flatten(white)
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
@@ -339,10 +363,11 @@ class Profile:
     @cached_property
     def _white_basis(self) -> np.ndarray:
         """(N, n) whose products with whitened rows are those of `basis` with the flattened rows."""
-        return self.fitted.weights.flatten(self.basis[:, :-len(self.fitted.z)]).T.copy()
+        return self.fitted.weights.flatten(self.basis[:, : -len(self.fitted.z)]).T.copy()
 
-    def fit(self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
-            ) -> tuple[np.ndarray, float, float]:
+    def fit(
+        self, model: Any, priors: Priors, z: np.ndarray, iterations: int, at: np.ndarray | None = None
+    ) -> tuple[np.ndarray, float, float]:
         """z (k,) of the added parameters, the free ones of `model`; the gain of log evidence with them, and the
         decrease of the penalised sum of squares.
 
@@ -358,8 +383,9 @@ class Profile:
             now = _evaluate(moved, priors, z, self.data, weights, derivative)
             # The products of the rows that `free` would return.
             H, g, cost = weights.normal_equations(now.J, now.e)
-            A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e):] @ rest
+            A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e) :] @ rest
             return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
+
         end, _ = descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
         gain = 0.5 * (fall - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
@@ -381,18 +407,23 @@ def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tupl
 
 
 def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
-    return {group: -0.5 * float(flat[rows] @ flat[rows] + weights.log_determinants[group])
-            for group, rows in weights.rows.items()}
+    return {
+        group: -0.5 * float(flat[rows] @ flat[rows] + weights.log_determinants[group])
+        for group, rows in weights.rows.items()
+    }
 
 
-def _evaluate(model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True
-              ) -> Evaluated:
-    parts = [block_residual(model, block, L[:, None], derivative=derivative)
-             for block, L in zip(data.blocks, weights.L, strict=True)]
+def _evaluate(
+    model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True
+) -> Evaluated:
+    parts = [
+        block_residual(model, block, L[:, None], derivative=derivative)
+        for block, L in zip(data.blocks, weights.L, strict=True)
+    ]
     e = np.concatenate([one[0] for one in parts])
     J = np.empty((len(z) if derivative else 0, len(e)))
     start, slopes = 0, priors.slopes(z)[:, None]
     for own, rows, _ in parts if derivative else ():
-        np.multiply(rows, slopes, out=J[:, start:start + len(own)])
+        np.multiply(rows, slopes, out=J[:, start : start + len(own)])
         start += len(own)
     return Evaluated(e, J, [one[2].error[:, :, 0] for one in parts])

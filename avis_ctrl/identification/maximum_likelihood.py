@@ -61,8 +61,8 @@ SETTINGS = LikelihoodSettings()
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Residual of a block: error e (n, n_y, m), white (the same with unit variance E|e|^2), and transient (n, n_y, m).
-    """
+    """Residual of a block: error e (n, n_y, m), white (the same with unit variance E|e|^2), and transient (n,
+    n_y, m)."""
 
     block: SpectralBlock
     error: np.ndarray
@@ -113,8 +113,8 @@ class LikelihoodFit(Generic[Fitted]):
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """chi2 and its expansion in relative parameters: g = -J^T e, H = J^T J; F is H reduced by the cost of the weights.
-    """
+    """chi2 and its expansion in relative parameters: g = -J^T e, H = J^T J; F is H reduced by the cost of the
+    weights."""
 
     chi2: float
     gradient: np.ndarray
@@ -123,9 +123,17 @@ class _Quadratic:
     residuals: tuple[Residual, ...] = ()
 
 
-def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior] | None = None,
-        starts: int = 1, spread: float = 0.1, seed: int = 1, max_iterations: int = 60,
-        progress: Callable[[str], None] | None = None, about: Fitted | None = None) -> LikelihoodFit[Fitted]:
+def fit(
+    model: Fitted,
+    blocks: Sequence[SpectralBlock],
+    priors: Mapping[str, Prior] | None = None,
+    starts: int = 1,
+    spread: float = 0.1,
+    seed: int = 1,
+    max_iterations: int = 60,
+    progress: Callable[[str], None] | None = None,
+    about: Fitted | None = None,
+) -> LikelihoodFit[Fitted]:
     """The most likely parameters of `model.names`, starting from its present values.
 
     Parameters
@@ -160,22 +168,35 @@ def fit(model: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Pri
             progress(f"start {k + 1} of {starts}: chi-square {reached[-1][0]:.6g}")
     chi2, best = min(reached, key=lambda pair: pair[0])
     if best is None or not np.isfinite(chi2):
-        raise ComputationError("no starting point of the fit reached a finite chi-square", measured=f"{chi2}",
-                               cause="data that are zero or far from this rig",
-                               next_step="check the findings of the gates, and start from better values")
+        raise ComputationError(
+            "no starting point of the fit reached a finite chi-square",
+            measured=f"{chi2}",
+            cause="data that are zero or far from this rig",
+            next_step="check the findings of the gates, and start from better values",
+        )
     last = best.evaluate(best.model, residuals=True)
     scale = about.scales()
     unknown = sum(transient_unknowns(block, model) for block in blocks)
     information = Information(model.names, best.model.values, model.units, last.F / np.outer(scale, scale), scale)
     dof = sum(block.numbers for block in blocks) + len(priors) - unknown - information.rank
-    return LikelihoodFit(best.model, information, last.chi2, dof, best.iterations, best.converged,
-                         tuple(best.history), last.residuals, tuple(value for value, _ in reached), priors,
-                         tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low)
-                         + best.largest_moments())
+    return LikelihoodFit(
+        best.model,
+        information,
+        last.chi2,
+        dof,
+        best.iterations,
+        best.converged,
+        tuple(best.history),
+        last.residuals,
+        tuple(value for value, _ in reached),
+        priors,
+        tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low) + best.largest_moments(),
+    )
 
 
-def _thinned_descent(begin: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior], first: Fitted,
-                     max_iterations: int) -> Fitted:
+def _thinned_descent(
+    begin: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior], first: Fitted, max_iterations: int
+) -> Fitted:
     """A first descent on a subset of the lines: from a distant start it leads to the same minimum in less time."""
     few = [thinned(block, max(SETTINGS.thin_lines, len(block.omega) // SETTINGS.thin_by)) for block in blocks]
     descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
@@ -186,8 +207,14 @@ def _thinned_descent(begin: Fitted, blocks: Sequence[SpectralBlock], priors: Map
 class _Descent(Generic[Fitted]):
     """One Levenberg-Marquardt run."""
 
-    def __init__(self, model: Fitted, blocks: Sequence[SpectralBlock], whiteners: Sequence[np.ndarray],
-                 priors: Mapping[str, Prior], first: Fitted):
+    def __init__(
+        self,
+        model: Fitted,
+        blocks: Sequence[SpectralBlock],
+        whiteners: Sequence[np.ndarray],
+        priors: Mapping[str, Prior],
+        first: Fitted,
+    ):
         self.model, self.blocks, self.whiteners, self.priors = model, blocks, whiteners, priors
         self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
         self.rows = _held_rows(first)
@@ -221,10 +248,10 @@ class _Descent(Generic[Fitted]):
         for name, (mean, sigma) in self.priors.items():
             j = model.names.index(name)
             miss, slope = (mean - model.values[j]) / sigma, self.scale[j] / sigma
-            chi2 += miss ** 2
+            chi2 += miss**2
             g[j] -= slope * miss
-            H[j, j] += slope ** 2
-            F[j, j] += slope ** 2
+            H[j, j] += slope**2
+            F[j, j] += slope**2
         return _Quadratic(chi2, g, H, F, tuple(kept))
 
     def run(self, max_iterations: int) -> None:
@@ -337,8 +364,9 @@ def _physical(model: FrequencyModel) -> bool:
     return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
 
 
-def block_residual(model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
-                    ) -> tuple[np.ndarray, np.ndarray, Residual]:
+def block_residual(
+    model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
+) -> tuple[np.ndarray, np.ndarray, Residual]:
     """Real residual e (N,) of unit variance and its negative Jacobian J (n_p, N), with the transient projected out of
     both."""
     if not block.transient:
@@ -364,8 +392,9 @@ def block_residual(model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *
     return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
 
 
-def added_terms(model: FrequencyModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
-                ) -> tuple[np.ndarray, np.ndarray]:
+def added_terms(
+    model: FrequencyModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """H (k, k) and g (k,) with chi2 = chi2_0 + s^T H s - 2 g^T s, if s times k known terms are added to the model's
     outputs.
 
@@ -402,13 +431,19 @@ def whitener(block: SpectralBlock) -> np.ndarray:
         raise InputError("expected the covariance of its noise", field=f"block {block.name}")
     n_y = block.noise.shape[-1]
     if block.dof <= n_y:
-        raise InputError(f"expected more than {n_y} degrees of freedom in the noise covariance",
-                         field=f"block {block.name}", value=block.dof)
+        raise InputError(
+            f"expected more than {n_y} degrees of freedom in the noise covariance",
+            field=f"block {block.name}",
+            value=block.dof,
+        )
     try:
         factor = np.linalg.cholesky(block.noise)
     except np.linalg.LinAlgError:
-        raise InputError("expected a positive definite noise covariance on every line; a channel without noise, or two "
-                         "equal channels, make it singular", field=f"block {block.name}") from None
+        raise InputError(
+            "expected a positive definite noise covariance on every line; a channel without noise, or two "
+            "equal channels, make it singular",
+            field=f"block {block.name}",
+        ) from None
     correction = 1.0 if np.isinf(block.dof) else (block.dof - n_y) / block.dof
     return np.sqrt(2 * correction) * np.linalg.inv(factor)
 
@@ -482,6 +517,8 @@ def _check(model: FrequencyModel, blocks: Sequence[SpectralBlock], priors: Mappi
         if name not in model.names:
             raise InputError(f"expected a free parameter out of {', '.join(model.names)}", field="priors", value=name)
         if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
-            raise InputError("expected a finite mean and a positive standard deviation", field=f"prior of {name}",
-                             value=(mean, sigma))
-
+            raise InputError(
+                "expected a finite mean and a positive standard deviation",
+                field=f"prior of {name}",
+                value=(mean, sigma),
+            )

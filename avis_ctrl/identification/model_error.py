@@ -54,8 +54,9 @@ class Unexplained(RecordSource):
         keep, self.at = slice(start - self.at, None), stop
         y = piece.y.copy()
         y[:, self.columns] -= read
-        header = replace(piece.header, samples=stop - start,
-                         start_s=self.header.start_s + start / self.header.sample_rate_Hz)
+        header = replace(
+            piece.header, samples=stop - start, start_s=self.header.start_s + start / self.header.sample_rate_Hz
+        )
         return Record(header, piece.u[keep], y[keep], None if piece.floor is None else piece.floor[keep])
 
 
@@ -64,8 +65,13 @@ def unexplained(campaign: Campaign, model: ResponseModel) -> Campaign:
     return replace(campaign, records=tuple(Unexplained(record, model) for record in campaign.records))
 
 
-def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[float, float],
-                      longest_piece: int | None = None, frequency_Hz: np.ndarray | None = None) -> FrequencyResponse:
+def measured_response(
+    campaign: Campaign,
+    model: ResponseModel,
+    band_Hz: tuple[float, float],
+    longest_piece: int | None = None,
+    frequency_Hz: np.ndarray | None = None,
+) -> FrequencyResponse:
     """Frequency response measured in the records: the model's, plus what it leaves unexplained.
 
     Windows of the local polynomial grow until the inputs can be separated in each: with zippered lines each input has
@@ -83,15 +89,23 @@ def measured_response(campaign: Campaign, model: ResponseModel, band_Hz: tuple[f
     return replace(left, value=value, method=f"response of the model plus its residual: {left.method}")
 
 
-def _local(campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None,
-           frequency_Hz: np.ndarray | None) -> FrequencyResponse:
+def _local(
+    campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None, frequency_Hz: np.ndarray | None
+) -> FrequencyResponse:
     # Directions that the records do not excite at all are missing in windows of any width.
     widths = HALF_WIDTHS if excited_space(campaign, band_Hz).full else HALF_WIDTHS[:1]
     for half_width in widths:
         try:
-            return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width,
-                                    longest_piece=longest_piece)
+            return local_polynomial(
+                campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width, longest_piece=longest_piece
+            )
         except ComputationError:
             continue
-    return local_polynomial(campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=widths[-1],
-                            longest_piece=longest_piece, partial=True)
+    return local_polynomial(
+        campaign,
+        band_Hz=band_Hz,
+        frequency_Hz=frequency_Hz,
+        half_width=widths[-1],
+        longest_piece=longest_piece,
+        partial=True,
+    )

@@ -55,12 +55,12 @@ class ModelModes:
     @property
     def frequency_std_Hz(self) -> np.ndarray:
         """(n,) standard deviations of the frequencies."""
-        return np.sqrt(np.diag(self.covariance)[:len(self.damping)])
+        return np.sqrt(np.diag(self.covariance)[: len(self.damping)])
 
     @property
     def damping_std(self) -> np.ndarray:
         """(n,) standard deviations of the damping ratios."""
-        return np.sqrt(np.diag(self.covariance)[len(self.damping):])
+        return np.sqrt(np.diag(self.covariance)[len(self.damping) :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +108,12 @@ def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> M
     poles, vectors = la.eig(A)
     keep = np.flatnonzero(poles.imag > 1e-9 * np.abs(poles))
     if len(keep) < N_Q:
-        raise ComputationError("not every mode of the rig oscillates", measured=f"{len(keep)} of {N_Q} modes do",
-                               cause="damping above critical, or a stiffness that is not positive",
-                               next_step="check damping and stiffness of the rig")
+        raise ComputationError(
+            "not every mode of the rig oscillates",
+            measured=f"{len(keep)} of {N_Q} modes do",
+            cause="damping above critical, or a stiffness that is not positive",
+            next_step="check damping and stiffness of the rig",
+        )
     keep = keep[np.argsort(np.abs(poles[keep]))]
     poles, X = poles[keep], vectors[:N_Q, keep]
     words = tuple(_in_words(M, x) for x in X.T)
@@ -119,13 +122,13 @@ def model_modes(model: ResponseModel, covariance: np.ndarray | None = None) -> M
     d = model.derivative_matrices
     dpoles = np.zeros((len(model.names), N_Q), complex)
     for k, (pole, x) in enumerate(zip(poles, X.T, strict=True)):
-        D = pole ** 2 * M + pole * C + K
+        D = pole**2 * M + pole * C + K
         y = la.svd(D)[0][:, -1].conj()  # y^T D = 0
-        dD = pole ** 2 * d.M + pole * d.C + d.K
+        dD = pole**2 * d.M + pole * d.C + d.K
         dpoles[:, k] = -np.einsum("i,pij,j->p", y, dD, x) / (y @ (2 * pole * M + C) @ x)
     size = np.abs(poles)
     dsize = np.real(np.conj(poles) * dpoles) / size
-    ddamping = -dpoles.real / size + poles.real * dsize / size ** 2
+    ddamping = -dpoles.real / size + poles.real * dsize / size**2
     gradient = np.concatenate([dsize / (2 * np.pi), ddamping], axis=1)
     return ModelModes(size / (2 * np.pi), -poles.real / size, gradient.T @ covariance @ gradient, X, words)
 
@@ -139,8 +142,9 @@ def _in_words(M: np.ndarray, x: np.ndarray) -> str:
     return COORDINATES[order[0]] + (f" with {', '.join(others)}" if others else "")
 
 
-def mode_table(model: ResponseModel, covariance: np.ndarray, start: ResponseModel,
-               measured: MeasuredModes | None) -> tuple[ModeRow, ...]:
+def mode_table(
+    model: ResponseModel, covariance: np.ndarray, start: ResponseModel, measured: MeasuredModes | None
+) -> tuple[ModeRow, ...]:
     """The model's modes with the start's and the measured ones, lowest first."""
     found, before = model_modes(model, covariance), model_modes(start)
     n = len(found.damping)
@@ -148,11 +152,23 @@ def mode_table(model: ResponseModel, covariance: np.ndarray, start: ResponseMode
     if measured is not None:
         own = np.sqrt(np.diag(measured.covariance))
         total = np.sqrt(np.diag(found.covariance) + np.diag(measured.covariance))
-        beside = [measured.frequency_Hz, own[:n], measured.damping, own[n:],
-                  (found.frequency_Hz - measured.frequency_Hz) / total[:n],
-                  (found.damping - measured.damping) / total[n:]]
-    columns = [found.frequency_Hz, found.frequency_std_Hz, found.damping, found.damping_std, before.frequency_Hz,
-               before.damping, *beside]
+        beside = [
+            measured.frequency_Hz,
+            own[:n],
+            measured.damping,
+            own[n:],
+            (found.frequency_Hz - measured.frequency_Hz) / total[:n],
+            (found.damping - measured.damping) / total[n:],
+        ]
+    columns = [
+        found.frequency_Hz,
+        found.frequency_std_Hz,
+        found.damping,
+        found.damping_std,
+        before.frequency_Hz,
+        before.damping,
+        *beside,
+    ]
     return tuple(ModeRow(shape, *map(float, row)) for shape, *row in zip(found.words, *columns, strict=True))
 
 
@@ -175,12 +191,23 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
     x = np.concatenate([np.log(start.frequency_Hz), np.log(np.maximum(start.damping, 1e-4))])
     n = len(start.damping)
     reach = np.concatenate([np.full(n, 0.2), np.full(n, 2.0)])
-    best = least_squares(lambda z: problem.evaluate(tuple(z))[0], x, lambda z: problem.evaluate(tuple(z))[1],
-                         bounds=(x - reach, x + reach), x_scale="jac", ftol=1e-10, xtol=1e-8, max_nfev=40)
+    best = least_squares(
+        lambda z: problem.evaluate(tuple(z))[0],
+        x,
+        lambda z: problem.evaluate(tuple(z))[1],
+        bounds=(x - reach, x + reach),
+        x_scale="jac",
+        ftol=1e-10,
+        xtol=1e-8,
+        max_nfev=40,
+    )
     if np.any(np.abs(best.x - x) > 0.99 * reach) or not best.success:
-        raise ComputationError("the fit of the measured modes did not converge",
-                               measured=f"modes at {np.round(np.exp(best.x[:n]), 3).tolist()} Hz",
-                               cause="modes hidden by noise, or not excited", next_step="check the responses")
+        raise ComputationError(
+            "the fit of the measured modes did not converge",
+            measured=f"modes at {np.round(np.exp(best.x[:n]), 3).tolist()} Hz",
+            cause="modes hidden by noise, or not excited",
+            next_step="check the responses",
+        )
     frequency, damping = np.exp(best.x[:n]), np.exp(best.x[n:])
     misfit = 2 * best.cost / (best.fun.size - problem.unknowns - 2 * n)
     scale = np.concatenate([frequency, damping])
@@ -198,11 +225,13 @@ def _of_one_kind(model: ResponseModel, blocks: Sequence[SpectralBlock]) -> tuple
     best = max(dict.fromkeys(kinds), key=lambda kind: (not kind[0], kinds.count(kind)))
     own = [k for k, kind in enumerate(kinds) if kind == best]
     chosen = replace(sensors.picked(own), relative=np.zeros(len(own), bool))
-    free = tuple(name for name in model.names if not name.startswith("sensor.")
-                 or name.removeprefix("sensor.") in chosen.names)
+    free = tuple(
+        name for name in model.names if not name.startswith("sensor.") or name.removeprefix("sensor.") in chosen.names
+    )
     return replace(model, names=free, sensors=chosen), [
         replace(block, Y=block.Y[:, own], noise=None if block.noise is None else block.noise[..., own, :][..., own])
-        for block in blocks]
+        for block in blocks
+    ]
 
 
 class _Poles:
@@ -216,20 +245,28 @@ class _Poles:
     def __init__(self, blocks: Sequence[SpectralBlock], model: ResponseModel, modes: int):
         self.modes, self.n_y = modes, len(model.sensors.names)
         if not blocks:
-            raise ComputationError("the modes cannot be measured", measured="no lines near them",
-                                   cause="a band that does not contain the modes", next_step="use a wider band")
+            raise ComputationError(
+                "the modes cannot be measured",
+                measured="no lines near them",
+                cause="a band that does not contain the modes",
+                next_step="use a wider band",
+            )
         total = np.sum([np.sum(np.abs(block.U) ** 2, axis=(0, 2)) for block in blocks], axis=0)
         driven = np.flatnonzero(total > 1e-12 * total.max())
         parts = [_rows(block, model, driven) for block in blocks]
         self.omega, self.Y, self.weight, self.correlation = (
-            np.concatenate([part[k] for part in parts], axis=axis) for k, axis in ((0, 0), (1, 1), (2, 1), (3, 0)))
+            np.concatenate([part[k] for part in parts], axis=axis) for k, axis in ((0, 0), (1, 1), (2, 1), (3, 0))
+        )
         self.through = np.hstack([np.concatenate([part[4] for part in parts]), la.block_diag(*[p[5] for p in parts])])
         self.beside = np.hstack([np.concatenate([part[6] for part in parts]), la.block_diag(*[p[7] for p in parts])])
         columns = 2 * modes * self.through.shape[1] + self.beside.shape[1]
         if 2 * len(self.omega) < FEWEST_PER_UNKNOWN * columns:
-            raise ComputationError("the modes cannot be measured without the rig's equations",
-                                   measured=f"{2 * len(self.omega)} numbers per output for {columns} unknown residues",
-                                   cause="too few lines near the modes for so many inputs", next_step="longer records")
+            raise ComputationError(
+                "the modes cannot be measured without the rig's equations",
+                measured=f"{2 * len(self.omega)} numbers per output for {columns} unknown residues",
+                cause="too few lines near the modes for so many inputs",
+                next_step="longer records",
+            )
         self.unknowns = columns * self.n_y
         self.evaluate = lru_cache(maxsize=2)(self._evaluate)
 
@@ -237,8 +274,8 @@ class _Poles:
         """Residual (N,) of unit variance and its Jacobian (N, 2 modes) by log w, log zeta."""
         n, s = self.modes, 1j * self.omega[:, None]
         w, zeta = 2 * np.pi * np.exp(x[:n]), np.exp(x[n:])
-        den = s ** 2 + 2 * zeta * w * s + w ** 2
-        slopes = np.hstack([-(2 * zeta * w * s + 2 * w ** 2) / den ** 2, -(2 * zeta * w * s) / den ** 2])
+        den = s**2 + 2 * zeta * w * s + w**2
+        slopes = np.hstack([-(2 * zeta * w * s + 2 * w**2) / den**2, -(2 * zeta * w * s) / den**2])
         # Columns: residue or its slope, mode, what is filtered.
         powers = np.stack([np.ones_like(s), s / np.abs(s).max()])
         poles = powers[..., None] / den[None, :, :, None] * self.through[:, None, :]
@@ -251,7 +288,7 @@ class _Poles:
             b = _real(weight * y)
             # By pivoted QR: the divide-and-conquer SVD of numpy's lstsq may not converge.
             c = la.lstsq(R, Q.T @ b, cond=1e-12, lapack_driver="gelsy")[0] / size
-            c = c[:poles.shape[0] * n * self.through.shape[1]]
+            c = c[: poles.shape[0] * n * self.through.shape[1]]
             filtered = np.einsum("akc,amc->km", powers * self.through, c.reshape(2, n, -1))
             slope = _real(weight[:, None] * np.tile(filtered, 2) * slopes)
             left.append(b - Q @ (Q.T @ b))
@@ -284,8 +321,16 @@ def _rows(block: SpectralBlock, model: ResponseModel, driven: np.ndarray) -> tup
     impulse, own = np.zeros((m * n, 0), complex), np.zeros((m * n, 0), complex)
     if block.transient:
         impulse, own = chain[:, None], model.chain_transients(s)[0]
-    return (omega, np.moveaxis(block.Y, (1, 2), (0, 1)).reshape(n_y, m * n), np.sqrt(2) / sigma.T,
-            noise / (sigma[:, :, None] * sigma[:, None, :]), inputs, impulse, folded[:, None] * U[:, volts], own)
+    return (
+        omega,
+        np.moveaxis(block.Y, (1, 2), (0, 1)).reshape(n_y, m * n),
+        np.sqrt(2) / sigma.T,
+        noise / (sigma[:, :, None] * sigma[:, None, :]),
+        inputs,
+        impulse,
+        folded[:, None] * U[:, volts],
+        own,
+    )
 
 
 def _real(x: np.ndarray) -> np.ndarray:

@@ -43,12 +43,13 @@ def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> li
         power = np.sum(np.abs(block.Y) ** 2, axis=2)
         width = max(3, len(block.omega) // 20)
         level = uniform_filter1d(power, width, axis=0, mode="nearest") + 1e-12 * power.max(0)
-        found.append(block.with_noise(fraction ** 2 * level[:, :, None] * np.eye(level.shape[1])))
+        found.append(block.with_noise(fraction**2 * level[:, :, None] * np.eye(level.shape[1])))
     return found
 
 
-def noise_from_residuals(residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], model: FrequencyModel
-                         ) -> list[SpectralBlock]:
+def noise_from_residuals(
+    residuals: Sequence[Residual], blocks: Sequence[SpectralBlock], model: FrequencyModel
+) -> list[SpectralBlock]:
     """Blocks with the covariance of a model's residuals near their lines, averaged over records of a kind.
 
     The window grows until the covariance has LEAST_DOF degrees of freedom, and three for each output.
@@ -147,14 +148,21 @@ def _outer(e: np.ndarray) -> np.ndarray:
 
 def _density(pool: Sequence[Residual]) -> float:
     """Number of lines times experiments per rad/s, of all records together."""
-    return max(sum(len(one.block.omega) * one.error.shape[2] / np.ptp(one.block.omega) for one in pool
-                   if len(one.block.omega) > 1), 1e-9)
+    return max(
+        sum(
+            len(one.block.omega) * one.error.shape[2] / np.ptp(one.block.omega)
+            for one in pool
+            if len(one.block.omega) > 1
+        ),
+        1e-9,
+    )
 
 
-def _window_sums(pool: Sequence[Residual], values: Sequence[np.ndarray], omega: np.ndarray, half: float
-                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of values (one array per record, by line) within half of each omega, at least one line; and their numbers.
-    """
+def _window_sums(
+    pool: Sequence[Residual], values: Sequence[np.ndarray], omega: np.ndarray, half: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of values (one array per record, by line) within half of each omega, at least one line; and their
+    numbers."""
     total, count = np.zeros((len(omega), *values[0].shape[1:]), values[0].dtype), np.zeros(len(omega))
     for one, value in zip(pool, values, strict=True):
         own = one.block.omega

@@ -61,7 +61,7 @@ class ResponseOverlay(MeasuredOverlay):
         """Fraction of the measured entries within two standard deviations (95 % of a circular normal error) of the
         model; a bias of the measured response counts against it too."""
         # P(|e|^2 < r s^2) = 1 - exp(-r/2) for real and imaginary variance s^2.
-        return float(np.mean(np.abs(self.measured - self.model) ** 2 < -2 * np.log(0.05) * self.measured_std ** 2))
+        return float(np.mean(np.abs(self.measured - self.model) ** 2 < -2 * np.log(0.05) * self.measured_std**2))
 
 
 def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseModel) -> ResponseOverlay:
@@ -79,10 +79,16 @@ def overlay(measured: FrequencyResponse, model: ResponseModel, start: ResponseMo
     rows = places(model.sensors.names, measured.outputs, "the response has", "outputs")
     U = np.broadcast_to(V.astype(complex), (len(measured.omega), *V.shape))
     return ResponseOverlay(
-        measured.frequency_Hz, measured.inputs, model.sensors.names,
-        f"{measured.output_unit} per {measured.input_unit}", measured.value[:, rows],
-        measured.standard_deviation[:, rows] / np.sqrt(2), measured.method,
-        start.driven(measured.omega, U, False).Y, model.driven(measured.omega, U, False).Y)
+        measured.frequency_Hz,
+        measured.inputs,
+        model.sensors.names,
+        f"{measured.output_unit} per {measured.input_unit}",
+        measured.value[:, rows],
+        measured.standard_deviation[:, rows] / np.sqrt(2),
+        measured.method,
+        start.driven(measured.omega, U, False).Y,
+        model.driven(measured.omega, U, False).Y,
+    )
 
 
 def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tuple[FrequencyResponse, np.ndarray]:
@@ -109,8 +115,9 @@ def _along_coordinates(measured: FrequencyResponse, model: ResponseModel) -> tup
     return measured.along(V[place][:, known], tuple(chosen), unit), V[:, known]
 
 
-def measured_response(data: Campaign | FrequencyResponse, band_Hz: tuple[float, float], model: ResponseModel
-                      ) -> FrequencyResponse:
+def measured_response(
+    data: Campaign | FrequencyResponse, band_Hz: tuple[float, float], model: ResponseModel
+) -> FrequencyResponse:
     """The given response; for records their best linear approximation if possible, otherwise a local polynomial
     estimate.
 

@@ -11,8 +11,21 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig import Rig
 
 _SPRINGS = tuple(f"k_s{k}" for k in range(1, 5))
-_HALCYONICS = ("Ixx", "Iyy", "Izz", *_SPRINGS, "k_a", "k_t", "k_r", "d1", "d3", "d4", "d5", "d6",
-               *(f"e{k}" for k in range(1, 9)))
+_HALCYONICS = (
+    "Ixx",
+    "Iyy",
+    "Izz",
+    *_SPRINGS,
+    "k_a",
+    "k_t",
+    "k_r",
+    "d1",
+    "d3",
+    "d4",
+    "d5",
+    "d6",
+    *(f"e{k}" for k in range(1, 9)),
+)
 _LOAD = ("load.L7", "load.L8", "load.L9", "load.Ixx", "load.Iyy", "load.Izz", "load.Ixy")
 
 
@@ -46,7 +59,8 @@ def named_parameters(model_of: Rig, patterns: Sequence[str], unit: str = "V") ->
         if not matching:
             near = difflib.get_close_matches(pattern, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
-            raise InputError(f"the rig {model_of.name} has no parameter that matches; {hint}", field="parameters",
-                             value=pattern)
+            raise InputError(
+                f"the rig {model_of.name} has no parameter that matches; {hint}", field="parameters", value=pattern
+            )
         found |= dict.fromkeys(matching)
     return tuple(found)

@@ -86,8 +86,9 @@ def prediction_error(model: FrequencyModel, block: SpectralBlock, derivative: bo
         basis, _ = span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
         rank, lost = basis.shape[1], _lost(L, basis, block)
     slopes = _complex(J, (n, n_y, m)) / np.sqrt(2) if derivative else np.empty((0, n, n_y, m), complex)
-    return PredictionError(block, left.error + left.transient, left.error, left.white, slopes, 2 * n * n_y * m - rank,
-                           2 * n * m - lost)
+    return PredictionError(
+        block, left.error + left.transient, left.error, left.white, slopes, 2 * n * n_y * m - rank, 2 * n * m - lost
+    )
 
 
 def _lost(L: np.ndarray, basis: np.ndarray, block: SpectralBlock) -> np.ndarray:

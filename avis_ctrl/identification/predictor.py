@@ -60,18 +60,21 @@ def continuous(model: ResponseModel, beside: bool = False) -> Continuous:
     amplifiers, volts = slice(plain - n_a, plain), slice(0, n_u)
     A, B = np.zeros((size, size)), np.zeros((size, n_in + n_e))
     A[:6, 6:12], A[6:12, :15] = np.eye(6), body[:, :15]
-    B[6:12, n_u:n_in], B[12:15, n_u:n_in] = body[:, 15 + n_u:], np.eye(3)
+    B[6:12, n_u:n_in], B[12:15, n_u:n_in] = body[:, 15 + n_u :], np.eye(3)
     if beside:
-        B[6:12, n_in:n_in + 6] = np.eye(6)
+        B[6:12, n_in : n_in + 6] = np.eye(6)
     if corner:
-        A[6:12, amplifiers] = body[:, 15:15 + n_u]
+        A[6:12, amplifiers] = body[:, 15 : 15 + n_u]
         A[amplifiers, amplifiers], B[amplifiers, volts] = -corner * np.eye(n_u), corner * np.eye(n_u)
     else:
-        B[6:12, volts] = body[:, 15:15 + n_u]
+        B[6:12, volts] = body[:, 15 : 15 + n_u]
     # The motion that the sensors measure, along their axes.
     none = np.zeros((6, n_in + n_e))
-    motion = {"displacement": (np.eye(size)[:6], none), "velocity": (np.eye(size)[6:12], none),
-              "acceleration": (A[6:12].copy(), B[6:12].copy())}
+    motion = {
+        "displacement": (np.eye(size)[:6], none),
+        "velocity": (np.eye(size)[6:12], none),
+        "acceleration": (A[6:12].copy(), B[6:12].copy()),
+    }
     C, D = np.zeros((n_y, size)), np.zeros((n_y, n_in + n_e))
     for k, (chain, part, added) in enumerate(zip(sensors.chains, own, integrators, strict=True)):
         seen_x, seen_e = (rows[k] @ one for one in motion[sensors.motions[k]])
@@ -125,13 +128,13 @@ class Predictor:
         # period.
         whole_step = self._step(1.0)
         self.old, self.new = late[0] @ early[1][:, :n_u], late[1][:, :n_u]
-        self.floor, self.ramp = (step[:, n_u:n_u + 3] for step in whole_step[1:])
+        self.floor, self.ramp = (step[:, n_u : n_u + 3] for step in whole_step[1:])
         self.part = part
         self.x = np.zeros(len(self.Phi))
         self.pending = np.zeros((self.whole + 1, n_u))
         self.table: SteppedTable | None = None
         if large_motion:
-            held, rising = (np.ascontiguousarray(step[:, n_u + 3:]) for step in whole_step[1:])
+            held, rising = (np.ascontiguousarray(step[:, n_u + 3 :]) for step in whole_step[1:])
             self.table, self.arrays = self._stepped(held, rising), rig_arrays(model.rig.mounted_body())
             self.before, self.started = np.zeros(6 + len(model.sensors.names)), False
 
@@ -140,23 +143,34 @@ class Predictor:
         n_u, corner = len(model.actuators), model.amplifier_corner_Hz
         known = [one.name for one in model.rig.mounted_body().actuators]
         chains = sum(0 if chain is None else chain.nstates for chain in model.sensors.realised.chains)
-        of_x, of_volts, of_floor = (np.ascontiguousarray(one) for one in
-                                    np.split(_body(model), [TABLE, TABLE + n_u], axis=1))
+        of_x, of_volts, of_floor = (
+            np.ascontiguousarray(one) for one in np.split(_body(model), [TABLE, TABLE + n_u], axis=1)
+        )
         place, direction = sensors_of(model.rig, model.sensors.names)
-        return SteppedTable(np.ascontiguousarray(self.Phi), held, rising, of_x, of_volts, of_floor,
-                            TABLE + chains if corner else -1,
-                            np.array([known.index(name) for name in model.actuators], np.int64),
-                            np.ascontiguousarray(la.inv(m.M)), place, direction, float(model.turning.motors),
-                            float(model.turning.sensors))
+        return SteppedTable(
+            np.ascontiguousarray(self.Phi),
+            held,
+            rising,
+            of_x,
+            of_volts,
+            of_floor,
+            TABLE + chains if corner else -1,
+            np.array([known.index(name) for name in model.actuators], np.int64),
+            np.ascontiguousarray(la.inv(m.M)),
+            place,
+            direction,
+            float(model.turning.motors),
+            float(model.turning.sensors),
+        )
 
     def _step(self, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Step over a fraction of a period: e^(A h), and the contributions of a constant and a rising unit input."""
         A, B = self.system.A, self.system.B
         n, m = B.shape
         block, h = np.zeros((n + 2 * m, n + 2 * m)), fraction * self.model.period_s
-        block[:n, :n], block[:n, n:n + m], block[n:n + m, n + m:] = A * h, B * h, np.eye(m)
+        block[:n, :n], block[:n, n : n + m], block[n : n + m, n + m :] = A * h, B * h, np.eye(m)
         power = la.expm(block)
-        return power[:n, :n], power[:n, n:n + m], power[:n, n + m:]
+        return power[:n, :n], power[:n, n : n + m], power[:n, n + m :]
 
     def read(self, u: np.ndarray, floor: np.ndarray | None = None) -> np.ndarray:
         """(n, n_y) for commanded u (n, n_u) in the model's order and floor velocity (n, 3) or None.
@@ -167,11 +181,11 @@ class Predictor:
         held = np.vstack([self.pending, u])
         self.pending = held[n:]
         # At sample k the voltage u[k - whole] acts or, if the delay has a fractional part, the voltage before it.
-        new, old = held[1:n + 1], held[:n]
+        new, old = held[1 : n + 1], held[:n]
         drive = new @ self.new.T + old @ self.old.T
         w = np.zeros((n + 1, len(FLOOR)))
         if floor is not None:
-            w[:len(floor)], w[len(floor):] = floor, floor[-1]
+            w[: len(floor)], w[len(floor) :] = floor, floor[-1]
             drive += w[:-1] @ self.floor.T + np.diff(w, axis=0) @ self.ramp.T
         x = np.empty((n, len(self.x)))
         acting = new if not np.any(self.old) else old
@@ -180,8 +194,18 @@ class Predictor:
             step_through_linear(drive, self.x, self.Phi, x)
         else:
             beside = np.empty((n, len(self.before)))
-            step_through(drive, np.ascontiguousarray(self.part * old + (1 - self.part) * new), w[:-1], self.x,
-                         self.before, self.started, self.table, self.arrays, x, beside)
+            step_through(
+                drive,
+                np.ascontiguousarray(self.part * old + (1 - self.part) * new),
+                w[:-1],
+                self.x,
+                self.before,
+                self.started,
+                self.table,
+                self.arrays,
+                x,
+                beside,
+            )
             self.started = self.started or n > 0
             inputs.append(beside)
         y = x @ self.system.C.T

@@ -57,18 +57,27 @@ def sensor_inverse(rig: Rig, y_names: tuple[str, ...], unit: str) -> SensorInver
     sensors = [one for name in y_names for one in rig.sensors() if one.name == name]
     kinds = {(one.quantity, one.zeros, one.poles) for one in sensors}
     if len(kinds) != 1 or not sensors[0].inertial:
-        raise InputError("expected geophones or accelerometers of one kind: the filter inverts a single sensor chain",
-                         field="y names", value=list(y_names))
+        raise InputError(
+            "expected geophones or accelerometers of one kind: the filter inverts a single sensor chain",
+            field="y names",
+            value=list(y_names),
+        )
     # Velocity is the voltage over the chain. Poles at zero: the chain's zeros, and an accelerometer's integration.
     first = sensors[0]
     at_rest = len(first.zeros) + (first.quantity == "acceleration")
     own = np.array([pole for pole in first.poles if pole not in first.low_pass], complex)
-    return SensorInverse("velocity", own, np.zeros(at_rest, complex), np.array([one.gain for one in sensors]),
-                         np.array(first.low_pass, complex))
+    return SensorInverse(
+        "velocity",
+        own,
+        np.zeros(at_rest, complex),
+        np.array([one.gain for one in sensors]),
+        np.array(first.low_pass, complex),
+    )
 
 
-def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz: float = 1.0, order: int = 6
-              ) -> tuple[np.ndarray, np.ndarray]:
+def prefilter(
+    record: Record, inverse: SensorInverse, delay_s: float, corner_Hz: float = 1.0, order: int = 6
+) -> tuple[np.ndarray, np.ndarray]:
     """u (n, n_u) V, delayed as it acts on the actuators, and y (n, n_y) as motion, both after a high-pass.
 
     Parameters
@@ -95,8 +104,10 @@ def prefilter(record: Record, inverse: SensorInverse, delay_s: float, corner_Hz:
         cancelled = int(np.count_nonzero(by == 0))
         sections = signal.zpk2sos([*zeros[cancelled:], *z], [*poles, *p[by != 0]], gain * k)
         return signal.sosfilt(sections, samples, axis=0)
-    u = filtered(delayed(record.u, delay_s * rate), np.zeros(0), inverse.low_pass,
-                 float(np.prod(-inverse.low_pass).real))
+
+    u = filtered(
+        delayed(record.u, delay_s * rate), np.zeros(0), inverse.low_pass, float(np.prod(-inverse.low_pass).real)
+    )
     return u, filtered(record.y / inverse.gain, inverse.zeros, inverse.poles, 1.0)
 
 
@@ -106,5 +117,6 @@ def delayed(u: np.ndarray, samples: float) -> np.ndarray:
     part = max(samples - whole, 0.0)
 
     def shifted(by: int) -> np.ndarray:
-        return np.vstack([np.zeros((min(by, len(u)), u.shape[1])), u[:max(len(u) - by, 0)]])
+        return np.vstack([np.zeros((min(by, len(u)), u.shape[1])), u[: max(len(u) - by, 0)]])
+
     return shifted(whole) if part < 1e-9 else (1 - part) * shifted(whole) + part * shifted(whole + 1)

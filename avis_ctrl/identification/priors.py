@@ -34,8 +34,9 @@ class Priors:
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """(n,) values of the parameters at standardised values z (n,)."""
-        found = np.where(self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z),
-                         self.mean + self.sigma * z)
+        found = np.where(
+            self.positive, self.mean * np.exp(np.where(self.positive, self.sigma, 0.0) * z), self.mean + self.sigma * z
+        )
         # At its bound a parameter has exactly that value, regardless of rounding.
         low, high = self.bounds
         return np.clip(np.where(z <= low, self.low, np.where(z >= high, self.high, found)), self.low, self.high)
@@ -56,15 +57,18 @@ class Priors:
 
     def followed_by(self, other: Priors) -> Priors:
         """Both sets, concatenated."""
+
         def both(name: str) -> np.ndarray:
             return np.concatenate([np.broadcast_to(getattr(one, name), len(one.names)) for one in (self, other)])
+
         return Priors((*self.names, *other.names), *map(both, _FIELDS))
 
     def of(self, names: Sequence[str]) -> Priors:
         """Priors of some parameters, in their order. Raises ValueError for a name that is not among them."""
         rows = [self.names.index(name) for name in names]
-        return Priors(tuple(names), *(np.broadcast_to(getattr(self, field), len(self.names))[rows]
-                                      for field in _FIELDS))
+        return Priors(
+            tuple(names), *(np.broadcast_to(getattr(self, field), len(self.names))[rows] for field in _FIELDS)
+        )
 
     def scaled(self, rows: Sequence[int], factor: float) -> Priors:
         """The priors with some standard deviations multiplied by a factor."""
@@ -104,8 +108,9 @@ def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -
     return Priors(tuple(rest), mean, np.array(list(rest.values())), relative)
 
 
-def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
-               ) -> Priors:
+def identified(
+    model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
+) -> Priors:
     """Priors of the free parameters of a model: as stated (mean, standard deviation), otherwise about their present
     values. The latter are so wide that they affect only combinations that the data do not determine."""
     mean, scale = model.values.copy(), model.scales()
@@ -118,8 +123,8 @@ def identified(model: ResponseModel, stated: Mapping[str, tuple[float, float]], 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """A value of the rig file with a tolerance: its estimate, standard deviation, and shift in units of its tolerance.
-    """
+    """A value of the rig file with a tolerance: its estimate, standard deviation, and shift in units of its
+    tolerance."""
 
     parameter: str
     value: float
@@ -137,8 +142,12 @@ def tolerances_of(rig: Rig) -> Tolerances:
     return getattr(rig, "tolerances", None) or Tolerances()
 
 
-_RELATIVE: Mapping[str, str] = {"actuator": "actuator_gain_percent", "sensor": "sensor_gain_percent",
-                                "corner": "sensor_corner_percent", "damping": "sensor_damping_percent"}
+_RELATIVE: Mapping[str, str] = {
+    "actuator": "actuator_gain_percent",
+    "sensor": "sensor_gain_percent",
+    "corner": "sensor_corner_percent",
+    "damping": "sensor_damping_percent",
+}
 
 
 def _sigma(name: str, t: Tolerances) -> float:

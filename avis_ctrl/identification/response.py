@@ -53,14 +53,19 @@ def _chain_response(chain: StateSpace | None, motion: Motion, lines: bytes) -> n
 
 
 @lru_cache(maxsize=64)
-def _aliases(lines: bytes, period_s: float, delay_s: float, motion: Motion, corner_Hz: float | None,
-             low_pass: tuple[complex, ...]) -> np.ndarray:
+def _aliases(
+    lines: bytes,
+    period_s: float,
+    delay_s: float,
+    motion: Motion,
+    corner_Hz: float | None,
+    low_pass: tuple[complex, ...],
+) -> np.ndarray:
     """(n,) `aliases`; read-only."""
     return aliases(np.frombuffer(lines), period_s, delay_s, motion, corner_Hz, low_pass)
 
 
-def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
-               ) -> Callable[[Model, np.ndarray], Value]:
+def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2) -> Callable[[Model, np.ndarray], Value]:
     """Cache the last `most` results of a method of lines omega, while their models live; they are read-only. A fit
     needs them repeatedly, and records of one kind share their lines."""
     known: list[tuple[ref[Model], np.ndarray, Value]] = []
@@ -77,6 +82,7 @@ def kept_lines(compute: Callable[[Model, np.ndarray], Value], most: int = 2
         value = compute(model, omega)
         known[:] = [*known, (ref(model, forget), omega, value)][-most:]
         return value
+
     return found
 
 
@@ -110,7 +116,7 @@ class SensorModel:
             return 1.0
         (f0, z0), (f, z) = known, own
         w0, w = 2 * np.pi * f0, 2 * np.pi * f
-        return (s ** 2 + 2 * z0 * w0 * s + w0 ** 2) / (s ** 2 + 2 * z * w * s + w ** 2)
+        return (s**2 + 2 * z0 * w0 * s + w0**2) / (s**2 + 2 * z * w * s + w**2)
 
     @property
     def detuned(self) -> dict[str, tuple[float, float]]:
@@ -123,7 +129,7 @@ class SensorModel:
         damping ratio; s (n, 1)."""
         f, z = np.array([self.suspensions[one] for one in k], float).T
         w = 2 * np.pi * f
-        den = s ** 2 + 2 * z * w * s + w ** 2
+        den = s**2 + 2 * z * w * s + w**2
         return -2 * np.pi * (2 * z * s + 2 * w) / den, -2 * w * s / den
 
     @property
@@ -138,11 +144,21 @@ class SensorModel:
 
     def picked(self, index: Sequence[int]) -> SensorModel:
         """The sensors at `index`, in that order; an index may be repeated."""
+
         def of(values: tuple[Value, ...]) -> tuple[Value, ...]:
             return tuple(values[k] for k in index)
-        return SensorModel(of(self.names), of(self.motions), of(self.chains), self.sensitivity[list(index)], self.unit,
-                           of(self.sensitivity_units), of(self.poles), self.relative[list(index)],
-                           low_pass=self.low_pass)
+
+        return SensorModel(
+            of(self.names),
+            of(self.motions),
+            of(self.chains),
+            self.sensitivity[list(index)],
+            self.unit,
+            of(self.sensitivity_units),
+            of(self.poles),
+            self.relative[list(index)],
+            low_pass=self.low_pass,
+        )
 
     @property
     def alike(self) -> bool:
@@ -173,11 +189,17 @@ class SensorModel:
         """(n, n_y) response from displacement to y of unit sensitivity."""
         s = 1j * np.asarray(omega, float)
         lines = s.imag.tobytes()
-        return np.stack([_chain_response(chain, motion, lines) * self._detuned(s, k) for k, (chain, motion) in
-                         enumerate(zip(self.chains, self.motions, strict=True))], axis=1)
+        return np.stack(
+            [
+                _chain_response(chain, motion, lines) * self._detuned(s, k)
+                for k, (chain, motion) in enumerate(zip(self.chains, self.motions, strict=True))
+            ],
+            axis=1,
+        )
 
-    def driven(self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None
-               ) -> tuple[np.ndarray, np.ndarray]:
+    def driven(
+        self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(n,) response from commanded to acting volts: hold, delay and amplifier; and (n, n_y) `aliases` of each
         sensor's motion. They pass the chain far above its corners, where its gain is that of the anti-alias filter
         alone."""
@@ -187,7 +209,8 @@ class SensorModel:
             return np.exp(-1j * omega * delay_s) / lag, np.zeros((len(omega), len(self.motions)), complex)
         lines = omega.tobytes()
         return hold(omega, period_s, delay_s) / lag, np.stack(
-            [_aliases(lines, period_s, delay_s, motion, corner_Hz, self.low_pass) for motion in self.motions], axis=1)
+            [_aliases(lines, period_s, delay_s, motion, corner_Hz, self.low_pass) for motion in self.motions], axis=1
+        )
 
 
 def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) -> SensorModel:
@@ -202,21 +225,35 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     at = places(chosen, known, f"the sensors of the rig {rig.name} are", "y names")
     n = len(chosen)
     if unit in MOTION_OF_UNIT:
-        return SensorModel(chosen, (MOTION_OF_UNIT[unit],) * n, (None,) * n, np.ones(n), unit,
-                           (f"{unit} per {unit}",) * n, ((1.0,),) * n, np.zeros(n, bool))
+        return SensorModel(
+            chosen,
+            (MOTION_OF_UNIT[unit],) * n,
+            (None,) * n,
+            np.ones(n),
+            unit,
+            (f"{unit} per {unit}",) * n,
+            ((1.0,),) * n,
+            np.zeros(n, bool),
+        )
     if unit != "V":
         raise InputError(f"expected V, {', '.join(MOTION_OF_UNIT)}", field="unit of y", value=unit)
     sensors = [rig.sensors()[k] for k in at]
     # Identical sensors share one chain object, whose response is computed once.
     systems = {(one.zeros, one.poles, one.quantity): one.chain(1.0) for one in sensors}
     units = {"velocity": "V s/m", "acceleration": "V s^2/m", "displacement": "V/m"}
-    return SensorModel(chosen, tuple(one.quantity for one in sensors),
-                       tuple(systems[one.zeros, one.poles, one.quantity] for one in sensors),
-                       np.array([one.gain for one in sensors]), "V", tuple(units[one.quantity] for one in sensors),
-                       tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles)))[::-1].tolist()) for one in sensors),
-                       np.array([not one.inertial for one in sensors]),
-                       tuple(one.suspension for one in sensors), tuple(one.suspension for one in sensors),
-                       sensors[0].low_pass if sensors else ())
+    return SensorModel(
+        chosen,
+        tuple(one.quantity for one in sensors),
+        tuple(systems[one.zeros, one.poles, one.quantity] for one in sensors),
+        np.array([one.gain for one in sensors]),
+        "V",
+        tuple(units[one.quantity] for one in sensors),
+        tuple(tuple(np.atleast_1d(np.real(np.poly(one.poles)))[::-1].tolist()) for one in sensors),
+        np.array([not one.inertial for one in sensors]),
+        tuple(one.suspension for one in sensors),
+        tuple(one.suspension for one in sensors),
+        sensors[0].low_pass if sensors else (),
+    )
 
 
 class Matrices(NamedTuple):
@@ -276,8 +313,12 @@ class Operands:
         if np.any(self.floor):
             springs += [(d.K_floor[:, :, :n_f], self.floor), (d.C_floor[:, :, :n_f], s * self.floor)]
         # Map from a vector to y, and the matrices with the vectors they multiply; only rows (p) with nonzero entries.
-        for left, entries in ((self.left, springs), (-self.inertial, [(d.M, s ** 2 * q)]), (-aliased, [(d.M, folded)]),
-                              (self.left * self.hold + aliased, [(d.T, self.volts)])):
+        for left, entries in (
+            (self.left, springs),
+            (-self.inertial, [(d.M, s**2 * q)]),
+            (-aliased, [(d.M, folded)]),
+            (self.left * self.hold + aliased, [(d.T, self.volts)]),
+        ):
             rows = np.flatnonzero(sum(np.any(A, axis=(1, 2)) for A, _ in entries))
             if rows.size:
                 dY[..., rows] += left[:, None] @ sum(_products(A[rows], x) for A, x in entries)
@@ -286,12 +327,15 @@ class Operands:
         rows, k = np.nonzero(np.any(d.R, axis=2))
         if rows.size:
             R = d.R[rows, k]
-            against = R[:, :self.chassis.shape[1]] * self.sensors.relative[k, None]
+            against = R[:, : self.chassis.shape[1]] * self.sensors.relative[k, None]
             change = self.sense[:, k] * (R @ q - against @ self.chassis) + alias[:, k] * (R @ folded)
             dY[:, :, k, rows] += change.swapaxes(1, 2)
         for kind in ("sensor", "corner", "damping"):
-            own = [(j, self.sensors.names.index(name.removeprefix(f"{kind}."))) for j, name in enumerate(names)
-                   if name.startswith(f"{kind}.")]
+            own = [
+                (j, self.sensors.names.index(name.removeprefix(f"{kind}.")))
+                for j, name in enumerate(names)
+                if name.startswith(f"{kind}.")
+            ]
             if not own:
                 continue
             rows, k = np.array(own).T
@@ -317,39 +361,58 @@ class FrequencyModel(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Free parameters."""
+
     @property
     def units(self) -> tuple[str, ...]:
         """(n_p,) their units."""
+
     @property
     def values(self) -> np.ndarray:
         """(n_p,) their present values; read-only."""
+
     @property
     def actuators(self) -> tuple[str, ...]:
         """Driven inputs."""
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Actuators, then the floor's velocities."""
+
     @property
     def matrices(self) -> Matrices:
         """Equations of motion and sensor rows."""
+
     @property
     def derivative_matrices(self) -> Matrices:
         """Derivatives by the free parameters."""
+
     def scales(self) -> np.ndarray:
         """(n_p,) size of one relative unit of each parameter."""
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_p,) lower and upper bounds in a fit that starts here."""
+
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """(n_p,) largest relative decrease and increase in one step of a fit."""
+
     def at(self, theta: Sequence[float] | np.ndarray) -> Self:
         """The model with its free parameters at theta."""
+
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """y for spectra of the inputs."""
-    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
-               inner: np.ndarray | None = None) -> Driven:
+
+    def answer(
+        self,
+        block: SpectralBlock,
+        body: np.ndarray | None = None,
+        derivative: bool = True,
+        inner: np.ndarray | None = None,
+    ) -> Driven:
         """y of a block of data."""
+
     def sensor_transients(self, omega: np.ndarray) -> np.ndarray:
         """Transients of the sensors."""
+
     def inner_transients(self, omega: np.ndarray) -> np.ndarray:
         """y by initial states other than those of body and sensors."""
 
@@ -400,14 +463,26 @@ class ResponseModel:
         places(self.actuators, available, f"the actuators of the rig {self.rig.name} are", "u names")
 
     @staticmethod
-    def of(rig: Rig, names: Sequence[str], unit: str = "V", sensors: Sequence[str] | None = None,
-           actuators: Sequence[str] | None = None, sampled: bool = True,
-           amplifier_corner_Hz: float | None = None) -> ResponseModel:
+    def of(
+        rig: Rig,
+        names: Sequence[str],
+        unit: str = "V",
+        sensors: Sequence[str] | None = None,
+        actuators: Sequence[str] | None = None,
+        sampled: bool = True,
+        amplifier_corner_Hz: float | None = None,
+    ) -> ResponseModel:
         """The model of a rig with its own sample rate and delay."""
         driven = tuple(actuators) if actuators is not None else rig.equations_of_motion().actuators
-        return ResponseModel(rig, tuple(names), sensor_model(rig, unit, sensors), driven,
-                             1 / rig.sample_rate_Hz if sampled else 0.0, rig.loop_delay_s if sampled else 0.0,
-                             amplifier_corner_Hz)
+        return ResponseModel(
+            rig,
+            tuple(names),
+            sensor_model(rig, unit, sensors),
+            driven,
+            1 / rig.sample_rate_Hz if sampled else 0.0,
+            rig.loop_delay_s if sampled else 0.0,
+            amplifier_corner_Hz,
+        )
 
     @property
     def _known(self) -> frozenset[str]:
@@ -417,8 +492,9 @@ class ResponseModel:
     def all_parameters(self) -> dict[str, Parameter]:
         """All parameters that may be free."""
         found = dict(self.rig.parameters())
-        for name, value, unit in zip(self.sensors.names, self.sensors.sensitivity, self.sensors.sensitivity_units,
-                                     strict=True):
+        for name, value, unit in zip(
+            self.sensors.names, self.sensors.sensitivity, self.sensors.sensitivity_units, strict=True
+        ):
             found[f"sensor.{name}"] = Parameter(float(value), unit, f"sensitivity of {name}")
         for name, own in zip(self.sensors.names, self.sensors.suspensions or (), strict=False):
             if own is not None:
@@ -463,23 +539,39 @@ class ResponseModel:
     def require_rate(self, header: RecordHeader) -> None:
         """Raise InputError for a record that was sampled at another rate."""
         if self.period_s and abs(header.sample_rate_Hz * self.period_s - 1) > 1e-6:
-            raise InputError(f"expected the rig's own {1 / self.period_s:g} Hz", value=header.sample_rate_Hz,
-                             field=f"record {header.name}: sample_rate_Hz")
+            raise InputError(
+                f"expected the rig's own {1 / self.period_s:g} Hz",
+                value=header.sample_rate_Hz,
+                field=f"record {header.name}: sample_rate_Hz",
+            )
 
     def at(self, theta: Sequence[float] | np.ndarray) -> Self:
         """The model with its free parameters at theta (n_p,). Raises InputError if no rig has these values."""
         values = dict(zip(self.names, np.asarray(theta, float).tolist(), strict=True))
-        sensitivity = np.array([values.get(f"sensor.{name}", old) for name, old
-                                in zip(self.sensors.names, self.sensors.sensitivity, strict=True)])
+        sensitivity = np.array(
+            [
+                values.get(f"sensor.{name}", old)
+                for name, old in zip(self.sensors.names, self.sensors.sensitivity, strict=True)
+            ]
+        )
         delay = values.get("loop_delay_s", self.delay_s)
         if not 0 <= delay < 1:
             raise InputError("expected a delay from 0 to 1 s", field="loop_delay_s", value=delay)
-        of_rig = {name: value for name, value in values.items()
-                  if not name.startswith(("sensor.", "corner.", "damping.")) and name != "loop_delay_s"}
-        own = tuple(old and (values.get(f"corner.{name}", old[0]), values.get(f"damping.{name}", old[1]))
-                    for name, old in zip(self.sensors.names, self.sensors.suspensions, strict=False))
-        return replace(self, rig=self.rig.with_parameters(of_rig), delay_s=delay,
-                       sensors=replace(self.sensors, sensitivity=sensitivity, suspensions=own))
+        of_rig = {
+            name: value
+            for name, value in values.items()
+            if not name.startswith(("sensor.", "corner.", "damping.")) and name != "loop_delay_s"
+        }
+        own = tuple(
+            old and (values.get(f"corner.{name}", old[0]), values.get(f"damping.{name}", old[1]))
+            for name, old in zip(self.sensors.names, self.sensors.suspensions, strict=False)
+        )
+        return replace(
+            self,
+            rig=self.rig.with_parameters(of_rig),
+            delay_s=delay,
+            sensors=replace(self.sensors, sensitivity=sensitivity, suspensions=own),
+        )
 
     @cached_property
     def matrices(self) -> Matrices:
@@ -522,8 +614,13 @@ class ResponseModel:
         n, n_in = len(omega), len(self.inputs)
         return self.driven(omega, np.broadcast_to(np.eye(n_in, dtype=complex), (n, n_in, n_in)), derivative=False).Y
 
-    def answer(self, block: SpectralBlock, body: np.ndarray | None = None, derivative: bool = True,
-               inner: np.ndarray | None = None) -> Driven:
+    def answer(
+        self,
+        block: SpectralBlock,
+        body: np.ndarray | None = None,
+        derivative: bool = True,
+        inner: np.ndarray | None = None,
+    ) -> Driven:
         """y of a block of data; body (n, 12, m) : impulses and steps of the transient, added to the block's inputs;
         inner : initial states other than those of body and sensors, of which this model has none."""
         U = block.U if body is None else np.concatenate([block.U, body], axis=1)
@@ -546,7 +643,7 @@ class ResponseModel:
         found = np.zeros((len(omega), len(self.sensors.names), len(known), 2), complex)
         for j, (k, (corner, damping)) in enumerate(known):
             w = 2 * np.pi * corner
-            ring = filtered * w ** 2 / (s ** 2 + 2 * damping * w * s + w ** 2)
+            ring = filtered * w**2 / (s**2 + 2 * damping * w * s + w**2)
             found[:, k, j] = np.stack([ring, s / w * ring], axis=-1)
         return found.reshape(*found.shape[:2], -1)
 
@@ -555,7 +652,7 @@ class ResponseModel:
         each, start = self.chain_transients(1j * omega), 0
         found = np.zeros((len(omega), len(each), sum(own.shape[1] for own in each)), complex)
         for k, own in enumerate(each):
-            found[:, k, start:start + own.shape[1]] = own
+            found[:, k, start : start + own.shape[1]] = own
             start += own.shape[1]
         return found
 
@@ -564,7 +661,7 @@ class ResponseModel:
         and a constant and a slope in frequency for the aliases of all other transients; s (n,) j omega."""
         known = {}
         for poles in dict.fromkeys(self.sensors.poles):
-            states = (s ** k / np.polyval(np.asarray(poles)[::-1], s) for k in range(len(poles) - 1))
+            states = (s**k / np.polyval(np.asarray(poles)[::-1], s) for k in range(len(poles) - 1))
             known[poles] = np.stack([*states, np.ones(len(s)), s], axis=-1)
         return [known[poles] for poles in self.sensors.poles]
 
@@ -580,7 +677,7 @@ class ResponseModel:
         omega = np.asarray(omega, float)
         s, mat, n_u = 1j * omega[:, None, None], self.matrices, len(self.actuators)
         a, alias, inverse, out = self._lines(omega)
-        volts, floor = U[:, :n_u], U[:, n_u:n_u + 3]
+        volts, floor = U[:, :n_u], U[:, n_u : n_u + 3]
         force = np.zeros((len(omega), N_Q, U.shape[2]), complex)
         driven, moving = np.any(volts), np.any(floor)
         if driven:
@@ -588,7 +685,7 @@ class ResponseModel:
         if moving:
             force += (mat.K_floor[:, :3] / s + mat.C_floor[:, :3]) @ floor
         if U.shape[1] > len(self.inputs):
-            force += U[:, n_u + 3:n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q:]
+            force += U[:, n_u + 3 : n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q :]
         q = inverse @ force
         seen = mat.R @ q
         if moving and np.any(self.sensors.relative):
@@ -608,15 +705,23 @@ class ResponseModel:
             dY[self.names.index("loop_delay_s")] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
         return Driven(Y, dY)
 
-    def _delay_derivative(self, omega: np.ndarray, volts: np.ndarray, mat: Matrices, inverse: np.ndarray,
-                          out: np.ndarray, Minv: np.ndarray) -> np.ndarray:
+    def _delay_derivative(
+        self,
+        omega: np.ndarray,
+        volts: np.ndarray,
+        mat: Matrices,
+        inverse: np.ndarray,
+        out: np.ndarray,
+        Minv: np.ndarray,
+    ) -> np.ndarray:
         """Exact for the continuous term; a difference for the aliases, which are small and have a kink at whole
         samples."""
         s, step = 1j * omega[:, None, None], 1e-4 * (self.period_s or 1e-3)
         a, _ = self.drive(omega)
         earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
-        slope = (replace(self, delay_s=later).drive(omega)[1]
-                 - replace(self, delay_s=earlier).drive(omega)[1]) / (later - earlier)
+        slope = (replace(self, delay_s=later).drive(omega)[1] - replace(self, delay_s=earlier).drive(omega)[1]) / (
+            later - earlier
+        )
         moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + slope * (mat.R @ Minv @ mat.T @ volts)
         return self.sensors.sensitivity[:, None] * moved
 
@@ -624,12 +729,12 @@ class ResponseModel:
     def _lines(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """`drive`, inv(D) (n, 6, 6), and the responses of the sensor chains (n, n_y, 1)."""
         s, mat = 1j * omega[:, None, None], self.matrices
-        inverse = np.linalg.inv(mat.K + s * mat.C + s ** 2 * mat.M)
+        inverse = np.linalg.inv(mat.K + s * mat.C + s**2 * mat.M)
         return *self.drive(omega), inverse, self.sensors.sense(omega)[:, :, None]
 
     def drive(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Response from commanded voltage to force divided by T (n, 1, 1), and the aliases of each sensor (n, n_y, 1).
-        """
+        """Response from commanded voltage to force divided by T (n, 1, 1), and the aliases of each sensor (n,
+        n_y, 1)."""
         a, folded = self.sensors.driven(omega, self.period_s, self.delay_s, self.amplifier_corner_Hz)
         return a[:, None, None], folded[:, :, None]
 

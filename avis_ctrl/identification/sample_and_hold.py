@@ -52,11 +52,17 @@ def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: compl
         return (np.exp(pole * high * period_s) - np.exp(pole * low * period_s)) / pole
 
     new, old = integral(0, 1 - part), integral(1 - part, 1)
-    return z ** -whole * (new + old / z) / (z - np.exp(pole * period_s))
+    return z**-whole * (new + old / z) / (z - np.exp(pole * period_s))
 
 
-def aliases(omega: np.ndarray, period_s: float, delay_s: float, motion: Motion,
-            amplifier_corner_Hz: float | None = None, low_pass: Sequence[complex] = ()) -> np.ndarray:
+def aliases(
+    omega: np.ndarray,
+    period_s: float,
+    delay_s: float,
+    motion: Motion,
+    amplifier_corner_Hz: float | None = None,
+    low_pass: Sequence[complex] = (),
+) -> np.ndarray:
     """(n,) contribution of the terms k != 0 to the motion per force and mass: exact sampled response minus the term k =
     0.
 
@@ -76,7 +82,9 @@ def aliases(omega: np.ndarray, period_s: float, delay_s: float, motion: Motion,
         exact = np.exp(-1j * omega * period_s * np.ceil(delay_s / period_s - 1e-9))
         if poles.size:
             residues = [gain / np.prod(pole - np.delete(poles, k)) for k, pole in enumerate(poles)]
-            exact = sum(residue * sampled_pole(omega, period_s, delay_s, pole)
-                        for residue, pole in zip(residues, poles, strict=True))
+            exact = sum(
+                residue * sampled_pole(omega, period_s, delay_s, pole)
+                for residue, pole in zip(residues, poles, strict=True)
+            )
         # At zero frequency both integrators are infinite with a finite difference, but no velocity is measured there.
         return np.where(omega == 0, 0.0, exact - continuous)

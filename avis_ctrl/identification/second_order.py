@@ -26,8 +26,9 @@ PIECE = 1 << 17
 EVIDENCE = 2 * np.log(19.0)
 
 
-def terms(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel,
-          turnings: Sequence[Turning] | None = None) -> list[np.ndarray]:
+def terms(
+    campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel, turnings: Sequence[Turning] | None = None
+) -> list[np.ndarray]:
     """(k, n, n_y, 1) for each block: the second-order terms of its record, for each of k turnings.
 
     blocks : of the campaign's records, or of pieces of them. turnings : by default only the model's own.
@@ -35,8 +36,9 @@ def terms(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseMo
     ways = [model.turning] if turnings is None else list(turnings)
     found: list[np.ndarray] = [np.zeros(0)] * len(blocks)
     for record in campaign.records:
-        own = sorted((k for k, block in enumerate(blocks) if block.name == record.header.name),
-                     key=lambda k: blocks[k].start_s)
+        own = sorted(
+            (k for k, block in enumerate(blocks) if block.name == record.header.name), key=lambda k: blocks[k].start_s
+        )
         if own:
             models = [replace(model, turning=way) for way in ways]
             for k, spectra in zip(own, _of_record(record, [blocks[k] for k in own], models), strict=True):
@@ -44,8 +46,9 @@ def terms(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseMo
     return found
 
 
-def _of_record(record: RecordSource, blocks: Sequence[SpectralBlock], models: Sequence[ResponseModel]
-               ) -> list[np.ndarray]:
+def _of_record(
+    record: RecordSource, blocks: Sequence[SpectralBlock], models: Sequence[ResponseModel]
+) -> list[np.ndarray]:
     whole = record.whole if isinstance(record, Portion) else record
     fs, at, found = whole.header.sample_rate_Hz, 0, []
     predictors = [Predictor(models[0]), *(Predictor(one, large_motion=True) for one in models)]
@@ -75,8 +78,9 @@ def without(blocks: Sequence[SpectralBlock], of: Sequence[np.ndarray]) -> list[S
     return [replace(block, Y=block.Y - one) for block, one in zip(blocks, of, strict=True)]
 
 
-def chosen_turning(campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel
-                   ) -> tuple[Turning, list[np.ndarray]]:
+def chosen_turning(
+    campaign: Campaign, blocks: Sequence[SpectralBlock], model: ResponseModel
+) -> tuple[Turning, list[np.ndarray]]:
     """What turns with the payload according to blocks with noise, and the corresponding terms (n, n_y, 1) of each
     block.
 
@@ -91,6 +95,7 @@ def chosen_turning(campaign: Campaign, blocks: Sequence[SpectralBlock], model: R
     def chi2(way: Turning) -> float:
         share = np.array([1.0, *way])
         return float(share @ H @ share - 2 * g @ share)
+
     best = min((Turning(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)), key=chi2)
     if chi2(model.turning) - chi2(best) < EVIDENCE:
         best = model.turning

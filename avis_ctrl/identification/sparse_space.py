@@ -39,8 +39,10 @@ def components(rows: np.ndarray) -> list[tuple[list[int], list[int]]]:
     """Parts without common columns: (rows, columns) of each, columns ascending, parts by their first column."""
     count, of = connected_components((rows != 0).astype(int) @ (rows != 0).T.astype(int), directed=False)
     parts = [np.flatnonzero(of == k) for k in range(count)]
-    return sorted(((part.tolist(), np.flatnonzero(np.any(rows[part], axis=0)).tolist()) for part in parts),
-                  key=lambda part: part[1])
+    return sorted(
+        ((part.tolist(), np.flatnonzero(np.any(rows[part], axis=0)).tolist()) for part in parts),
+        key=lambda part: part[1],
+    )
 
 
 def sparse_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
@@ -89,9 +91,10 @@ def whole_numbers(row: np.ndarray, largest: int = 12, tolerance: float = 1e-4) -
     unit = row / np.min(np.abs(row[inside]))
     fractions = [Fraction(float(value)).limit_denominator(largest) for value in unit]
     common = math.lcm(*(f.denominator for f in fractions))
-    near = all(abs(float(f) - value) <= tolerance * max(1.0, abs(value))
-               for f, value in zip(fractions, unit, strict=True))
-    if near and max(abs(f * common) for f in fractions) <= largest ** 2:
+    near = all(
+        abs(float(f) - value) <= tolerance * max(1.0, abs(value)) for f, value in zip(fractions, unit, strict=True)
+    )
+    if near and max(abs(f * common) for f in fractions) <= largest**2:
         found = np.array([float(f * common) for f in fractions])
         found /= math.gcd(*(int(value) for value in found))
     else:

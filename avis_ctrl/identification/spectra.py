@@ -34,8 +34,11 @@ def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, flo
     frequency = scipy.fft.rfftfreq(h.samples, 1 / h.sample_rate_Hz)
     keep = (frequency >= band_Hz[0]) & (frequency <= band_Hz[1]) & (frequency > 0)
     if not np.any(keep):
-        raise InputError(f"expected a band with lines; record {h.name} resolves {frequency[1]:.3g} Hz up to "
-                         f"{frequency[-1]:.4g} Hz", field="band_Hz", value=band_Hz)
+        raise InputError(
+            f"expected a band with lines; record {h.name} resolves {frequency[1]:.3g} Hz up to {frequency[-1]:.4g} Hz",
+            field="band_Hz",
+            value=band_Hz,
+        )
 
     def spectrum(samples: np.ndarray) -> np.ndarray:
         return scipy.fft.rfft(samples - samples.mean(0), axis=0)[keep] / np.sqrt(h.samples)
@@ -46,12 +49,21 @@ def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, flo
         _place(U, h.floor_names, FLOOR, spectrum(record.floor), f"record {h.name}: floor names", len(model.actuators))
     Y = spectrum(record.y)[:, places(model.sensors.names, h.y_names, "the record has", f"record {h.name}: y names")]
     kind = "floor measured" if record.floor is not None else "floor not measured"
-    return SpectralBlock(h.name, 2 * np.pi * frequency[keep], U[:, :, None], Y[:, :, None], transient=True, kind=kind,
-                         start_s=h.start_s, samples=h.samples)
+    return SpectralBlock(
+        h.name,
+        2 * np.pi * frequency[keep],
+        U[:, :, None],
+        Y[:, :, None],
+        transient=True,
+        kind=kind,
+        start_s=h.start_s,
+        samples=h.samples,
+    )
 
 
-def response_block(measured: FrequencyResponse, model: ResponseModel, name: str = "frequency response"
-                   ) -> SpectralBlock:
+def response_block(
+    measured: FrequencyResponse, model: ResponseModel, name: str = "frequency response"
+) -> SpectralBlock:
     """A measured frequency response, weighted by its covariance.
 
     If neighbouring lines share data, the covariance of each is multiplied by their number, so that together they
@@ -63,8 +75,9 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
     InputError : channels or units that are not the model's, a Gram matrix with negative eigenvalues.
     """
     if measured.output_unit != model.sensors.unit:
-        raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
-                         value=measured.output_unit)
+        raise InputError(
+            f"expected {model.sensors.unit}", field="unit of the response's outputs", value=measured.output_unit
+        )
     n, n_in = len(measured.frequency_Hz), len(measured.inputs)
     rows = places(model.sensors.names, measured.outputs, "the response has", "outputs")
     if measured.entry_variance is None:
@@ -77,8 +90,16 @@ def response_block(measured: FrequencyResponse, model: ResponseModel, name: str 
         noise = variance[..., None] * np.eye(len(rows))
     U = np.zeros((n, len(model.inputs), n_in), complex)
     _place(U, measured.inputs, model.inputs, W, "inputs")
-    return SpectralBlock(name, measured.omega, U, measured.value[:, rows] @ W, noise * measured.shared, measured.dof,
-                         kind=name, shared=measured.shared)
+    return SpectralBlock(
+        name,
+        measured.omega,
+        U,
+        measured.value[:, rows] @ W,
+        noise * measured.shared,
+        measured.dof,
+        kind=name,
+        shared=measured.shared,
+    )
 
 
 def _root(gram: np.ndarray) -> np.ndarray:
@@ -100,8 +121,9 @@ def _root(gram: np.ndarray) -> np.ndarray:
     return safe[:, :, None] * vectors * np.sqrt(kept)[:, None, :]
 
 
-def _place(into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str,
-           offset: int = 0) -> None:
+def _place(
+    into: np.ndarray, names: Sequence[str], known: Sequence[str], values: np.ndarray, field: str, offset: int = 0
+) -> None:
     """Write values to the entries of the named inputs."""
     into[:, [offset + k for k in places(names, known, "the model's inputs are", field)]] = values
 
@@ -127,14 +149,15 @@ def _transient_columns(model: FrequencyModel, omega: np.ndarray) -> tuple[np.nda
     return columns / norms, norms
 
 
-def transient_parts(x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: FrequencyModel
-                    ) -> tuple[np.ndarray, np.ndarray]:
+def transient_parts(
+    x: np.ndarray, norms: np.ndarray, block: SpectralBlock, model: FrequencyModel
+) -> tuple[np.ndarray, np.ndarray]:
     """(n, 12, 1) impulses and steps on the body, and (m,) initial values of the inner states: the part of unknowns x
     (n_t,) of the columns of `transient_columns`, norms (n_t,), that depends on the model's parameters."""
     n_b, true = 2 * N_Q, x / norms
     chains = model.sensor_transients(block.omega[:1]).shape[2]
     body = np.broadcast_to(true[None, :n_b, None], (len(block.omega), n_b, 1))
-    return body, true[n_b + chains:]
+    return body, true[n_b + chains :]
 
 
 # Relative singular value of unit columns below which a direction is dropped: states with columns this close are one.

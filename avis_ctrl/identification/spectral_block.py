@@ -48,8 +48,11 @@ class SpectralBlock:
     def __post_init__(self) -> None:
         n, m = len(self.omega), self.U.shape[-1]
         if self.U.shape[0] != n or self.Y.shape[0] != n or self.Y.shape[2] != m or n == 0:
-            raise InputError(f"expected U (n, n_in, m) and Y (n, n_y, m) on {n} lines",
-                             field=f"block {self.name}", value=(self.U.shape, self.Y.shape))
+            raise InputError(
+                f"expected U (n, n_in, m) and Y (n, n_y, m) on {n} lines",
+                field=f"block {self.name}",
+                value=(self.U.shape, self.Y.shape),
+            )
         if self.transient and m != 1:
             raise InputError("expected one experiment in a block with a transient", field=f"block {self.name}")
 
@@ -65,5 +68,10 @@ class SpectralBlock:
 
     def lines(self, keep: np.ndarray) -> SpectralBlock:
         """The block on some of its lines."""
-        return replace(self, omega=self.omega[keep], U=self.U[keep], Y=self.Y[keep],
-                       noise=None if self.noise is None else self.noise[keep])
+        return replace(
+            self,
+            omega=self.omega[keep],
+            U=self.U[keep],
+            Y=self.Y[keep],
+            noise=None if self.noise is None else self.noise[keep],
+        )

@@ -60,8 +60,11 @@ class FrfSpread:
         """
         able = [k for k, one in enumerate(self.confidences) if one >= confidence - 1e-9]
         if not able:
-            raise InputError(f"expected at most {100 * max(self.confidences):g} %, the largest that the spread was "
-                             "computed for", field="confidence", value=confidence)
+            raise InputError(
+                f"expected at most {100 * max(self.confidences):g} %, the largest that the spread was computed for",
+                field="confidence",
+                value=confidence,
+            )
         return self.measured + self.noise[min(able, key=lambda k: self.confidences[k])]
 
     def drowned(self, confidence: float = 0.95) -> np.ndarray:
@@ -84,12 +87,14 @@ class FrfSpread:
         place = np.floor(per_octave * np.log2(self.frequency_Hz / self.frequency_Hz[0]) + 1e-9).astype(int)
         bound = self.bound(confidence)
         largest = np.array([np.flatnonzero(place == one)[np.argmax(bound[place == one])] for one in np.unique(place)])
-        return replace(self, frequency_Hz=self.frequency_Hz[largest], measured=self.measured[largest],
-                       noise=self.noise[:, largest])
+        return replace(
+            self, frequency_Hz=self.frequency_Hz[largest], measured=self.measured[largest], noise=self.noise[:, largest]
+        )
 
 
-def kept_axes(rig: Rig, keep: Sequence[str], actuators: Sequence[str], sensors: Sequence[str]
-              ) -> tuple[np.ndarray, np.ndarray]:
+def kept_axes(
+    rig: Rig, keep: Sequence[str], actuators: Sequence[str], sensors: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
     """A (n_u, n_axes) volts per newton and D (n_axes, n_s) velocities from velocities along the sensors.
 
     Raises
@@ -97,12 +102,19 @@ def kept_axes(rig: Rig, keep: Sequence[str], actuators: Sequence[str], sensors: 
     InputError : coordinates that these actuators cannot drive or these sensors cannot distinguish.
     """
     lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
-    return (actuator_axes(rig, keep, actuators).allocation * lever,
-            sensor_axes(rig, keep, sensors).decoding * lever[:, None])
+    return (
+        actuator_axes(rig, keep, actuators).allocation * lever,
+        sensor_axes(rig, keep, sensors).decoding * lever[:, None],
+    )
 
 
-def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence[str] = ("z", "phi_x"),
-               confidences: Sequence[float] = CONFIDENCES, seed: int = 1) -> FrfSpread:
+def frf_spread(
+    measured: FrequencyResponse,
+    model: ResponseModel,
+    keep: Sequence[str] = ("z", "phi_x"),
+    confidences: Sequence[float] = CONFIDENCES,
+    seed: int = 1,
+) -> FrfSpread:
     """Spread of a measured frequency response about an identified model.
 
     Parameters
@@ -130,13 +142,13 @@ def frf_spread(measured: FrequencyResponse, model: ResponseModel, keep: Sequence
     G_k = D @ response @ A
     L = np.linalg.solve(G_k, D @ (measured.value[:, rows][:, :, columns] - response) @ A)
     left = np.linalg.solve(G_k, np.broadcast_to(D, (len(G_k), *D.shape)))
-    noise = _noise_quantile(_covariance(measured, rows, columns, left, A), len(keep), measured.dof, confidences,
-                            seed)
+    noise = _noise_quantile(_covariance(measured, rows, columns, left, A), len(keep), measured.dof, confidences, seed)
     return FrfSpread(tuple(keep), measured.frequency_Hz, largest_singular_value(L), noise, tuple(confidences))
 
 
-def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, keep: Sequence[str]
-            ) -> tuple[FrequencyResponse, np.ndarray]:
+def _pushed(
+    measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, keep: Sequence[str]
+) -> tuple[FrequencyResponse, np.ndarray]:
     """Lines on which the response to the kept coordinates is known, and A (n_u, k) for the measured drives.
 
     This is A as a design has it, in the order of those drives, if the records excite it; otherwise the minimum-norm
@@ -149,6 +161,7 @@ def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, ke
         V = np.zeros((len(measured.inputs), volts.shape[1]))
         V[at] = volts
         return np.all(measured.spanned(V), axis=1)
+
     own = A[drives]
     lines = known(own) if len(drives) == len(A) else np.zeros(len(measured.frequency_Hz), bool)
     if not np.any(lines):
@@ -158,8 +171,11 @@ def _pushed(measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, ke
         made = np.linalg.norm(T[:, drives] @ own - T @ A, axis=0) < 1e-6 * np.linalg.norm(T @ A, axis=0)
         lines = known(own)
         if not np.all(made) or not np.any(lines):
-            raise InputError("expected records that excite each of these coordinates separately", field="keep",
-                             value=[name for name, one in zip(keep, made, strict=True) if not one] or list(keep))
+            raise InputError(
+                "expected records that excite each of these coordinates separately",
+                field="keep",
+                value=[name for name, one in zip(keep, made, strict=True) if not one] or list(keep),
+            )
     return measured.at(lines), own
 
 
@@ -170,27 +186,33 @@ def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
     _, inside = measured.inverse_gram()
     line = int(np.argmax(np.real(np.trace(inside, axis1=1, axis2=2))))
     left, s, _ = np.linalg.svd(measured.gram[line][np.ix_(at, at)].real)
-    known = left[:, s > SPANNED ** 2 * s[0]]
+    known = left[:, s > SPANNED**2 * s[0]]
     return known
 
 
 def _channels(measured: FrequencyResponse, model: ResponseModel) -> tuple[list[int], list[int]]:
     """Rows of the model's sensors in the response, and indices of the model's actuators that it contains."""
     if measured.output_unit != model.sensors.unit:
-        raise InputError(f"expected {model.sensors.unit}", field="unit of the response's outputs",
-                         value=measured.output_unit)
+        raise InputError(
+            f"expected {model.sensors.unit}", field="unit of the response's outputs", value=measured.output_unit
+        )
     if missing := [name for name in model.sensors.names if name not in measured.outputs]:
-        raise InputError(f"expected a response with {', '.join(model.sensors.names)}; {', '.join(missing)} missing",
-                         field="outputs", value=list(measured.outputs))
+        raise InputError(
+            f"expected a response with {', '.join(model.sensors.names)}; {', '.join(missing)} missing",
+            field="outputs",
+            value=list(measured.outputs),
+        )
     drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
     if not drives:
-        raise InputError(f"expected a response to some of {', '.join(model.actuators)}", field="inputs",
-                         value=list(measured.inputs))
+        raise InputError(
+            f"expected a response to some of {', '.join(model.actuators)}", field="inputs", value=list(measured.inputs)
+        )
     return [measured.outputs.index(name) for name in model.sensors.names], drives
 
 
-def _covariance(measured: FrequencyResponse, rows: list[int], columns: list[int], left: np.ndarray,
-                A: np.ndarray) -> np.ndarray:
+def _covariance(
+    measured: FrequencyResponse, rows: list[int], columns: list[int], left: np.ndarray, A: np.ndarray
+) -> np.ndarray:
     """(n, k k, k k) covariance of vec(left N A), with the columns of the error stacked."""
     if measured.entry_variance is None:
         assert measured.gram is not None and measured.noise is not None
@@ -206,8 +228,7 @@ def _covariance(measured: FrequencyResponse, rows: list[int], columns: list[int]
     return found.reshape(n, k * k, k * k)
 
 
-def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Sequence[float],
-                    seed: int) -> np.ndarray:
+def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Sequence[float], seed: int) -> np.ndarray:
     """(c, n) quantiles of the largest singular value of (k, k) matrices of that covariance, estimated with `dof`."""
     rng = np.random.default_rng(seed)
     Z = (rng.standard_normal((DRAWS, k * k)) + 1j * rng.standard_normal((DRAWS, k * k))) / np.sqrt(2)
@@ -219,6 +240,6 @@ def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Seq
     found = []
     for start in range(0, len(root), CHUNK):
         # (n, draws, column, row) of the error.
-        N = (Z @ np.swapaxes(root[start:start + CHUNK], 1, 2)).reshape(-1, DRAWS, k, k)
+        N = (Z @ np.swapaxes(root[start : start + CHUNK], 1, 2)).reshape(-1, DRAWS, k, k)
         found.append(np.quantile(largest_singular_value(N), confidences, axis=1))
     return np.concatenate(found, axis=1)

@@ -80,8 +80,9 @@ def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarr
     return la.orth(null) if null.size else null
 
 
-def structure_of(null: np.ndarray, values: np.ndarray, units: Sequence[str], names: Sequence[str],
-                 tolerance: float = 1e-6) -> Structure:
+def structure_of(
+    null: np.ndarray, values: np.ndarray, units: Sequence[str], names: Sequence[str], tolerance: float = 1e-6
+) -> Structure:
     """Parts of a null space (n_p, d), given in relative units.
 
     tolerance : threshold of a zero entry, relative to the largest entry of a vector.
@@ -107,13 +108,18 @@ def _whole(rows: np.ndarray) -> np.ndarray:
     return np.array([whole_numbers(row) for row in rows]).reshape(rows.shape)
 
 
-def _scalings(null: np.ndarray, values: np.ndarray, units: Sequence[str], names: Sequence[str],
-              tolerance: float) -> tuple[Scaling, ...]:
+def _scalings(
+    null: np.ndarray, values: np.ndarray, units: Sequence[str], names: Sequence[str], tolerance: float
+) -> tuple[Scaling, ...]:
     """Scalings in the null space, with one exponent per kind of parameter (its unit); two kinds or more."""
     # Sensors first: of scalings with equally many kinds, the one without sensors is preferred.
     kinds = sorted({(not name.startswith("sensor."), unit) for name, unit in zip(names, units, strict=True)})
-    member = np.array([[float((not name.startswith("sensor."), unit) == kind and value != 0) for kind in kinds]
-                       for name, unit, value in zip(names, units, values, strict=True)])
+    member = np.array(
+        [
+            [float((not name.startswith("sensor."), unit) == kind and value != 0) for kind in kinds]
+            for name, unit, value in zip(names, units, values, strict=True)
+        ]
+    )
     length = np.linalg.norm(member, axis=0)
     inside = length > 0
     outside = member[:, inside] / length[inside]
@@ -130,15 +136,16 @@ def _signed(row: np.ndarray) -> np.ndarray:
     return row if np.sum(np.sign(row)) > 0 or (np.sum(np.sign(row)) == 0 and row[-1] > 0) else -row
 
 
-def _pinned(null: np.ndarray, scalings: tuple[Scaling, ...], names: Sequence[str], tolerance: float
-            ) -> tuple[Scaling, ...]:
+def _pinned(
+    null: np.ndarray, scalings: tuple[Scaling, ...], names: Sequence[str], tolerance: float
+) -> tuple[Scaling, ...]:
     """Pin of each scaling: the parameter whose knowledge leaves the fewest entries in the remaining null space."""
     pins: list[int] = []
     found = []
     for k, scaling in enumerate(scalings):
         best: tuple[tuple[int, int, int], int] | None = None
         for j in np.flatnonzero(scaling.exponents).tolist():
-            exponents = np.array([[one.exponents[i] for i in [*pins, j]] for one in scalings[:k + 1]])
+            exponents = np.array([[one.exponents[i] for i in [*pins, j]] for one in scalings[: k + 1]])
             if abs(np.linalg.det(exponents)) < 1e-9:
                 continue
             left = reduced_rows(_without(null, [*pins, j]), tolerance)

@@ -38,8 +38,14 @@ class ToleranceFit(NamedTuple):
     flat: np.ndarray
 
 
-def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping[str, float], tolerances: Tolerances,
-          stated: Mapping[str, Prior], settings: FitSettings = SETTINGS) -> ToleranceFit:
+def begin(
+    model: ResponseModel,
+    blocks: Sequence[SpectralBlock],
+    levels: Mapping[str, float],
+    tolerances: Tolerances,
+    stated: Mapping[str, Prior],
+    settings: FitSettings = SETTINGS,
+) -> ToleranceFit:
     """Start from parameters that were fitted with the file's values as stated, on some lines of each block.
 
     Parameters
@@ -58,8 +64,9 @@ def begin(model: ResponseModel, blocks: Sequence[SpectralBlock], levels: Mapping
     return ToleranceFit(found, flat)
 
 
-def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float],
-        settings: FitSettings = SETTINGS) -> ToleranceFit:
+def end(
+    begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float], settings: FitSettings = SETTINGS
+) -> ToleranceFit:
     """Continue from there, with blocks from which the second-order terms of the fitted model were subtracted."""
     one, data = begun.fitted, Data.of(blocks, levels, settings.lines)
     priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
@@ -68,29 +75,46 @@ def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[st
     return begun._replace(fitted=found)
 
 
-def as_likelihood_fit(found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit[ResponseModel],
-                      settings: FitSettings = SETTINGS) -> LikelihoodFit[ResponseModel]:
+def as_likelihood_fit(
+    found: ToleranceFit,
+    blocks: Sequence[SpectralBlock],
+    first: LikelihoodFit[ResponseModel],
+    settings: FitSettings = SETTINGS,
+) -> LikelihoodFit[ResponseModel]:
     """Convert to the form of a fit by noise alone, with tolerances among the parameters; residuals on all lines of the
     blocks."""
     one, model = found.fitted, found.fitted.model
     H, g, cost = one.weights.normal_equations(one.white.J, one.white.e)
     known = np.where(found.flat, 0.0, 1.0)
     slopes = one.priors.slopes(one.z)
-    information = Information(model.names, model.values, model.units,
-                              (H + np.diag(known)) / np.outer(slopes, slopes), model.scales())
+    information = Information(
+        model.names, model.values, model.units, (H + np.diag(known)) / np.outer(slopes, slopes), model.scales()
+    )
     step = np.linalg.solve(H + np.eye(len(g)), g - one.z)
     less = int(known.sum()) - sum(transient_unknowns(block, model) for block in blocks) - information.rank
     fitted, dof = len(one.white.e) + less, sum(block.numbers for block in blocks) + less
     # The fitted lines represent all of the residuals.
-    chi2 = (cost + float(known @ one.z ** 2)) * dof / fitted
+    chi2 = (cost + float(known @ one.z**2)) * dof / fitted
     residuals = tuple(block_residual(model, block, whitener(block), derivative=False)[2] for block in blocks)
-    return LikelihoodFit(model, information, chi2, dof, first.iterations + one.iterations,
-                         bool(step @ (g - one.z) < settings.converged * len(one.white.e)), first.history, residuals,
-                         first.starts, _with_prior(one.priors, ~found.flat))
+    return LikelihoodFit(
+        model,
+        information,
+        chi2,
+        dof,
+        first.iterations + one.iterations,
+        bool(step @ (g - one.z) < settings.converged * len(one.white.e)),
+        first.history,
+        residuals,
+        first.starts,
+        _with_prior(one.priors, ~found.flat),
+    )
 
 
 def _with_prior(priors: Priors, which: np.ndarray) -> dict[str, Prior]:
     """(mean, standard deviation) by name, in the parameters' units."""
     sigma = priors.sigma * np.where(priors.positive, priors.mean, 1.0)
-    return {name: (float(mean), float(deviation)) for name, mean, deviation, own in
-            zip(priors.names, priors.mean, sigma, which, strict=True) if own}
+    return {
+        name: (float(mean), float(deviation))
+        for name, mean, deviation, own in zip(priors.names, priors.mean, sigma, which, strict=True)
+        if own
+    }

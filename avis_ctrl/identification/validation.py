@@ -112,9 +112,16 @@ class Validation:
 
     def as_dict(self) -> dict[str, Any]:
         """Values for a file, without the arrays of figures."""
-        return {"verdict": self.verdict, "passed": self.passed, "sentences": self.sentences, "notes": self.notes,
-                "outputs": self.outputs, "band_Hz": self.band_Hz, "modes": [vars(row) for row in self.modes],
-                "held_out": [_without_figures(one) for one in self.held_out]}
+        return {
+            "verdict": self.verdict,
+            "passed": self.passed,
+            "sentences": self.sentences,
+            "notes": self.notes,
+            "outputs": self.outputs,
+            "band_Hz": self.band_Hz,
+            "modes": [vars(row) for row in self.modes],
+            "held_out": [_without_figures(one) for one in self.held_out],
+        }
 
 
 def _without_figures(one: HeldOut) -> dict[str, Any]:
@@ -123,8 +130,9 @@ def _without_figures(one: HeldOut) -> dict[str, Any]:
     return found if white is None else found | {"whiteness": {"white": white.white, "sentences": white.sentences}}
 
 
-def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse
-             ) -> Validation:
+def validate(
+    found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse
+) -> Validation:
     """Prediction errors, their whiteness, responses and modes of the fitted model on data that no fit has used.
 
     Raises
@@ -134,20 +142,25 @@ def validate(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
     """
     notes: list[str] = []
     if isinstance(fitted, FrequencyResponse) != isinstance(held_out, FrequencyResponse):
-        raise InputError("expected held-out data of the same kind as the fitted ones", field="held out",
-                         value=type(held_out).__name__)
+        raise InputError(
+            "expected held-out data of the same kind as the fitted ones",
+            field="held out",
+            value=type(held_out).__name__,
+        )
     blocks = [(*_with_noise(found, fitted, block), block, record) for block, record in _blocks(found, held_out)]
     figures = [_figures(found, fitted, *one, len(blocks), notes) for one in blocks]
     modes, mode_note = _modes(found, [one[0] for one in blocks])
     drawn = _overlay(found, fitted, held_out, notes)
     verdict = verdict_of(figures)
     said = (verdict, *_sentences(figures), *_mode_sentence(modes), mode_note, *_overlay_sentence(drawn))
-    return Validation(found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, verdict,
-                      said, tuple(notes))
+    return Validation(
+        found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, verdict, said, tuple(notes)
+    )
 
 
-def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
-            ) -> list[tuple[SpectralBlock, RecordSource | None]]:
+def _blocks(
+    found: CampaignFit, held_out: Campaign | FrequencyResponse
+) -> list[tuple[SpectralBlock, RecordSource | None]]:
     """Spectra of the held-out data, in pieces if long; each with its record if it begins at the record's start."""
     model = found.fit.model
     if isinstance(held_out, FrequencyResponse):
@@ -167,28 +180,38 @@ def _blocks(found: CampaignFit, held_out: Campaign | FrequencyResponse
     return [(block, record) for block, (_, record) in zip(linear, blocks, strict=True)]
 
 
-def _with_noise(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock
-                ) -> tuple[SpectralBlock, float, str]:
+def _with_noise(
+    found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock
+) -> tuple[SpectralBlock, float, str]:
     """The block with the noise of the fitted data, the real numbers used to estimate it, and a description."""
     if isinstance(fitted, FrequencyResponse):
         near = response_block(fitted.between(*found.band_Hz), found.fit.model)
         assert near.noise is not None
         at = np.clip(np.searchsorted((near.omega[1:] + near.omega[:-1]) / 2, block.omega), 0, len(near.omega) - 1)
-        return (block.with_noise(near.noise[at], near.dof), np.inf,
-                "covariance of the nearest fitted line, as estimated with the responses")
+        return (
+            block.with_noise(near.noise[at], near.dof),
+            np.inf,
+            "covariance of the nearest fitted line, as estimated with the responses",
+        )
     residuals = found.fit.residuals
     kinds = {one.block.kind for one in residuals}
     if block.kind not in kinds:
-        raise InputError(f"expected records of the kind that was fitted: {', '.join(sorted(kinds))}",
-                         field=f"held-out record {block.name}", value=block.kind)
+        raise InputError(
+            f"expected records of the kind that was fitted: {', '.join(sorted(kinds))}",
+            field=f"held-out record {block.name}",
+            value=block.kind,
+        )
     noisy = noise_from_residuals(residuals, [block], model=found.fit.model)[0]
     pool = sum(one.block.numbers for one in residuals if one.block.kind == block.kind)
     # The fit reduced its own residuals: they lack its degrees of freedom.
     share = found.fit.dof / sum(one.block.numbers for one in residuals)
     assert noisy.noise is not None
-    return (noisy.with_noise(noisy.noise / share, noisy.dof), pool * share * _inverse_dof(noisy.dof, len(noisy.Y[0])),
-            f"covariance of the fit's residuals in the fitted records ({block.kind}), {noisy.dof:.0f} degrees of "
-            "freedom per line; unlike the noise of a local model it is not biased at resonances")
+    return (
+        noisy.with_noise(noisy.noise / share, noisy.dof),
+        pool * share * _inverse_dof(noisy.dof, len(noisy.Y[0])),
+        f"covariance of the fit's residuals in the fitted records ({block.kind}), {noisy.dof:.0f} degrees of "
+        "freedom per line; unlike the noise of a local model it is not biased at resonances",
+    )
 
 
 def _inverse_dof(dof: float, n_y: int) -> float:
@@ -197,28 +220,52 @@ def _inverse_dof(dof: float, n_y: int) -> float:
     The trace of the inverse of a complex Wishart matrix of n_y outputs and dof degrees of freedom has the relative
     variance dof / (n_y ((dof - n_y)^2 - 1)) (moments of Maiwald and Kraus, IEE Proc. Radar 147, 2000).
     """
-    return max((dof - n_y) ** 2 - 1, 1.0) / dof ** 2
+    return max((dof - n_y) ** 2 - 1, 1.0) / dof**2
 
 
-def _figures(found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock, noise_dof: float,
-             words: str, raw: SpectralBlock, record: RecordSource | None, families: int, notes: list[str]) -> HeldOut:
+def _figures(
+    found: CampaignFit,
+    fitted: Campaign | FrequencyResponse,
+    block: SpectralBlock,
+    noise_dof: float,
+    words: str,
+    raw: SpectralBlock,
+    record: RecordSource | None,
+    families: int,
+    notes: list[str],
+) -> HeldOut:
     model, covariance = found.fit.model, found.fit.information.covariance
     error, before = prediction_error(model, block), prediction_error(found.start, block, derivative=False)
     expected = error.expected(covariance) / error.dof
     power = np.sum(np.abs(block.Y) ** 2, axis=(0, 2))
     if not np.all(power > 0):
-        raise InputError("expected outputs that are not zero", field=f"held-out record {block.name}",
-                         value=power.tolist())
+        raise InputError(
+            "expected outputs that are not zero", field=f"held-out record {block.name}", value=power.tolist()
+        )
     of_output = [interval(expected, dof, noise_dof / len(power), LEVEL) for dof in error.output_dof]
     floor = error.noise_share()
     white = whiteness(error, model.sensors.names, model.inputs, covariance, noise_dof / (2 * len(power)), families)
     return HeldOut(
-        block.name, len(block.omega), words, error.chi2 / error.dof, interval(expected, error.dof, noise_dof, LEVEL),
-        before.chi2 / before.dof, _local_chi2(found, fitted, raw, notes), error.output_chi2 / error.output_dof,
-        np.array(of_output), _root(error.error, power), _root(before.error, power), np.sqrt(floor / power),
-        _root_all(error), _root_all(before), float(np.sqrt(floor.sum() / power.sum())),
+        block.name,
+        len(block.omega),
+        words,
+        error.chi2 / error.dof,
+        interval(expected, error.dof, noise_dof, LEVEL),
+        before.chi2 / before.dof,
+        _local_chi2(found, fitted, raw, notes),
+        error.output_chi2 / error.output_dof,
+        np.array(of_output),
+        _root(error.error, power),
+        _root(before.error, power),
+        np.sqrt(floor / power),
+        _root_all(error),
+        _root_all(before),
+        float(np.sqrt(floor.sum() / power.sum())),
         floor_interval(error, float(floor.sum() / power.sum()), noise_dof / (2 * block.Y.size)),
-        *_in_time(found, record), white, _exact(found, block))
+        *_in_time(found, record),
+        white,
+        _exact(found, block),
+    )
 
 
 def _exact(found: CampaignFit, block: SpectralBlock) -> float | None:
@@ -229,8 +276,9 @@ def floor_interval(error: PredictionError, floor: float, times: float) -> tuple[
     """Interval of the root of sum |e|^2 / sum |Y|^2 for noise alone, which was estimated from `times` as many lines;
     few degrees of freedom if few lines contain most of it (Welch and Satterthwaite)."""
     assert error.block.noise is not None
-    C = np.broadcast_to(error.block.noise, (*error.block.noise.shape[:1], error.error.shape[2],
-                                            *error.block.noise.shape[2:]))
+    C = np.broadcast_to(
+        error.block.noise, (*error.block.noise.shape[:1], error.error.shape[2], *error.block.noise.shape[2:])
+    )
     dof = 2 * np.real(np.einsum("kmii->", C)) ** 2 / np.real(np.einsum("kmij,kmji->", C, C))
     low, high = interval(floor, dof, max(dof * times, 3.0))
     return float(np.sqrt(low)), float(np.sqrt(high))
@@ -244,8 +292,9 @@ def _root_all(error: PredictionError) -> float:
     return float(np.linalg.norm(error.error) / np.linalg.norm(error.block.Y))
 
 
-def _local_chi2(found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: SpectralBlock, notes: list[str]
-                ) -> float:
+def _local_chi2(
+    found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: SpectralBlock, notes: list[str]
+) -> float:
     """chi-square per degree of freedom with the noise of the local polynomial model."""
     if isinstance(fitted, FrequencyResponse):
         return float("nan")
@@ -257,8 +306,9 @@ def _local_chi2(found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: S
     return error.chi2 / error.dof
 
 
-def _in_time(found: CampaignFit, record: RecordSource | None
-             ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None, str]:
+def _in_time(
+    found: CampaignFit, record: RecordSource | None
+) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None, str]:
     """n.r.m.s. error of the time-domain prediction: in the band, of the start model, and without a filter."""
     if record is None:
         return None, None, None, "no time-domain prediction: the data do not start at rest, or are frequency responses"
@@ -272,8 +322,13 @@ def _time_nrms(model: ResponseModel, record: Record, band_Hz: tuple[float, float
     """(n_y,) n.r.m.s. error in the band, and that of the whole signal without its mean."""
     y = record.y[:, [record.header.y_names.index(name) for name in model.sensors.names]]
     e = y - predict(model, record)
-    return (np.sqrt(_band_power(e, record.header.sample_rate_Hz, band_Hz)
-                    / _band_power(y, record.header.sample_rate_Hz, band_Hz)), np.std(e, axis=0) / np.std(y, axis=0))
+    return (
+        np.sqrt(
+            _band_power(e, record.header.sample_rate_Hz, band_Hz)
+            / _band_power(y, record.header.sample_rate_Hz, band_Hz)
+        ),
+        np.std(e, axis=0) / np.std(y, axis=0),
+    )
 
 
 def _band_power(x: np.ndarray, rate: float, band_Hz: tuple[float, float]) -> np.ndarray:
@@ -289,9 +344,11 @@ def _modes(found: CampaignFit, blocks: list[SpectralBlock]) -> tuple[tuple[ModeR
     measured: MeasuredModes | None = None
     try:
         measured = measured_modes(blocks, model)
-        note = (f"measured modes: common poles with free residues fitted to the held-out data, {measured.lines} lines "
-                f"from {measured.band_Hz[0]:.3g} to {measured.band_Hz[1]:.3g} Hz, mean square of the whitened residual "
-                f"{measured.misfit:.3g}")
+        note = (
+            f"measured modes: common poles with free residues fitted to the held-out data, {measured.lines} lines "
+            f"from {measured.band_Hz[0]:.3g} to {measured.band_Hz[1]:.3g} Hz, mean square of the whitened residual "
+            f"{measured.misfit:.3g}"
+        )
     except AvisError as failed:
         note = f"no measured modes: {failed}"
     try:
@@ -300,8 +357,9 @@ def _modes(found: CampaignFit, blocks: list[SpectralBlock]) -> tuple[tuple[ModeR
         return (), f"no table of modes: {failed}"
 
 
-def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse,
-             notes: list[str]) -> ResponseOverlay | None:
+def _overlay(
+    found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse, notes: list[str]
+) -> ResponseOverlay | None:
     """Responses from all measured data: a single record seldom separates all inputs."""
     if isinstance(fitted, Campaign) and isinstance(held_out, Campaign):
         data: Campaign | FrequencyResponse = replace(fitted, records=(*fitted.records, *held_out.records))
@@ -316,40 +374,52 @@ def _overlay(found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out:
 
 def verdict_of(figures: list[HeldOut]) -> str:
     """Verdict on the record that fits worst; if some records exceed what noise explains, on the worst of these."""
+
     def ratio(one: HeldOut) -> float:
         return one.chi2_per_dof / one.chi2_interval[1]
+
     off = [one for one in figures if ratio(one) > 1]
     beyond = [one for one in off if one.nrms_all > one.nrms_all_interval[1]]
     worst = max(beyond or off or figures, key=ratio)
     if beyond:
         judged = "the identified model does not agree with the held-out data (avis gap searches for the cause)"
     elif off:
-        judged = ("the identified model predicts the held-out data as well as their noise allows, but chi-square shows "
-                  "a small systematic error")
+        judged = (
+            "the identified model predicts the held-out data as well as their noise allows, but chi-square shows "
+            "a small systematic error"
+        )
     elif not all(one.whiteness is None or one.whiteness.white for one in figures):
-        judged = ("the identified model predicts the held-out data as well as their noise allows, but the residual "
-                  "is not white")
+        judged = (
+            "the identified model predicts the held-out data as well as their noise allows, but the residual "
+            "is not white"
+        )
     else:
         judged = "the identified model agrees with the held-out data"
-    return (f"{judged}: on record {worst.name} its residual is {_percent(worst.nrms_all)} of the signal, r.m.s. "
-            f"(expected from noise alone {_percent(worst.nrms_all_interval[0])} to "
-            f"{_percent(worst.nrms_all_interval[1])}; start model {_percent(worst.nrms_all_start)}), and chi-square "
-            f"per degree of freedom is {worst.chi2_per_dof:.4g} (expected {worst.chi2_interval[0]:.4g} to "
-            f"{worst.chi2_interval[1]:.4g})")
+    return (
+        f"{judged}: on record {worst.name} its residual is {_percent(worst.nrms_all)} of the signal, r.m.s. "
+        f"(expected from noise alone {_percent(worst.nrms_all_interval[0])} to "
+        f"{_percent(worst.nrms_all_interval[1])}; start model {_percent(worst.nrms_all_start)}), and chi-square "
+        f"per degree of freedom is {worst.chi2_per_dof:.4g} (expected {worst.chi2_interval[0]:.4g} to "
+        f"{worst.chi2_interval[1]:.4g})"
+    )
 
 
 def _sentences(figures: list[HeldOut]) -> list[str]:
     said = []
     for one in figures:
         if one.nrms_time is not None and one.nrms_time_start is not None:
-            said.append(f"record {one.name} {one.time_note}: normalised r.m.s. error in the band "
-                        f"{_percent(one.nrms_time.min())} to {_percent(one.nrms_time.max())}, depending on the output "
-                        f"(start model: {_percent(one.nrms_time_start.min())} to "
-                        f"{_percent(one.nrms_time_start.max())})")
+            said.append(
+                f"record {one.name} {one.time_note}: normalised r.m.s. error in the band "
+                f"{_percent(one.nrms_time.min())} to {_percent(one.nrms_time.max())}, depending on the output "
+                f"(start model: {_percent(one.nrms_time_start.min())} to "
+                f"{_percent(one.nrms_time_start.max())})"
+            )
         if one.nrms_all_exact is not None:
-            said.append(f"record {one.name}: residual {_percent(one.nrms_all_exact)} of the signal, r.m.s., with the "
-                        f"values of the rig file taken as exact, and {_percent(one.nrms_all)} with them fitted within "
-                        "their tolerances")
+            said.append(
+                f"record {one.name}: residual {_percent(one.nrms_all_exact)} of the signal, r.m.s., with the "
+                f"values of the rig file taken as exact, and {_percent(one.nrms_all)} with them fitted within "
+                "their tolerances"
+            )
         if one.whiteness is not None:
             said += [f"record {one.name}: {sentence}" for sentence in one.whiteness.sentences]
     return said
@@ -357,21 +427,28 @@ def _sentences(figures: list[HeldOut]) -> list[str]:
 
 def _mode_sentence(modes: tuple[ModeRow, ...]) -> list[str]:
     """The largest difference between model and measured modes."""
-    known: list[Mapping[str, Any]] = [{"what": what, "mode": row.frequency_Hz, "sigma": sigma} for row in modes
-                                      for what, sigma in (("frequency", row.frequency_sigma),
-                                                          ("damping", row.damping_sigma)) if np.isfinite(sigma)]
+    known: list[Mapping[str, Any]] = [
+        {"what": what, "mode": row.frequency_Hz, "sigma": sigma}
+        for row in modes
+        for what, sigma in (("frequency", row.frequency_sigma), ("damping", row.damping_sigma))
+        if np.isfinite(sigma)
+    ]
     if not known:
         return []
     far = max(known, key=lambda one: abs(one["sigma"]))
-    return [f"model and measured modes differ by at most {abs(far['sigma']):.2g} standard deviations, in the "
-            f"{far['what']} of the mode at {far['mode']:.4g} Hz"]
+    return [
+        f"model and measured modes differ by at most {abs(far['sigma']):.2g} standard deviations, in the "
+        f"{far['what']} of the mode at {far['mode']:.4g} Hz"
+    ]
 
 
 def _overlay_sentence(drawn: ResponseOverlay | None) -> list[str]:
     if drawn is None:
         return []
-    return [f"{100 * drawn.inside:.3g} % of the values of the measured frequency response lie within their 95 % "
-            f"confidence region about the model ({drawn.method})"]
+    return [
+        f"{100 * drawn.inside:.3g} % of the values of the measured frequency response lie within their 95 % "
+        f"confidence region about the model ({drawn.method})"
+    ]
 
 
 def _percent(share: float) -> str:

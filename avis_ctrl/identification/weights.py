@@ -28,8 +28,8 @@ Group = tuple[float, int]
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """path : (n_y,) relative variances v by band. distortion : (n_y,) variances s [unit of y^2] by level [V] and band.
-    """
+    """path : (n_y,) relative variances v by band. distortion : (n_y,) variances s [unit of y^2] by level [V]
+    and band."""
 
     path: Mapping[int, np.ndarray]
     distortion: Mapping[Group, np.ndarray]
@@ -44,8 +44,11 @@ class Variances:
         """s (n_y,) of a level and band, or of the nearest fitted ones."""
         if (level, band) in self.distortion:
             return self.distortion[level, band]
-        return self.distortion[min(self.distortion, key=lambda one: (
-            abs(np.log(max(one[0], 1e-9) / max(level, 1e-9))), abs(one[1] - band)))]
+        return self.distortion[
+            min(
+                self.distortion, key=lambda one: (abs(np.log(max(one[0], 1e-9) / max(level, 1e-9))), abs(one[1] - band))
+            )
+        ]
 
 
 def bands(omega: np.ndarray, per_octave: int) -> np.ndarray:
@@ -97,7 +100,7 @@ class Weights:
             less = one.size / (1 + one.size)
             H -= (along * less) @ along.T
             g -= along @ (less * of)
-            cost -= float(less @ of ** 2)
+            cost -= float(less @ of**2)
         return H, g, cost
 
 
@@ -120,8 +123,13 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
     return block.with_noise(block.noise[:, 0] + s[:, :, None] * np.eye(s.shape[1]))
 
 
-def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Sequence[np.ndarray], variances: Variances,
-          settings: FitSettings) -> Weights:
+def weigh(
+    blocks: Sequence[SpectralBlock],
+    levels: Sequence[float],
+    paths: Sequence[np.ndarray],
+    variances: Variances,
+    settings: FitSettings,
+) -> Weights:
     """Weights of blocks; paths : (n, n_y, n_in) G_cj u_j of each block, from the present model."""
     L, start = [], 0
     determinants: dict[Group, float] = {}
@@ -168,8 +176,9 @@ def weigh(blocks: Sequence[SpectralBlock], levels: Sequence[float], paths: Seque
     return Weights(tuple(L), tuple(errors), by_group, determinants)
 
 
-def mean_noise(blocks: Sequence[SpectralBlock], levels: Sequence[float], settings: FitSettings
-               ) -> dict[Group, np.ndarray]:
+def mean_noise(
+    blocks: Sequence[SpectralBlock], levels: Sequence[float], settings: FitSettings
+) -> dict[Group, np.ndarray]:
     """(n_y,) mean noise variance by level and band."""
     found: dict[Group, list[np.ndarray]] = {}
     for block, level in zip(blocks, levels, strict=True):
@@ -180,8 +189,15 @@ def mean_noise(blocks: Sequence[SpectralBlock], levels: Sequence[float], setting
     return {group: np.concatenate(parts).mean(axis=0) for group, parts in found.items()}
 
 
-def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], levels: Sequence[float],
-              paths: Sequence[np.ndarray], old: Variances, settings: FitSettings, hold_path: bool = False) -> Variances:
+def estimated(
+    left: Sequence[np.ndarray],
+    blocks: Sequence[SpectralBlock],
+    levels: Sequence[float],
+    paths: Sequence[np.ndarray],
+    old: Variances,
+    settings: FitSettings,
+    hold_path: bool = False,
+) -> Variances:
     """Most likely variances of path errors and distortion, for residuals `left` (n, n_y) of each block.
 
     hold_path : keep the variances of the path errors.
@@ -217,7 +233,7 @@ def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], level
     for (level, band), value in noise.items():
         n[row[band], column[level]], s[row[band], column[level]] = value, old.of_distortion(level, band)
     v = np.array([old.of_path(band) for band in row])
-    half, v0, s0 = settings.error_weight / 2, settings.least_error ** 2, settings.least_distortion * n
+    half, v0, s0 = settings.error_weight / 2, settings.least_error**2, settings.least_distortion * n
     for _ in range(settings.climbs):
         d = n + s
         K = np.linalg.inv(np.sum(M / d[..., None, None], axis=1) + np.eye(k) / v[..., None, None])
@@ -225,18 +241,19 @@ def estimated(left: Sequence[np.ndarray], blocks: Sequence[SpectralBlock], level
         Mx = (M @ x[:, None, :, :, None])[..., 0]
         power = q + np.real(np.sum(x[:, None].conj() * (Mx - 2 * p), axis=-1))
         known = np.real(np.sum(np.swapaxes(K, -1, -2)[:, None] * M, axis=(-1, -2)))
-        of_v = (np.sum(np.abs(x) ** 2, axis=-1) + half * v0) / v ** 2
-        of_s = power / d ** 2 + half * s0 / s ** 2
+        of_v = (np.sum(np.abs(x) ** 2, axis=-1) + half * v0) / v**2
+        of_s = power / d**2 + half * s0 / s**2
         v = v if hold_path else v * np.sqrt(of_v / ((k - np.real(np.einsum("byaa->by", K)) / v + half) / v))
-        s = s * np.sqrt(of_s / (lines / d - known / d ** 2 + half / s))
-    return Variances({band: v[b] for band, b in row.items()},
-                     {(level, band): s[row[band], column[level]] for level, band in noise})
+        s = s * np.sqrt(of_s / (lines / d - known / d**2 + half / s))
+    return Variances(
+        {band: v[b] for band, b in row.items()}, {(level, band): s[row[band], column[level]] for level, band in noise}
+    )
 
 
 def log_prior(variances: Variances, noise: Mapping[Group, np.ndarray], settings: FitSettings) -> float:
     """Log prior of the variances up to a constant: flat in the logarithm, with an exponential decrease below the
     minimum values. noise : (n_y,) mean variance by level and band (`mean_noise`)."""
     half = settings.error_weight / 2
-    pairs = [(v, np.full(len(v), settings.least_error ** 2)) for v in variances.path.values()]
+    pairs = [(v, np.full(len(v), settings.least_error**2)) for v in variances.path.values()]
     pairs += [(variances.of_distortion(*group), settings.least_distortion * n) for group, n in noise.items()]
     return sum(float(np.sum(-half * (np.log(value) + least / value))) for value, least in pairs)

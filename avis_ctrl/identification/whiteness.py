@@ -58,8 +58,10 @@ class Correlation:
         at = f"{self.lags[lag]:.3g} {self.lag_unit}"
         largest = f"{self.value[row, lag]:.3g} against a limit of {self.limit[row, lag]:.3g}, {self.rows[row]} at {at}"
         if self.beyond:
-            return (f"{self.what}: {self.beyond} of {ratio.size} values exceed their limit (noise alone exceeds any "
-                    f"limit in 1 % of all validations); the largest is {largest}")
+            return (
+                f"{self.what}: {self.beyond} of {ratio.size} values exceed their limit (noise alone exceeds any "
+                f"limit in 1 % of all validations); the largest is {largest}"
+            )
         return f"{self.what}: none of {ratio.size} values exceeds its limit; the closest is {largest}"
 
 
@@ -80,8 +82,14 @@ class Whiteness:
         return tuple(one.sentence for one in self.correlations)
 
 
-def whiteness(error: PredictionError, outputs: Sequence[str], inputs: Sequence[str], covariance: np.ndarray,
-              noise_lines: float = np.inf, families: int = 1) -> Whiteness | None:
+def whiteness(
+    error: PredictionError,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    covariance: np.ndarray,
+    noise_lines: float = np.inf,
+    families: int = 1,
+) -> Whiteness | None:
     """Correlations of the residual of one block; None if it has too few lines.
 
     Parameters
@@ -101,8 +109,10 @@ def whiteness(error: PredictionError, outputs: Sequence[str], inputs: Sequence[s
     tests = n_y * (lines + steps + len(driven) * len(lags))
     level = -np.log(-np.expm1(np.log1p(-FAMILY / families) / tests))
     step = 2 * np.pi / (omega[-1] - omega[0])
-    found = [_over_frequency(error, outputs, lines, level),
-             _over_time(error, outputs, np.arange(1, steps + 1) * step, level, noise_lines)]
+    found = [
+        _over_frequency(error, outputs, lines, level),
+        _over_time(error, outputs, np.arange(1, steps + 1) * step, level, noise_lines),
+    ]
     if driven.size:
         found.append(_with_inputs(error, outputs, inputs, driven, lags * step, level, covariance))
     return Whiteness(tuple(found))
@@ -112,24 +122,39 @@ def _over_frequency(error: PredictionError, outputs: Sequence[str], lines: int, 
     w = error.white
     value = np.stack([np.abs(np.mean(w[lag:] * np.conj(w[:-lag]), axis=(0, 2))) for lag in range(1, lines + 1)], axis=1)
     counts = np.array([(len(w) - lag) * w.shape[2] for lag in range(1, lines + 1)])
-    return Correlation("correlation of the residual from line to line", tuple(outputs), np.arange(1.0, lines + 1),
-                       "lines", value, np.broadcast_to(np.sqrt(level / counts), value.shape))
+    return Correlation(
+        "correlation of the residual from line to line",
+        tuple(outputs),
+        np.arange(1.0, lines + 1),
+        "lines",
+        value,
+        np.broadcast_to(np.sqrt(level / counts), value.shape),
+    )
 
 
-def _over_time(error: PredictionError, outputs: Sequence[str], tau: np.ndarray, level: float, noise_lines: float
-               ) -> Correlation:
+def _over_time(
+    error: PredictionError, outputs: Sequence[str], tau: np.ndarray, level: float, noise_lines: float
+) -> Correlation:
     count = error.white.shape[0] * error.white.shape[2]
     excess = np.mean(np.abs(error.white) ** 2, axis=2)
     # Its mean is tested by chi-square.
     excess = excess - excess.mean(axis=0)
     value = np.abs(excess.T @ np.exp(1j * np.outer(error.block.omega, tau))) / len(excess)
     limit = np.sqrt(level / count * (1 + count / noise_lines))
-    return Correlation("correlation of the residual over time", tuple(outputs), tau, "s", value,
-                       np.full(value.shape, limit))
+    return Correlation(
+        "correlation of the residual over time", tuple(outputs), tau, "s", value, np.full(value.shape, limit)
+    )
 
 
-def _with_inputs(error: PredictionError, outputs: Sequence[str], inputs: Sequence[str], driven: np.ndarray,
-                 tau: np.ndarray, level: float, covariance: np.ndarray) -> Correlation:
+def _with_inputs(
+    error: PredictionError,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    driven: np.ndarray,
+    tau: np.ndarray,
+    level: float,
+    covariance: np.ndarray,
+) -> Correlation:
     turn = np.exp(1j * np.outer(error.block.omega, tau))
     rows, values, limits = [], [], []
     for j in driven:
@@ -142,5 +167,11 @@ def _with_inputs(error: PredictionError, outputs: Sequence[str], inputs: Sequenc
         values.append(np.abs(r) / root)
         limits.append(np.sqrt(level * spread) / root)
         rows += [f"{output} with {inputs[j]}" for output in outputs]
-    return Correlation("correlation of the residual with the inputs", tuple(rows), tau, "s", np.concatenate(values),
-                       np.concatenate(limits))
+    return Correlation(
+        "correlation of the residual with the inputs",
+        tuple(rows),
+        tau,
+        "s",
+        np.concatenate(values),
+        np.concatenate(limits),
+    )

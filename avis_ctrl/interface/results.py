@@ -71,8 +71,10 @@ class DesignStudy:
             lines.append(wrapped(all_axes(self.result)))
         rows = self._rows()
         widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
-        lines += ["  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
-                  for name, limit, value, met in rows]
+        lines += [
+            "  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
+            for name, limit, value, met in rows
+        ]
         return "\n".join([*lines, *map(wrapped, self.result.notes)])
 
     def _rows(self) -> list[tuple[str, ...]]:
@@ -98,8 +100,9 @@ class DesignStudy:
         """Third-octave velocity of floor and payload (worst axis) with the vibration criteria."""
         site = self.result.controller("mu").site
         f = site.third_octave_Hz
-        return plot.vc_curves({"floor": (f, site.floor_third_octaves),
-                               "payload, mu": (f, np.max(site.payload_third_octaves, axis=1))}, ax)
+        return plot.vc_curves(
+            {"floor": (f, site.floor_third_octaves), "payload, mu": (f, np.max(site.payload_third_octaves, axis=1))}, ax
+        )
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write the files of `avis design`, all or none: reports, controllers, plant.json, result.json.
@@ -135,27 +138,42 @@ class IdentificationStudy:
     def values(self) -> dict[str, tuple[float, float, str]]:
         """(value, standard deviation, unit) by parameter; std is inf for a parameter determined only in combination."""
         i = self.found.information
-        return {name: (float(v), float(s), u) for name, v, s, u in zip(i.names, i.values, i.standard_deviation, i.units,
-                                                                       strict=True)}
+        return {
+            name: (float(v), float(s), u)
+            for name, v, s, u in zip(i.names, i.values, i.standard_deviation, i.units, strict=True)
+        }
 
     def _rows(self) -> list[tuple[str, str, str]]:
-        return [(name, uncertain_value.text(value, sigma) if np.isfinite(sigma) else
-                 f"{value:.6g}, only in combination", unit) for name, (value, sigma, unit) in self.values.items()]
+        return [
+            (
+                name,
+                uncertain_value.text(value, sigma) if np.isfinite(sigma) else f"{value:.6g}, only in combination",
+                unit,
+            )
+            for name, (value, sigma, unit) in self.values.items()
+        ]
 
     def summary(self) -> str:
         """The identified values, the verdict on held-out records, and what the data do not determine."""
         verdict, *more = self.found.validation.sentences
         rest = (*self.found.campaign_fit.notes, *more, *self.found.identifiability.sentences)
-        return "\n".join([wrapped(f"{verdict[:1].upper()}{verdict[1:]}."),
-                          *(f"  {name:20s} {value:>26s} {unit}" for name, value, unit in self._rows()),
-                          *map(wrapped, rest)])
+        return "\n".join(
+            [
+                wrapped(f"{verdict[:1].upper()}{verdict[1:]}."),
+                *(f"  {name:20s} {value:>26s} {unit}" for name, value, unit in self._rows()),
+                *map(wrapped, rest),
+            ]
+        )
 
     def plot_values(self, ax: Any = None) -> Any:
         """Relative change of each parameter from its starting value, with its standard deviation."""
         ax = axes_of(ax)
         start = self.found.start.parameters()
-        rows = [(name, v, s, start[name].value) for name, (v, s, _) in self.values.items()
-                if name in start and start[name].value]
+        rows = [
+            (name, v, s, start[name].value)
+            for name, (v, s, _) in self.values.items()
+            if name in start and start[name].value
+        ]
         change = [100 * (v / old - 1) for _, v, _, old in rows]
         bars = [100 * abs(s / old) if np.isfinite(s) else 0.0 for _, _, s, old in rows]
         places = np.arange(len(rows))[::-1]
@@ -200,8 +218,10 @@ class IdentificationStudy:
 
     def __repr__(self) -> str:
         information = self.found.information
-        return (f"IdentificationStudy({self.rig.name!r}: {information.rank} of {len(information.names)} combinations "
-                "of parameters determined)")
+        return (
+            f"IdentificationStudy({self.rig.name!r}: {information.rank} of {len(information.names)} combinations "
+            "of parameters determined)"
+        )
 
     def _repr_html_(self) -> str:
         return html_table(self._rows(), ("parameter", "value +- standard deviation", "unit"), self.rig.name)

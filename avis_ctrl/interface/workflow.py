@@ -67,8 +67,13 @@ def campaign(path: str | Path, columns: Mapping[str, Any] | None = None, **hints
     return read_measurements(path, columns, **hints)
 
 
-def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | None = None, *, seed: int = 1,
-                      progress: Progress | None = None) -> Campaign:
+def simulate_campaign(
+    table: Rig | str,
+    plan: Mapping[str, Any] | str | Path | None = None,
+    *,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> Campaign:
     """Simulate a campaign with the nonlinear table, to rehearse an identification; as `avis simulate-campaign`.
 
     plan : file or keys of docs/campaign_plan.md; by default multisines at three levels, noise, rest, a shaken floor.
@@ -83,14 +88,24 @@ def simulate_campaign(table: Rig | str, plan: Mapping[str, Any] | str | Path | N
     (2, ('Sy1', 'Sz1'))
     """
     table = _rig(table)
-    chosen = (default_plan(table) if plan is None else plan_from_table(dict(plan)) if isinstance(plan, Mapping)
-              else read_plan(plan))
+    chosen = (
+        default_plan(table)
+        if plan is None
+        else plan_from_table(dict(plan))
+        if isinstance(plan, Mapping)
+        else read_plan(plan)
+    )
     record_done = None if progress is None else lambda k, total, name: progress(f"record {name}, {k} of {total}")
     return rehearse_with_effects(table, chosen, seed, record_done).campaign
 
 
-def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | str, *, progress: Progress | None = None,
-             **options: Any) -> IdentificationStudy:
+def identify(
+    measured: Campaign | FrequencyResponse | str | Path,
+    table: Rig | str,
+    *,
+    progress: Progress | None = None,
+    **options: Any,
+) -> IdentificationStudy:
     """Identify a table and its uncertainty from measurements; as `avis identify`.
 
     Parameters
@@ -117,8 +132,13 @@ def identify(measured: Campaign | FrequencyResponse | str | Path, table: Rig | s
     return IdentificationStudy(found)
 
 
-def gap(measured: Campaign | FrequencyResponse | str | Path, table: Rig | str, *, progress: Progress | None = None,
-        **options: Any) -> GapStudy:
+def gap(
+    measured: Campaign | FrequencyResponse | str | Path,
+    table: Rig | str,
+    *,
+    progress: Progress | None = None,
+    **options: Any,
+) -> GapStudy:
     """Find where a table's model and its measurement disagree, and name the missing effect; as `avis gap`.
 
     options : band_Hz, seed, gates, despite_gates, amplifier_corner_Hz, design, design_file, own_effects; see
@@ -134,8 +154,9 @@ def gap(measured: Campaign | FrequencyResponse | str | Path, table: Rig | str, *
     return GapStudy(find_gap(_measured(measured), _rig(table), _options(GapOptions, options), progress or _silent))
 
 
-def design(source: Design | IdentificationStudy | Rig | str | Path, *, progress: Progress | None = None,
-           **sections: Any) -> DesignStudy:
+def design(
+    source: Design | IdentificationStudy | Rig | str | Path, *, progress: Progress | None = None, **sections: Any
+) -> DesignStudy:
     """Design certified controllers, compare them with skyhook, check them in simulation; as `avis design`.
 
     Parameters
@@ -201,16 +222,18 @@ def _rig(table: Any) -> Rig:
         return table
     if isinstance(table, (str, Path)):
         return load_rig(table)
-    raise InputError("expected a rig, the name of a shipped one, or a rig file", field="rig",
-                     value=type(table).__name__)
+    raise InputError(
+        "expected a rig, the name of a shipped one, or a rig file", field="rig", value=type(table).__name__
+    )
 
 
 def _measured(measured: Any) -> Campaign | FrequencyResponse:
     if isinstance(measured, (str, Path)):
         return read_measurements(measured)
     if not isinstance(measured, (Campaign, FrequencyResponse)):
-        raise InputError("expected a campaign, a frequency response or a file", field="measured",
-                         value=type(measured).__name__)
+        raise InputError(
+            "expected a campaign, a frequency response or a file", field="measured", value=type(measured).__name__
+        )
     return measured
 
 

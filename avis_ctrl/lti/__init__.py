@@ -5,5 +5,19 @@ from avis_ctrl.lti.norms import h2_norm, hinf_norm
 from avis_ctrl.lti.realisation import balance, balanced_truncation, discretise, minimal
 from avis_ctrl.lti.statespace import StateSpace, append, gain, tf
 
-__all__ = ["StateSpace", "append", "balance", "balanced_truncation", "connect", "discretise", "gain", "h2_norm",
-           "hinf_norm", "lft_lower", "lft_upper", "minimal", "summing_junction", "tf"]
+__all__ = [
+    "StateSpace",
+    "append",
+    "balance",
+    "balanced_truncation",
+    "connect",
+    "discretise",
+    "gain",
+    "h2_norm",
+    "hinf_norm",
+    "lft_lower",
+    "lft_upper",
+    "minimal",
+    "summing_junction",
+    "tf",
+]

@@ -43,12 +43,22 @@ def continuous_image(system: StateSpace) -> StateSpace:
     _, (scale, _) = la.matrix_balance(system.A, permute=False, separate=True)
     T, Q = la.schur(system.A / scale[:, None] * scale)
     B, C = Q.T @ (system.B / scale[:, None]), (system.C * scale) @ Q
-    inverse = _inverse(np.eye(n) + T, 1.0,
-                       "a pole at z = -1, half the sample rate, has no continuous image",
-                       "a derivative discretised by the bilinear rule, or a resonance aliased to half the rate")
+    inverse = _inverse(
+        np.eye(n) + T,
+        1.0,
+        "a pole at z = -1, half the sample rate, has no continuous image",
+        "a derivative discretised by the bilinear rule, or a resonance aliased to half the rate",
+    )
     root = np.sqrt(2 * a)
-    return replace(system, A=a * inverse @ (T - np.eye(n)), B=root * inverse @ B, C=root * C @ inverse,
-                   D=system.D - C @ inverse @ B, dt=0.0, states=())
+    return replace(
+        system,
+        A=a * inverse @ (T - np.eye(n)),
+        B=root * inverse @ B,
+        C=root * C @ inverse,
+        D=system.D - C @ inverse @ B,
+        dt=0.0,
+        states=(),
+    )
 
 
 def sampled_image(system: StateSpace, dt: float) -> StateSpace:
@@ -59,11 +69,21 @@ def sampled_image(system: StateSpace, dt: float) -> StateSpace:
     n, a = system.nstates, 2.0 / dt
     if not n:
         return replace(system, dt=dt)
-    inverse = _inverse(a * np.eye(n) - system.A, a, f"a pole at s = 2/dt = {a:.6g} rad/s has no sampled image",
-                       "an unstable pole as fast as the sample rate")
+    inverse = _inverse(
+        a * np.eye(n) - system.A,
+        a,
+        f"a pole at s = 2/dt = {a:.6g} rad/s has no sampled image",
+        "an unstable pole as fast as the sample rate",
+    )
     root = np.sqrt(2 * a)
-    return replace(system, A=inverse @ (a * np.eye(n) + system.A), B=root * inverse @ system.B,
-                   C=root * system.C @ inverse, D=system.D + system.C @ inverse @ system.B, dt=dt)
+    return replace(
+        system,
+        A=inverse @ (a * np.eye(n) + system.A),
+        B=root * inverse @ system.B,
+        C=root * system.C @ inverse,
+        D=system.D + system.C @ inverse @ system.B,
+        dt=dt,
+    )
 
 
 def image_frequency(omega: np.ndarray | float, dt: float) -> np.ndarray | float:
@@ -83,6 +103,10 @@ def _inverse(matrix: np.ndarray, size: float, failed: str, cause: str) -> np.nda
     # The test uses the poles, because a condition number would depend on the units of the states.
     nearest = float(np.min(np.abs(la.eigvals(matrix)))) / size
     if nearest <= SETTINGS.at_infinity:
-        raise ComputationError(failed, measured=f"relative distance {nearest:.1e}", cause=cause,
-                               next_step="move the pole off this point, or take another discretisation")
+        raise ComputationError(
+            failed,
+            measured=f"relative distance {nearest:.1e}",
+            cause=cause,
+            next_step="move the pole off this point, or take another discretisation",
+        )
     return np.linalg.inv(matrix)

@@ -22,8 +22,9 @@ def summing_junction(output: str, terms: Sequence[str]) -> StateSpace:
     return gain([signs], names, [output])
 
 
-def connect(parts: dict[str, StateSpace] | Sequence[StateSpace], inputs: Sequence[str],
-            outputs: Sequence[str]) -> StateSpace:
+def connect(
+    parts: dict[str, StateSpace] | Sequence[StateSpace], inputs: Sequence[str], outputs: Sequence[str]
+) -> StateSpace:
     """Connect systems through signals of the same name.
 
     Parameters
@@ -42,8 +43,12 @@ def connect(parts: dict[str, StateSpace] | Sequence[StateSpace], inputs: Sequenc
     if missing := [name for name in outputs if name not in source]:
         raise InputError(f"output {missing} is driven by nothing; the signals are {sorted(source)}")
 
-    total = append(*(part.renamed([f"{key}:{n}" for n in part.inputs], [f"{key}:{n}" for n in part.outputs])
-                     for key, part in named.items()))
+    total = append(
+        *(
+            part.renamed([f"{key}:{n}" for n in part.inputs], [f"{key}:{n}" for n in part.outputs])
+            for key, part in named.items()
+        )
+    )
     read = [name for part in named.values() for name in part.inputs]
     made = [name for part in named.values() for name in part.outputs]
     external = {name: k for k, name in enumerate(inputs)}
@@ -85,9 +90,12 @@ def _close(total: StateSpace, F: np.ndarray, E: np.ndarray) -> tuple[np.ndarray,
     """(A, B, C, D) from the external inputs e to all outputs y of the parts, with u = F y + E e."""
     loop = np.eye(total.noutputs) - total.D @ F
     if total.noutputs and (condition := np.linalg.cond(_equilibrated(loop))) > 1e12:
-        raise ComputationError("the connection is not well posed", cause="an algebraic loop of unit gain",
-                               measured=f"condition of I - D F, scaled, is {condition:.1e}",
-                               next_step="put a delay or a low-pass filter in the loop")
+        raise ComputationError(
+            "the connection is not well posed",
+            cause="an algebraic loop of unit gain",
+            measured=f"condition of I - D F, scaled, is {condition:.1e}",
+            next_step="put a delay or a low-pass filter in the loop",
+        )
     C = np.linalg.solve(loop, total.C)
     D = np.linalg.solve(loop, total.D @ E)
     return total.A + total.B @ F @ C, total.B @ (E + F @ D), C, D
@@ -110,8 +118,8 @@ def lft_lower(P: StateSpace, K: StateSpace) -> StateSpace:
         raise InputError(f"controller {K.D.shape} does not fit plant {P.D.shape}")
     total = append(_anonymous(P, "p"), _anonymous(K, "k"))
     F = np.zeros((P.ninputs + n_y, P.noutputs + n_u))
-    F[n_w:P.ninputs, P.noutputs:] = np.eye(n_u)
-    F[P.ninputs:, n_z:P.noutputs] = np.eye(n_y)
+    F[n_w : P.ninputs, P.noutputs :] = np.eye(n_u)
+    F[P.ninputs :, n_z : P.noutputs] = np.eye(n_y)
     E = np.eye(P.ninputs + n_y, n_w)
     A, B, C, D = _close(total, F, E)
     return StateSpace(A, B, C[:n_z], D[:n_z], total.dt, P.inputs[:n_w], P.outputs[:n_z], P.states + K.states)
@@ -127,5 +135,6 @@ def lft_upper(P: StateSpace, Delta: StateSpace | np.ndarray) -> StateSpace:
 
 
 def _anonymous(system: StateSpace, prefix: str) -> StateSpace:
-    return system.renamed([f"{prefix}u{k}" for k in range(system.ninputs)],
-                          [f"{prefix}y{k}" for k in range(system.noutputs)])
+    return system.renamed(
+        [f"{prefix}u{k}" for k in range(system.ninputs)], [f"{prefix}y{k}" for k in range(system.noutputs)]
+    )

@@ -33,8 +33,11 @@ def as_system(given: Any, field: str = "system") -> StateSpace:
         raise InputError(f"expected a proper system: {' '.join(str(error).split())}", field=field) from None
     if found is not None:
         return found
-    raise InputError("expected a StateSpace (avis_ctrl or python-control), a TransferFunction, a number or a matrix",
-                     field=field, value=type(given).__name__)
+    raise InputError(
+        "expected a StateSpace (avis_ctrl or python-control), a TransferFunction, a number or a matrix",
+        field=field,
+        value=type(given).__name__,
+    )
 
 
 def is_response(given: Any) -> bool:

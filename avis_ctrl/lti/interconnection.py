@@ -14,8 +14,12 @@ Quadruple = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 def series(X: Quadruple, Y: Quadruple) -> Quadruple:
     """X Y, the outputs of Y connected to the inputs of X; the internal signals of X come first."""
     (A, B, C, D), (a, b, c, d) = X, Y
-    return (np.block([[A, B @ c], [np.zeros((a.shape[0], A.shape[1])), a]]), np.vstack([B @ d, b]),
-            np.hstack([C, D @ c]), D @ d)
+    return (
+        np.block([[A, B @ c], [np.zeros((a.shape[0], A.shape[1])), a]]),
+        np.vstack([B @ d, b]),
+        np.hstack([C, D @ c]),
+        D @ d,
+    )
 
 
 def parallel(X: Quadruple, Y: Quadruple) -> Quadruple:
@@ -35,7 +39,7 @@ def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
     # y and u as functions of the internal signals of X and Y, and of r.
     y = np.linalg.inv(return_difference(X, Y, sign)) @ np.hstack([C, sign * D @ c, D])
     u = sign * d @ y
-    u[:, A.shape[1]:] += np.hstack([sign * c, np.eye(D.shape[1])])
+    u[:, A.shape[1] :] += np.hstack([sign * c, np.eye(D.shape[1])])
     out, n = np.vstack([B @ u, b @ y]), A.shape[1] + a.shape[1]
     out[:, :n] += la.block_diag(A, a)
     return out[:, :n], out[:, n:], y[:, :n], y[:, n:]

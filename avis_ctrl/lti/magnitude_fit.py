@@ -59,8 +59,13 @@ class _Layout:
 
     def function(self, x: np.ndarray) -> Rational:
         zp, pp, rz, rp = (np.exp(part) for part in self.split(x))
-        return Rational(float(np.exp(x[0])), tuple((float(w), float(z)) for w, z in zp),
-                        tuple((float(w), float(z)) for w, z in pp), tuple(map(float, rz)), tuple(map(float, rp)))
+        return Rational(
+            float(np.exp(x[0])),
+            tuple((float(w), float(z)) for w, z in zp),
+            tuple((float(w), float(z)) for w, z in pp),
+            tuple(map(float, rz)),
+            tuple(map(float, rp)),
+        )
 
     def log_magnitude(self, x: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """log|H| at omega and its Jacobian (n_omega, n_unknowns)."""
@@ -69,13 +74,13 @@ class _Layout:
         for sign, pairs in ((1.0, zp), (-1.0, pp)):
             for log_w, log_zeta in pairs:
                 w, zeta = np.exp(log_w), np.exp(log_zeta)
-                real, imag = w * w - omega ** 2, 2 * zeta * w * omega
-                square = real ** 2 + imag ** 2
+                real, imag = w * w - omega**2, 2 * zeta * w * omega
+                square = real**2 + imag**2
                 value = value + sign * 0.5 * np.log(square)
-                columns.append(sign * np.stack([(2 * real * w * w + imag ** 2) / square, imag ** 2 / square], axis=1))
+                columns.append(sign * np.stack([(2 * real * w * w + imag**2) / square, imag**2 / square], axis=1))
         for sign, singles in ((1.0, rz), (-1.0, rp)):
             for log_w in singles:
-                square = omega ** 2 + np.exp(2 * log_w)
+                square = omega**2 + np.exp(2 * log_w)
                 value = value + sign * 0.5 * np.log(square)
                 columns.append(sign * (np.exp(2 * log_w) / square)[:, None])
         return value, np.hstack(columns)
@@ -84,14 +89,20 @@ class _Layout:
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
         w_low, w_high = np.log(omega[0] / reach), np.log(omega[-1] * reach)
         pairs = 2 * (self.zero_pairs + self.pole_pairs)
-        low[1:1 + pairs:2], high[1:1 + pairs:2] = w_low, w_high
-        low[2:1 + pairs:2], high[2:1 + pairs:2] = np.log(min_damping), np.log(10.0)
-        low[1 + pairs:], high[1 + pairs:] = w_low, w_high
+        low[1 : 1 + pairs : 2], high[1 : 1 + pairs : 2] = w_low, w_high
+        low[2 : 1 + pairs : 2], high[2 : 1 + pairs : 2] = np.log(min_damping), np.log(10.0)
+        low[1 + pairs :], high[1 + pairs :] = w_low, w_high
         return low, high
 
 
-def magnitude_fit(omega: np.ndarray, magnitude: np.ndarray, order: int, relative_degree: int = 0,
-                  min_damping: float = 0.02, reach: float = 10.0) -> MagnitudeFit:
+def magnitude_fit(
+    omega: np.ndarray,
+    magnitude: np.ndarray,
+    order: int,
+    relative_degree: int = 0,
+    min_damping: float = 0.02,
+    reach: float = 10.0,
+) -> MagnitudeFit:
     """Stable, minimum-phase rational function by a least-squares fit of the log magnitude.
 
     Parameters
@@ -110,16 +121,24 @@ def magnitude_fit(omega: np.ndarray, magnitude: np.ndarray, order: int, relative
     """
     omega, log_target = _checked(omega, magnitude)
     if not (order >= relative_degree >= 0):
-        raise InputError("the order must be at least the relative degree, and that at least 0", field="order",
-                         value=order)
+        raise InputError(
+            "the order must be at least the relative degree, and that at least 0", field="order", value=order
+        )
     path = _growth(omega, log_target, relative_degree, (order - relative_degree) % 2, min_damping, reach)
     layout, x = next(step for step in path if step[0].order == order)
     error = DB * (layout.log_magnitude(x, omega)[0] - log_target)
-    return MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(error ** 2))), float(np.max(np.abs(error))))
+    return MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))))
 
 
-def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order: int,
-                 target: np.ndarray | None = None, min_damping: float = 0.1, reach: float = 10.0) -> MagnitudeFit:
+def covering_fit(
+    omega: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    order: int,
+    target: np.ndarray | None = None,
+    min_damping: float = 0.1,
+    reach: float = 10.0,
+) -> MagnitudeFit:
     """Biproper function with |H| >= lower at all points and the smallest maximum excess of |H| over upper in dB.
 
     Parameters
@@ -141,9 +160,15 @@ def covering_fit(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order:
     return last
 
 
-def covering_fits(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, orders: Iterable[int],
-                  target: np.ndarray | None = None, min_damping: float = 0.1,
-                  reach: float = 10.0) -> Iterator[MagnitudeFit]:
+def covering_fits(
+    omega: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    orders: Iterable[int],
+    target: np.ndarray | None = None,
+    min_damping: float = 0.1,
+    reach: float = 10.0,
+) -> Iterator[MagnitudeFit]:
     """Generate `covering_fit` for increasing orders; each starts from the least-squares fit of the same order."""
     omega, log_lower = _checked(omega, lower)
     _, log_upper = _checked(omega, upper)
@@ -158,12 +183,20 @@ def covering_fits(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, order
         x = x.copy()
         x[0] += np.max(log_lower - layout.log_magnitude(x, omega)[0])
         excess = DB * np.maximum(layout.log_magnitude(x, omega)[0] - log_upper, 0.0)
-        yield MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(excess ** 2))), float(np.max(excess)))
+        yield MagnitudeFit(layout.function(x), float(np.sqrt(np.mean(excess**2))), float(np.max(excess)))
 
 
-def _chebyshev(layout: _Layout, x: np.ndarray, omega: np.ndarray, lower: np.ndarray, upper: np.ndarray,
-               min_damping: float, reach: float) -> np.ndarray:
+def _chebyshev(
+    layout: _Layout,
+    x: np.ndarray,
+    omega: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    min_damping: float,
+    reach: float,
+) -> np.ndarray:
     """Minimise t subject to lower <= log|H| <= upper + t, by sequential quadratic programming from x."""
+
     def slack(y: np.ndarray) -> np.ndarray:
         value, _ = layout.log_magnitude(y[:-1], omega)
         return np.concatenate([value - lower, upper + y[-1] - value])
@@ -178,10 +211,15 @@ def _chebyshev(layout: _Layout, x: np.ndarray, omega: np.ndarray, lower: np.ndar
     t0 = np.max(value + np.max(lower - value) - upper)
     low, high = layout.bounds(omega, min_damping, reach)
     gradient = np.append(np.zeros(layout.size), 1.0)
-    result = minimize(lambda y: y[-1], np.append(x, t0), jac=lambda y: gradient, method="SLSQP",
-                      bounds=[*zip(low, high, strict=True), (0.0, None)],
-                      constraints=[{"type": "ineq", "fun": slack, "jac": slope}],
-                      options={"maxiter": 200, "ftol": 1e-8})
+    result = minimize(
+        lambda y: y[-1],
+        np.append(x, t0),
+        jac=lambda y: gradient,
+        method="SLSQP",
+        bounds=[*zip(low, high, strict=True), (0.0, None)],
+        constraints=[{"type": "ineq", "fun": slack, "jac": slope}],
+        options={"maxiter": 200, "ftol": 1e-8},
+    )
     better = np.all(np.isfinite(result.x)) and result.x[-1] < t0 and np.min(slack(result.x)) > -1e-3
     return np.asarray(result.x[:-1]) if better else x
 
@@ -197,8 +235,9 @@ def _checked(omega: np.ndarray, magnitude: np.ndarray) -> tuple[np.ndarray, np.n
     return omega, np.log(magnitude)
 
 
-def _growth(omega: np.ndarray, log_target: np.ndarray, relative_degree: int, odd: int, min_damping: float,
-            reach: float) -> Iterator[tuple[_Layout, np.ndarray]]:
+def _growth(
+    omega: np.ndarray, log_target: np.ndarray, relative_degree: int, odd: int, min_damping: float, reach: float
+) -> Iterator[tuple[_Layout, np.ndarray]]:
     """Least-squares fits of order relative_degree + odd, then two orders higher each time; an infinite generator."""
     layout, x = _start(omega, log_target, odd, relative_degree)
     x = _least_squares(layout, x, omega, log_target, min_damping, reach, 300)
@@ -225,8 +264,9 @@ def _start(omega: np.ndarray, log_target: np.ndarray, odd: int, relative_degree:
     return layout, x
 
 
-def _grown(layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.ndarray
-           ) -> list[tuple[_Layout, np.ndarray]]:
+def _grown(
+    layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.ndarray
+) -> list[tuple[_Layout, np.ndarray]]:
     """Initial guesses with one more biquad: a peak or notch at the largest errors, or a step within the band."""
     value, _ = layout.log_magnitude(x, omega)
     error = log_target - value
@@ -239,18 +279,34 @@ def _grown(layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.nda
         guesses.append(([centre, np.log(zeta) + tall / 2], [centre, np.log(zeta) - tall / 2]))
     for at in np.log(omega[[omega.size // 4, omega.size // 2, (3 * omega.size) // 4]]):
         guesses += [([at + 0.2, 0.0], [at - 0.2, 0.0]), ([at - 0.2, 0.0], [at + 0.2, 0.0])]
-    return [(grown, grown.join(x[0], np.vstack([zp, [zero]]), np.vstack([pp, [pole]]), rz, rp))
-            for zero, pole in guesses]
+    return [
+        (grown, grown.join(x[0], np.vstack([zp, [zero]]), np.vstack([pp, [pole]]), rz, rp)) for zero, pole in guesses
+    ]
 
 
-def _least_squares(layout: _Layout, x: np.ndarray, omega: np.ndarray, log_target: np.ndarray, min_damping: float,
-                   reach: float, evaluations: int) -> np.ndarray:
+def _least_squares(
+    layout: _Layout,
+    x: np.ndarray,
+    omega: np.ndarray,
+    log_target: np.ndarray,
+    min_damping: float,
+    reach: float,
+    evaluations: int,
+) -> np.ndarray:
     low, high = layout.bounds(omega, min_damping, reach)
-    result = least_squares(lambda y: layout.log_magnitude(y, omega)[0] - log_target,
-                           np.clip(x, low + 1e-6, high - 1e-6), jac=lambda y: layout.log_magnitude(y, omega)[1],
-                           bounds=(low, high), x_scale=1.0, max_nfev=evaluations)
+    result = least_squares(
+        lambda y: layout.log_magnitude(y, omega)[0] - log_target,
+        np.clip(x, low + 1e-6, high - 1e-6),
+        jac=lambda y: layout.log_magnitude(y, omega)[1],
+        bounds=(low, high),
+        x_scale=1.0,
+        max_nfev=evaluations,
+    )
     if not np.all(np.isfinite(result.x)):
-        raise ComputationError("the magnitude fit diverged", measured=f"cost {result.cost:.3g}",
-                               cause="data spanning too many decades for the order",
-                               next_step="narrow the band or raise the order")
+        raise ComputationError(
+            "the magnitude fit diverged",
+            measured=f"cost {result.cost:.3g}",
+            cause="data spanning too many decades for the order",
+            next_step="narrow the band or raise the order",
+        )
     return np.asarray(result.x)

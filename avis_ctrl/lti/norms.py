@@ -60,8 +60,15 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
     sizes = np.abs(poles[poles != 0]) if np.any(poles) else np.ones(1)
     # A coarse grid catches flat responses, whose Hamiltonian eigenvalues are ill conditioned.
     grid = np.geomspace(0.1 * np.min(sizes), 10 * np.max(sizes), 100)
-    candidates = np.concatenate([[0.0, np.inf], grid, np.abs(poles), np.abs(poles.imag),
-                                 np.sqrt(np.maximum(np.abs(poles) ** 2 - 2 * poles.real ** 2, 0.0))])
+    candidates = np.concatenate(
+        [
+            [0.0, np.inf],
+            grid,
+            np.abs(poles),
+            np.abs(poles.imag),
+            np.sqrt(np.maximum(np.abs(poles) ** 2 - 2 * poles.real**2, 0.0)),
+        ]
+    )
     omega, level = _best(system, np.unique(candidates))
     if level == 0.0:
         return PeakGain(0.0, 0.0)
@@ -81,8 +88,12 @@ def hinf_norm(system: StateSpace, tolerance: float = 1e-6) -> PeakGain:
         if new_level <= (1.0 + tolerance) * level:
             return PeakGain(max(level, new_level), omega if level >= new_level else new_omega)
         omega, level = new_omega, new_level
-    raise ComputationError("the H-infinity norm did not settle in 60 steps", measured=f"last level {level:.6g}",
-                           cause="a badly scaled realisation", next_step="balance the system first")
+    raise ComputationError(
+        "the H-infinity norm did not settle in 60 steps",
+        measured=f"last level {level:.6g}",
+        cause="a badly scaled realisation",
+        next_step="balance the system first",
+    )
 
 
 def norm_is_below(system: StateSpace, level: float) -> bool:
@@ -116,7 +127,7 @@ def largest_singular_value(M: np.ndarray) -> np.ndarray:
     if rows == columns == 2:
         square = np.sum(np.abs(M) ** 2, axis=(-2, -1))
         product = np.abs(M[..., 0, 0] * M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0])
-        return size * np.sqrt((square + np.sqrt(np.maximum(square ** 2 - 4 * product ** 2, 0.0))) / 2)
+        return size * np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * product**2, 0.0))) / 2)
     if not (rows and columns):
         return size
     adjoint = np.conj(np.swapaxes(M, -1, -2))
@@ -128,8 +139,12 @@ def _best(system: StateSpace, omegas: np.ndarray) -> tuple[float, float]:
     response = system.frequency_response(omegas)
     if not np.all(np.isfinite(response)):
         lost = int(np.sum(~np.all(np.isfinite(response), axis=(1, 2))))
-        raise ComputationError("the response overflows", measured=f"at {lost} of {len(omegas)} frequencies",
-                               cause="a badly scaled realisation", next_step="balance the system first")
+        raise ComputationError(
+            "the response overflows",
+            measured=f"at {lost} of {len(omegas)} frequencies",
+            cause="a badly scaled realisation",
+            next_step="balance the system first",
+        )
     gains = np.linalg.norm(response, ord=2, axis=(1, 2))
     best = int(np.argmax(gains))
     return float(omegas[best]), float(gains[best])
@@ -145,7 +160,7 @@ def _balanced(system: StateSpace) -> StateSpace:
 def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
     """Frequencies [rad/s] where a singular value of the response (nearly) equals the level; level > sigma_max(D)."""
     A, B, C, D = system.A, system.B, system.C, system.D
-    R = level ** 2 * np.eye(system.ninputs) - D.T @ D
+    R = level**2 * np.eye(system.ninputs) - D.T @ D
     if not system.nstates or np.min(la.eigvalsh(R)) <= 0:
         return np.zeros(0)
     gain_x = np.linalg.solve(R, D.T @ C)
@@ -153,8 +168,14 @@ def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
     BR = B @ np.linalg.solve(R, B.T)
     Q = C.T @ C + C.T @ D @ gain_x
     scale = symplectic_scale(F, BR, Q)
-    eigenvalues = la.eigvals(np.block([[F / scale[:, None] * scale, BR / np.outer(scale, scale)],
-                                       [-Q * np.outer(scale, scale), -(F / scale[:, None] * scale).T]]))
+    eigenvalues = la.eigvals(
+        np.block(
+            [
+                [F / scale[:, None] * scale, BR / np.outer(scale, scale)],
+                [-Q * np.outer(scale, scale), -(F / scale[:, None] * scale).T],
+            ]
+        )
+    )
     size = np.maximum(np.abs(eigenvalues), 1e-12 * np.max(np.abs(eigenvalues)))
     # Round-off moves the crossings of a flat response far off the axis (a nearly multiple eigenvalue). The caller
     # evaluates the response at every returned frequency: an extra frequency costs little, a missing one the norm.

@@ -43,11 +43,15 @@ class Rational:
         for field in ("gain", "zero_pairs", "pole_pairs", "real_zeros", "real_poles"):
             numbers = np.asarray(getattr(self, field), float)
             if not (np.all(np.isfinite(numbers)) and np.all(numbers > 0)):
-                raise InputError("every number must be finite and positive (stable, minimum phase)", field=field,
-                                 value=getattr(self, field))
+                raise InputError(
+                    "every number must be finite and positive (stable, minimum phase)",
+                    field=field,
+                    value=getattr(self, field),
+                )
         if self.relative_degree < 0:
-            raise InputError(f"improper: {self.order - self.relative_degree} zeros over {self.order} poles",
-                             field="zero_pairs")
+            raise InputError(
+                f"improper: {self.order - self.relative_degree} zeros over {self.order} poles", field="zero_pairs"
+            )
 
     @property
     def order(self) -> int:
@@ -108,8 +112,13 @@ def second_order_roots(corner_Hz: float, damping: float) -> np.ndarray:
     return _roots([(2 * np.pi * corner_Hz, damping)], [])
 
 
-def cascade(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np.ndarray, leading: float,
-            input: str = "u", output: str = "y") -> StateSpace:
+def cascade(
+    zeros: Sequence[complex] | np.ndarray,
+    poles: Sequence[complex] | np.ndarray,
+    leading: float,
+    input: str = "u",
+    output: str = "y",
+) -> StateSpace:
     """leading * prod(s - z) / prod(s - p) as a balanced cascade of first- and second-order sections.
 
     A cascade keeps widely spread roots accurate; a single companion matrix would lose them. The poles of each section
@@ -119,8 +128,9 @@ def cascade(zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np
     """
     pole_sections, zero_sections = _real_sections(poles, "poles"), _real_sections(zeros, "zeros")
     if sum(len(z) for z in zero_sections) > sum(len(p) for p in pole_sections):
-        raise InputError(f"improper: {len(np.atleast_1d(zeros))} zeros over {len(np.atleast_1d(poles))} poles",
-                         field="zeros")
+        raise InputError(
+            f"improper: {len(np.atleast_1d(zeros))} zeros over {len(np.atleast_1d(poles))} poles", field="zeros"
+        )
     if not pole_sections:
         return gain(leading, [input], [output])
     chain = None
@@ -158,7 +168,7 @@ def _real_sections(roots: Sequence[complex] | np.ndarray, field: str) -> list[np
         sections.append(np.array([root, np.conj(root)]))
     if lower:
         raise InputError(f"complex root {lower[0]:.4g} has no conjugate", field=field)
-    sections += [np.array(real[k:k + 2], complex) for k in range(0, len(real), 2)]
+    sections += [np.array(real[k : k + 2], complex) for k in range(0, len(real), 2)]
     return sorted(sections, key=lambda s: float(np.max(np.abs(s))))
 
 

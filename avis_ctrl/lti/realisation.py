@@ -24,8 +24,8 @@ def balance(system: StateSpace) -> StateSpace:
     A = np.abs(system.A - np.diag(np.diag(system.A)))
     for _ in range(30):
         Ak = A / scale[:, None] * scale
-        rows = np.sqrt(np.sum(Ak ** 2, axis=1) + (norm_B / scale) ** 2)
-        cols = np.sqrt(np.sum(Ak ** 2, axis=0) + (norm_C * scale) ** 2)
+        rows = np.sqrt(np.sum(Ak**2, axis=1) + (norm_B / scale) ** 2)
+        cols = np.sqrt(np.sum(Ak**2, axis=0) + (norm_C * scale) ** 2)
         step = np.where((rows > 0) & (cols > 0), np.sqrt(np.divide(rows, cols, out=np.ones(n), where=cols > 0)), 1.0)
         step = 2.0 ** np.round(np.log2(step) * 0.8)
         if np.all(step == 1.0):
@@ -38,9 +38,14 @@ def gramian_factors(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     """Square-root factors L_c, L_o of the controllability and observability Gramians of a stable system."""
     if not system.is_stable():
         poles = system.poles()
-        raise ComputationError("Gramians exist for stable systems only", measured=(
-            f"largest magnitude of a pole {np.max(np.abs(poles)):.3g}" if system.dt else
-            f"largest real part {np.max(poles.real):.3g} rad/s"))
+        raise ComputationError(
+            "Gramians exist for stable systems only",
+            measured=(
+                f"largest magnitude of a pole {np.max(np.abs(poles)):.3g}"
+                if system.dt
+                else f"largest real part {np.max(poles.real):.3g} rad/s"
+            ),
+        )
     if system.dt:
         Wc = la.solve_discrete_lyapunov(system.A, system.B @ system.B.T)
         Wo = la.solve_discrete_lyapunov(system.A.T, system.C.T @ system.C)
@@ -51,6 +56,7 @@ def gramian_factors(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     def factor(W: np.ndarray) -> np.ndarray:
         values, vectors = la.eigh((W + W.T) / 2)
         return vectors * np.sqrt(np.maximum(values, 0.0))
+
     return factor(Wc), factor(Wo)
 
 
@@ -82,6 +88,7 @@ def balanced_truncation(system: StateSpace, order: int | None = None, tolerance:
 
 def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
     """Remove uncontrollable and unobservable states (staircase algorithm by SVD on the balanced system)."""
+
     def reachable(A: np.ndarray, B: np.ndarray) -> np.ndarray:
         size = np.linalg.norm(A, 2)
         Q, s, _ = la.svd(B, full_matrices=False) if B.size else (np.zeros((A.shape[0], 0)), np.zeros(0), None)
@@ -95,6 +102,7 @@ def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
             new = Q[:, s > tolerance * size]
             basis = np.hstack([basis, new])
         return basis
+
     if not system.nstates:
         return system
     base = balance(system)

@@ -164,8 +164,13 @@ class StateSpace:
             return NotImplemented
         if self.ninputs != other.noutputs:
             raise InputError(f"series connection of {other.noutputs} outputs into {self.ninputs} inputs")
-        return StateSpace(*series(self.matrices, other.matrices), _common_dt(self, other), other.inputs, self.outputs,
-                          self.states + other.states)
+        return StateSpace(
+            *series(self.matrices, other.matrices),
+            _common_dt(self, other),
+            other.inputs,
+            self.outputs,
+            self.states + other.states,
+        )
 
     def __rmatmul__(self, other: Any) -> StateSpace:
         left = operand(other)
@@ -188,8 +193,13 @@ class StateSpace:
             return NotImplemented
         if self.D.shape != other.D.shape:
             raise InputError(f"parallel connection of shapes {self.D.shape} and {other.D.shape}")
-        return StateSpace(*parallel(self.matrices, other.matrices), _common_dt(self, other), self.inputs, self.outputs,
-                          self.states + other.states)
+        return StateSpace(
+            *parallel(self.matrices, other.matrices),
+            _common_dt(self, other),
+            self.inputs,
+            self.outputs,
+            self.states + other.states,
+        )
 
     def __neg__(self) -> StateSpace:
         return replace(self, C=-self.C, D=-self.D)
@@ -207,12 +217,20 @@ class StateSpace:
         """Closed loop from r to y with y = self u, u = r + sign other y. Raises InputError if it is not well posed."""
         K = operand(other)
         if K is None or K.D.shape != self.D.shape[::-1] or sign not in (-1, 1):
-            raise InputError(f"expected {self.noutputs} inputs and {self.ninputs} outputs, and sign -1 or 1",
-                             field="other, sign", value=(np.shape(K.D) if K else type(other).__name__, sign))
+            raise InputError(
+                f"expected {self.noutputs} inputs and {self.ninputs} outputs, and sign -1 or 1",
+                field="other, sign",
+                value=(np.shape(K.D) if K else type(other).__name__, sign),
+            )
         if np.linalg.cond(return_difference(self.matrices, K.matrices, sign)) > 1 / np.finfo(float).eps:
             raise InputError("the loop is not well posed: an algebraic loop without a solution", field="other")
-        return StateSpace(*feedback(self.matrices, K.matrices, sign), _common_dt(self, K), self.inputs, self.outputs,
-                          self.states + K.states)
+        return StateSpace(
+            *feedback(self.matrices, K.matrices, sign),
+            _common_dt(self, K),
+            self.inputs,
+            self.outputs,
+            self.states + K.states,
+        )
 
     def scaled(self, left: np.ndarray | float = 1.0, right: np.ndarray | float = 1.0) -> StateSpace:
         """`left @ self @ right`, where a vector represents a diagonal matrix and a scalar a multiple of the identity.
@@ -224,9 +242,13 @@ class StateSpace:
         inputs = self.inputs if R.shape[1] == self.ninputs else ()
         return StateSpace(self.A, self.B @ R, L @ self.C, L @ self.D @ R, self.dt, inputs, outputs, self.states)
 
-    def renamed(self, inputs: Sequence[str] | dict[str, str] | None = None,
-                outputs: Sequence[str] | dict[str, str] | None = None) -> StateSpace:
+    def renamed(
+        self,
+        inputs: Sequence[str] | dict[str, str] | None = None,
+        outputs: Sequence[str] | dict[str, str] | None = None,
+    ) -> StateSpace:
         """The same system with new signal names (a full list, or a dict from old to new names)."""
+
         def new(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:
             if given is None:
                 return old
@@ -235,14 +257,23 @@ class StateSpace:
                     raise InputError(f"no signal {missing} among {old}")
                 return tuple(given.get(name, name) for name in old)
             return tuple(given)
+
         return replace(self, inputs=new(self.inputs, inputs), outputs=new(self.outputs, outputs))
 
     def select(self, outputs: Selector | None = None, inputs: Selector | None = None) -> StateSpace:
         """The subsystem of the selected inputs and outputs, by name or position, in the order given."""
         rows = positions(self.outputs, outputs, "output")
         cols = positions(self.inputs, inputs, "input")
-        return StateSpace(self.A, self.B[:, cols], self.C[rows], self.D[np.ix_(rows, cols)], self.dt,
-                          tuple(self.inputs[k] for k in cols), tuple(self.outputs[k] for k in rows), self.states)
+        return StateSpace(
+            self.A,
+            self.B[:, cols],
+            self.C[rows],
+            self.D[np.ix_(rows, cols)],
+            self.dt,
+            tuple(self.inputs[k] for k in cols),
+            tuple(self.outputs[k] for k in rows),
+            self.states,
+        )
 
     def similar(self, T: np.ndarray) -> StateSpace:
         """The same transfer matrix in the state coordinates x_new = inv(T) x."""
@@ -256,9 +287,16 @@ class StateSpace:
         """
         import control
 
-        return control.ss(self.A, self.B, self.C, self.D, self.dt, remove_useless_states=False,
-                          inputs=[name.replace(".", "_") for name in self.inputs],
-                          outputs=[name.replace(".", "_") for name in self.outputs])
+        return control.ss(
+            self.A,
+            self.B,
+            self.C,
+            self.D,
+            self.dt,
+            remove_useless_states=False,
+            inputs=[name.replace(".", "_") for name in self.inputs],
+            outputs=[name.replace(".", "_") for name in self.outputs],
+        )
 
     @staticmethod
     def from_control(system: Any) -> StateSpace:
@@ -267,21 +305,27 @@ class StateSpace:
             import control
 
             system = control.ss(system)
-        return StateSpace(system.A, system.B, system.C, system.D, float(system.dt or 0.0),
-                          tuple(system.input_labels), tuple(system.output_labels))
+        return StateSpace(
+            system.A,
+            system.B,
+            system.C,
+            system.D,
+            float(system.dt or 0.0),
+            tuple(system.input_labels),
+            tuple(system.output_labels),
+        )
 
     def __repr__(self) -> str:
         clock = f"dt = {self.dt:g} s" if self.dt else "continuous"
-        return (f"StateSpace({count_of(self.nstates, 'state')}, {clock}, "
-                f"{list(self.inputs)} -> {list(self.outputs)})")
+        return f"StateSpace({count_of(self.nstates, 'state')}, {clock}, {list(self.inputs)} -> {list(self.outputs)})"
 
 
-def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] = (),
-         dt: float = 0.0) -> StateSpace:
+def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] = (), dt: float = 0.0) -> StateSpace:
     """Static gain, as a system without states."""
     D = np.atleast_2d(np.asarray(matrix, dtype=float))
-    return StateSpace(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D, dt,
-                      tuple(inputs), tuple(outputs))
+    return StateSpace(
+        np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D, dt, tuple(inputs), tuple(outputs)
+    )
 
 
 def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> StateSpace:
@@ -366,13 +410,21 @@ def _companion(nums: np.ndarray, den: np.ndarray) -> StateSpace:
 
 def append(*systems: StateSpace) -> StateSpace:
     """Block-diagonal connection of systems with all their signals (default names if any name repeats)."""
+
     def joined(names: Iterable[Names]) -> Names:
         together = sum(names, ())
         return together if len(set(together)) == len(together) else ()
-    return StateSpace(la.block_diag(*(s.A for s in systems)), la.block_diag(*(s.B for s in systems)),
-                      la.block_diag(*(s.C for s in systems)), la.block_diag(*(s.D for s in systems)),
-                      _common_dt(*systems), joined(s.inputs for s in systems),
-                      joined(s.outputs for s in systems), sum((s.states for s in systems), ()))
+
+    return StateSpace(
+        la.block_diag(*(s.A for s in systems)),
+        la.block_diag(*(s.B for s in systems)),
+        la.block_diag(*(s.C for s in systems)),
+        la.block_diag(*(s.D for s in systems)),
+        _common_dt(*systems),
+        joined(s.inputs for s in systems),
+        joined(s.outputs for s in systems),
+        sum((s.states for s in systems), ()),
+    )
 
 
 def operand(given: Any) -> StateSpace | None:
@@ -470,5 +522,5 @@ def _back_substituted(T: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.nd
         block = slice(max(stop - RESOLVENT_BLOCK, 0), stop)
         right[block] += T[block, stop:] @ x[stop:]
         for k in range(stop - 1, block.start - 1, -1):
-            x[k] = (right[k] + T[k, k + 1:stop] @ x[k + 1:stop]) / pivots[k]
+            x[k] = (right[k] + T[k, k + 1 : stop] @ x[k + 1 : stop]) / pivots[k]
     return np.moveaxis((C @ x).reshape(-1, points.size, columns), 1, 0).copy()

@@ -58,13 +58,19 @@ class RecordHeader:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.sample_rate_Hz) and self.sample_rate_Hz > 0):
-            raise InputError("expected a positive sample rate in Hz", field=f"record {self.name}: sample_rate_Hz",
-                             value=self.sample_rate_Hz)
+            raise InputError(
+                "expected a positive sample rate in Hz",
+                field=f"record {self.name}: sample_rate_Hz",
+                value=self.sample_rate_Hz,
+            )
         if self.samples < 2:
             raise InputError("expected at least two samples", field=f"record {self.name}", value=self.samples)
         if self.excitation not in EXCITATIONS:
-            raise InputError(f"expected one of {', '.join(EXCITATIONS)}", field=f"record {self.name}: excitation",
-                             value=self.excitation)
+            raise InputError(
+                f"expected one of {', '.join(EXCITATIONS)}",
+                field=f"record {self.name}: excitation",
+                value=self.excitation,
+            )
         for field in ("u_names", "y_names", "floor_names"):
             names = getattr(self, field)
             if len(set(names)) != len(names):
@@ -78,8 +84,11 @@ class RecordHeader:
             raise InputError("expected a positive period in s", field=field, value=period_s)
         count = period_s * self.sample_rate_Hz
         if abs(count - round(count)) > 1e-6 * count or round(count) < 2:
-            raise InputError(f"expected a whole number of samples; at {self.sample_rate_Hz:g} Hz it is {count:.6g}",
-                             field=field, value=period_s)
+            raise InputError(
+                f"expected a whole number of samples; at {self.sample_rate_Hz:g} Hz it is {count:.6g}",
+                field=field,
+                value=period_s,
+            )
 
     def part(self, start: int, stop: int) -> RecordHeader:
         """Header of samples start .. stop."""
@@ -119,8 +128,12 @@ def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: i
     good = np.isfinite(array)
     if not good.all():
         row, column = np.argwhere(~good)[0]
-        raise InputError(f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at sample "
-                         f"{start + row} of channel {names[column]}", field=field, value=float(array[row, column]))
+        raise InputError(
+            f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at sample "
+            f"{start + row} of channel {names[column]}",
+            field=field,
+            value=float(array[row, column]),
+        )
 
 
 class RecordSource(ABC):
@@ -146,8 +159,11 @@ class RecordSource(ABC):
         step = longest
         if period := self.header.period_samples:
             if period > longest:
-                raise InputError(f"expected periods of at most {longest} samples, to be read in pieces",
-                                 field=f"record {self.header.name}: period_s", value=self.header.period_s)
+                raise InputError(
+                    f"expected periods of at most {longest} samples, to be read in pieces",
+                    field=f"record {self.header.name}: period_s",
+                    value=self.header.period_s,
+                )
             step = longest // period * period
         for start, stop in ranges(self.header.samples, step):
             yield self.load(start, stop)
@@ -171,8 +187,11 @@ class Record(RecordSource):
         for field, names in columns.items():
             array = np.asarray(getattr(self, field), float)
             if array.shape != (h.samples, len(names)):
-                raise InputError(f"expected shape {(h.samples, len(names))}: {h.samples} samples of {len(names)} "
-                                 "channels", field=f"record {h.name}: {field}", value=array.shape)
+                raise InputError(
+                    f"expected shape {(h.samples, len(names))}: {h.samples} samples of {len(names)} channels",
+                    field=f"record {h.name}: {field}",
+                    value=array.shape,
+                )
             require_finite(array, names, f"record {h.name}: {field}")
             object.__setattr__(self, field, array)
         if self.floor is None and h.floor_names:
@@ -187,8 +206,12 @@ class Record(RecordSource):
         stop = self.header.samples if stop is None else stop
         if (start, stop) == (0, self.header.samples):
             return self
-        return Record(self.header.part(start, stop), self.u[start:stop], self.y[start:stop],
-                      None if self.floor is None else self.floor[start:stop])
+        return Record(
+            self.header.part(start, stop),
+            self.u[start:stop],
+            self.y[start:stop],
+            None if self.floor is None else self.floor[start:stop],
+        )
 
 
 class Portion(RecordSource):
@@ -227,9 +250,11 @@ class Campaign:
         for record in self.records[1:]:
             for field in ("sample_rate_Hz", "u_names", "y_names", "u_unit", "y_unit"):
                 if getattr(record.header, field) != getattr(first, field):
-                    raise InputError(f"expected {getattr(first, field)!r} as in record {first.name}",
-                                     field=f"record {record.header.name}: {field}",
-                                     value=getattr(record.header, field))
+                    raise InputError(
+                        f"expected {getattr(first, field)!r} as in record {first.name}",
+                        field=f"record {record.header.name}: {field}",
+                        value=getattr(record.header, field),
+                    )
 
     @property
     def sample_rate_Hz(self) -> float:
@@ -270,8 +295,10 @@ def in_short(notes: tuple[str, ...]) -> tuple[str, ...]:
         head, colon, text = note.partition(": ")
         named = colon and head.startswith("record ")
         of.setdefault(text if named else note, []).append(head.removeprefix("record ") if named else "")
-    return tuple(text if names == [""] else f"record{'s' if len(names) > 1 else ''} {', '.join(names)}: {text}"
-                 for text, names in of.items())
+    return tuple(
+        text if names == [""] else f"record{'s' if len(names) > 1 else ''} {', '.join(names)}: {text}"
+        for text, names in of.items()
+    )
 
 
 def digest(campaign: Campaign, longest: int = 1 << 20) -> str:

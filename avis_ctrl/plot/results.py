@@ -13,8 +13,14 @@ from avis_ctrl.plot.axes import HERTZ, axes_of, finish, log_if_wide, whole_numbe
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
 # Palette of Okabe and Ito; controllers have the same colours as in the report.
-COLOURS = {"passive": "#7a7a7a", "skyhook_classical": "#56b4e9", "skyhook": "#e69f00", "loops": "#d55e00",
-           "hinf": "#009e73", "mu": "#0072b2"}
+COLOURS = {
+    "passive": "#7a7a7a",
+    "skyhook_classical": "#56b4e9",
+    "skyhook": "#e69f00",
+    "loops": "#d55e00",
+    "hinf": "#009e73",
+    "mu": "#0072b2",
+}
 LIMIT, LOWER = "#b3261e", "#e69f00"
 
 
@@ -27,8 +33,12 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     """
     peak = getattr(peak, "mu", peak)
     if not hasattr(peak, "upper_curve"):
-        raise InputError("expected bounds of mu over frequency; for the result of a synthesis use "
-                         "mu_peak(result.closed_loop, result.blocks)", field="peak", value=type(peak).__name__)
+        raise InputError(
+            "expected bounds of mu over frequency; for the result of a synthesis use "
+            "mu_peak(result.closed_loop, result.blocks)",
+            field="peak",
+            value=type(peak).__name__,
+        )
     ax = axes_of(ax)
     f = np.asarray(peak.frequencies) / HERTZ
     shown = f > 0
@@ -37,11 +47,19 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     ax.plot(f[shown], lower[shown], color=LOWER, linestyle="--", label=f"{label}, lower bound")
     if np.isfinite(peak.upper):
         worth = "proved between all points" if peak.guaranteed else "at the computed points only"
-        ax.axhline(peak.upper, color=color, linewidth=0.8, linestyle="--",
-                   label=f"peak below {peak.upper:.4g}, {worth}")
+        ax.axhline(
+            peak.upper, color=color, linewidth=0.8, linestyle="--", label=f"peak below {peak.upper:.4g}, {worth}"
+        )
     if np.isfinite(peak.lower) and peak.lower > 0 and peak.omega > 0:
-        ax.plot(peak.omega / HERTZ, peak.lower, "o", color=color, markersize=5, fillstyle="none",
-                label=f"reached: {peak.lower:.4g} at {peak.omega / HERTZ:.4g} Hz")
+        ax.plot(
+            peak.omega / HERTZ,
+            peak.lower,
+            "o",
+            color=color,
+            markersize=5,
+            fillstyle="none",
+            label=f"reached: {peak.lower:.4g} at {peak.omega / HERTZ:.4g} Hz",
+        )
     ax.set_ylim(bottom=0)
     return finish(ax, "frequency [Hz]", label, above=True)
 
@@ -70,12 +88,20 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
         colour = COLOURS.get(name, "#222222")
         ax.plot(t.omega / HERTZ, in_dB(t.sigma), color=colour, label=one.title, linewidth=2 if name == "mu" else 1.3)
         if name == names[-1]:
-            ax.fill_between(t.omega / HERTZ, in_dB(t.low), in_dB(t.high), color=colour, alpha=0.25, linewidth=0,
-                            label=f"{one.title}, sampled plants")
+            ax.fill_between(
+                t.omega / HERTZ,
+                in_dB(t.low),
+                in_dB(t.high),
+                color=colour,
+                alpha=0.25,
+                linewidth=0,
+                label=f"{one.title}, sampled plants",
+            )
             if np.isfinite(one.worst_peak.upper):
                 level = float(in_dB(np.array(one.worst_peak.upper)))
-                ax.axhline(level, color=LIMIT, linewidth=0.9, linestyle="--",
-                           label=f"{one.title}, worst case {level:.1f} dB")
+                ax.axhline(
+                    level, color=LIMIT, linewidth=0.9, linestyle="--", label=f"{one.title}, worst case {level:.1f} dB"
+                )
     return finish(ax, "frequency [Hz]", "transmissibility [dB]")
 
 
@@ -85,8 +111,7 @@ def dk_history(history: Any, ax: Any = None) -> Any:
     rows = _rows(history)
     steps = [row.iteration for row in rows]
     ax.plot(steps, [row.gamma for row in rows], "s--", color="#e69f00", markersize=4, label="gamma of the scaled loop")
-    ax.plot(steps, [row.mu_upper for row in rows], "o-", color=COLOURS["mu"], markersize=4,
-            label="peak mu on the grid")
+    ax.plot(steps, [row.mu_upper for row in rows], "o-", color=COLOURS["mu"], markersize=4, label="peak mu on the grid")
     values = np.array([[row.gamma, row.mu_upper] for row in rows])
     log_if_wide(ax, values)
     ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
@@ -97,12 +122,21 @@ def dk_history(history: Any, ax: Any = None) -> Any:
 def order(history: Any, ax: Any = None) -> Any:
     """Peak mu of each controller against its number of states; `history` as for `dk_history`, or pairs (order, mu)."""
     ax = axes_of(ax)
-    rows = history if isinstance(history, (list, tuple)) and history and isinstance(history[0], tuple) else [
-        (row.order, row.mu_upper) for row in _rows(history)]
+    rows = (
+        history
+        if isinstance(history, (list, tuple)) and history and isinstance(history[0], tuple)
+        else [(row.order, row.mu_upper) for row in _rows(history)]
+    )
     states, values = (np.array(part, float) for part in zip(*sorted(rows), strict=True))
     ax.plot(states, values, "o", color=COLOURS["mu"], markersize=4, label="controllers")
-    ax.step(states, np.minimum.accumulate(values), where="post", color=COLOURS["mu"], linewidth=1,
-            label="least mu up to this order")
+    ax.step(
+        states,
+        np.minimum.accumulate(values),
+        where="post",
+        color=COLOURS["mu"],
+        linewidth=1,
+        label="least mu up to this order",
+    )
     log_if_wide(ax, values)
     ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
     whole_numbers(ax)
@@ -118,8 +152,15 @@ def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
     for one in CRITERIA:
         f = one.midbands()
         ax.plot(f, 1e6 * one.limit(f), color="#8a8a8a", linewidth=1)
-        ax.annotate(one.name, (f[-1], 1e6 * one.limit(f)[-1]), xytext=(4, 0), textcoords="offset points", va="center",
-                    fontsize="x-small", color="#555555")
+        ax.annotate(
+            one.name,
+            (f[-1], 1e6 * one.limit(f)[-1]),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize="x-small",
+            color="#555555",
+        )
     for name, (f, rms) in (spectra or {}).items():
         f, rms = np.asarray(f, float), np.asarray(rms, float)
         if f.shape != rms.shape or f.ndim != 1:

@@ -17,8 +17,15 @@ from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 SAMPLES, FAINT = 20, {"color": "#0072b2", "alpha": 0.3, "linewidth": 0.8}
 
 
-def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequency_Hz: np.ndarray | None = None,
-         label: str | None = None, **line: Any) -> Any:
+def bode(
+    system: Any,
+    omega: np.ndarray | None = None,
+    ax: Any = None,
+    *,
+    frequency_Hz: np.ndarray | None = None,
+    label: str | None = None,
+    **line: Any,
+) -> Any:
     """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input-output pair.
 
     Returns the two axes.
@@ -56,8 +63,15 @@ def bode(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, freque
     return axes
 
 
-def sigma(system: Any, omega: np.ndarray | None = None, ax: Any = None, *, frequency_Hz: np.ndarray | None = None,
-          label: str | None = None, **line: Any) -> Any:
+def sigma(
+    system: Any,
+    omega: np.ndarray | None = None,
+    ax: Any = None,
+    *,
+    frequency_Hz: np.ndarray | None = None,
+    label: str | None = None,
+    **line: Any,
+) -> Any:
     """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, but a single axes object."""
     ax = axes_of(ax)
     if isinstance(system, UncertainSystem):
@@ -82,8 +96,9 @@ def _rad_s(omega: Any, frequency_Hz: Any, system: Any = None) -> Any:
     return None if system is None else plot_frequencies(system)
 
 
-def _family(draw: Any, system: UncertainSystem, omega: np.ndarray | None, ax: Any, label: str | None,
-            line: dict[str, Any]) -> Any:
+def _family(
+    draw: Any, system: UncertainSystem, omega: np.ndarray | None, ax: Any, label: str | None, line: dict[str, Any]
+) -> Any:
     nominal = system.nominal
     omega = plot_frequencies(nominal) if omega is None else omega
     for one in system.sample(SAMPLES):

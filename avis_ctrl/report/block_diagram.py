@@ -16,8 +16,16 @@ LEFT, MIDDLE, NEAR, FAR = 150.0, 405.0, 570.0, 710.0
 BOX_WIDTH, BOX_HEIGHT, SMALL = 160.0, 42.0, 120.0
 RIG_HEIGHT = 96.0
 DISTURBANCE, JUDGED = "#8a1c12", "#00548a"
-FILLS = {"rig": "#dbe8f6", "actuator": "#fdebc8", "sensor": "#d5f0e5", "weight": "#f6dfec", "allocation": "#eeeeee",
-         "sum": "#ffffff", "controller": "#ffffff", "delta": "#fbd9d3"}
+FILLS = {
+    "rig": "#dbe8f6",
+    "actuator": "#fdebc8",
+    "sensor": "#d5f0e5",
+    "weight": "#f6dfec",
+    "allocation": "#eeeeee",
+    "sum": "#ffffff",
+    "controller": "#ffffff",
+    "delta": "#fbd9d3",
+}
 Node = tuple[float, float, float]  # centre (x, y) and width
 
 
@@ -61,6 +69,7 @@ class BlockDiagram:
             ways = [longest(n, (*seen, n)) for n in dict.fromkeys(after.get(part, [])) if n not in seen]
             ways = [[part, *way] for way in ways if way]
             return max(ways, key=len) if ways else [part] if part in last else []
+
         starts = dict.fromkeys(r for s in self.signals if s.role == "u" for r in s.readers)
         return max((longest(start, (start,)) for start in starts), key=len)
 
@@ -109,8 +118,11 @@ class BlockDiagram:
         """The chain down the middle, and the measurement fed back to the controller at the top."""
         for upper, lower in zip(self.chain, self.chain[1:], strict=False):
             (x, y, _), (_, y2, _) = self.nodes[upper], self.nodes[lower]
-            between = [s for s in self.signals if lower in s.readers and
-                       (s.source == upper or (upper == "K" and s.role == "u"))]
+            between = [
+                s
+                for s in self.signals
+                if lower in s.readers and (s.source == upper or (upper == "K" and s.role == "u"))
+            ]
             tip = y2 - self._height(lower) / 2
             self.canvas.line([(x, y + self._height(upper) / 2), (x, tip)], width=1.6, arrow=True)
             self.canvas.text((x - 8, tip - 9), self._label(between[0]), 11, anchor="end")
@@ -118,8 +130,17 @@ class BlockDiagram:
         top = self.nodes["K"][1]
         seen = next(s for s in self.signals if s.role == "y")
         corner = 26.0
-        self.canvas.line([(x, y + BOX_HEIGHT / 2), (x, y + BOX_HEIGHT / 2 + 24), (corner, y + BOX_HEIGHT / 2 + 24),
-                          (corner, top), (x - width / 2, top)], width=1.6, arrow=True)
+        self.canvas.line(
+            [
+                (x, y + BOX_HEIGHT / 2),
+                (x, y + BOX_HEIGHT / 2 + 24),
+                (corner, y + BOX_HEIGHT / 2 + 24),
+                (corner, top),
+                (x - width / 2, top),
+            ],
+            width=1.6,
+            arrow=True,
+        )
         self.canvas.text((x - 8, y + BOX_HEIGHT / 2 + 18), self._label(seen), 11, anchor="end")
 
     def _link(self, s: SignalFamily, source: str, reader: str) -> None:
@@ -189,20 +210,27 @@ class BlockDiagram:
     def _boxes(self) -> None:
         for name, (x, y, width) in self.nodes.items():
             kind, count = self.kind.get(name, ("controller", 1))
-            self._box(kind, "controller K" if name == "K" else name.removesuffix(" *"), count, (x, y), width,
-                      self._height(name))
+            self._box(
+                kind,
+                "controller K" if name == "K" else name.removesuffix(" *"),
+                count,
+                (x, y),
+                width,
+                self._height(name),
+            )
 
     def _box(self, kind: str, name: str, count: int, place: Point, width: float, height: float = BOX_HEIGHT) -> None:
         times = f" ×{count}" if count > 1 else ""
         if count > 1:
-            self.canvas.rectangle((place[0] + 4, place[1] + 4), width, height, FILLS.get(kind, "#ffffff"),
-                                  "#777777", 0.8, 4)
+            self.canvas.rectangle(
+                (place[0] + 4, place[1] + 4), width, height, FILLS.get(kind, "#ffffff"), "#777777", 0.8, 4
+            )
         self.canvas.rectangle(place, width, height, FILLS.get(kind, "#ffffff"), corner=4)
         words, size = f"{name}{times}", 12.0
         if 6.9 * len(words) > width - 8 and " " in name:
-            cut = name.index(" ", len(name) // 2 - 1) if " " in name[len(name) // 2 - 1:] else name.rindex(" ")
+            cut = name.index(" ", len(name) // 2 - 1) if " " in name[len(name) // 2 - 1 :] else name.rindex(" ")
             self.canvas.text((place[0], place[1] - 3), name[:cut], size)
-            self.canvas.text((place[0], place[1] + 13), f"{name[cut + 1:]}{times}", size)
+            self.canvas.text((place[0], place[1] + 13), f"{name[cut + 1 :]}{times}", size)
         else:
             self.canvas.text((place[0], place[1] + 4), words, size)
 

@@ -18,8 +18,9 @@ class Canvas:
         self.width, self.height = width, height
         self._shapes: list[str] = []
 
-    def line(self, points: Sequence[Point], colour: str = "#333333", width: float = 1.2, dash: str = "",
-             arrow: bool = False) -> None:
+    def line(
+        self, points: Sequence[Point], colour: str = "#333333", width: float = 1.2, dash: str = "", arrow: bool = False
+    ) -> None:
         """A polyline, optionally with an arrowhead at its end."""
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
         style = f' stroke-dasharray="{dash}"' if dash else ""
@@ -39,28 +40,53 @@ class Canvas:
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
         self._shapes.append(f'<polygon points="{path}" fill="{fill}" stroke="{stroke}" stroke-width="{width}"/>')
 
-    def rectangle(self, centre: Point, width: float, height: float, fill: str = "#ffffff", stroke: str = "#333333",
-                  line: float = 1.2, corner: float = 0.0, dash: str = "") -> None:
+    def rectangle(
+        self,
+        centre: Point,
+        width: float,
+        height: float,
+        fill: str = "#ffffff",
+        stroke: str = "#333333",
+        line: float = 1.2,
+        corner: float = 0.0,
+        dash: str = "",
+    ) -> None:
         """A rectangle given by its centre."""
         style = f' stroke-dasharray="{dash}"' if dash else ""
-        self._shapes.append(f'<rect x="{centre[0] - width / 2:.1f}" y="{centre[1] - height / 2:.1f}" '
-                            f'width="{width:.1f}" height="{height:.1f}" rx="{corner}" fill="{fill}" '
-                            f'stroke="{stroke}" stroke-width="{line}"{style}/>')
+        self._shapes.append(
+            f'<rect x="{centre[0] - width / 2:.1f}" y="{centre[1] - height / 2:.1f}" '
+            f'width="{width:.1f}" height="{height:.1f}" rx="{corner}" fill="{fill}" '
+            f'stroke="{stroke}" stroke-width="{line}"{style}/>'
+        )
 
-    def circle(self, centre: Point, radius: float, fill: str = "none", stroke: str = "#333333",
-               width: float = 1.2) -> None:
+    def circle(
+        self, centre: Point, radius: float, fill: str = "none", stroke: str = "#333333", width: float = 1.2
+    ) -> None:
         """A circle."""
-        self._shapes.append(f'<circle cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" r="{radius}" fill="{fill}" '
-                            f'stroke="{stroke}" stroke-width="{width}"/>')
+        self._shapes.append(
+            f'<circle cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" r="{radius}" fill="{fill}" '
+            f'stroke="{stroke}" stroke-width="{width}"/>'
+        )
 
-    def text(self, place: Point, text: str, size: float = 12.0, colour: str = "#1d1d1f", anchor: Anchor = "middle",
-             bold: bool = False) -> None:
+    def text(
+        self,
+        place: Point,
+        text: str,
+        size: float = 12.0,
+        colour: str = "#1d1d1f",
+        anchor: Anchor = "middle",
+        bold: bool = False,
+    ) -> None:
         """A line of text with its baseline at `place`."""
         weight = ' font-weight="bold"' if bold else ""
-        self._shapes.append(f'<text x="{place[0]:.1f}" y="{place[1]:.1f}" font-size="{size}" fill="{colour}" '
-                            f'text-anchor="{anchor}"{weight}>{escape(text)}</text>')
+        self._shapes.append(
+            f'<text x="{place[0]:.1f}" y="{place[1]:.1f}" font-size="{size}" fill="{colour}" '
+            f'text-anchor="{anchor}"{weight}>{escape(text)}</text>'
+        )
 
     def svg(self) -> str:
         """The drawing as SVG."""
-        return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
-                f'width="{self.width:g}" height="{self.height:g}" font-family="{FONT}">{"".join(self._shapes)}</svg>')
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
+            f'width="{self.width:g}" height="{self.height:g}" font-family="{FONT}">{"".join(self._shapes)}</svg>'
+        )

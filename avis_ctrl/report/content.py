@@ -17,12 +17,28 @@ from avis_ctrl.report.sections.verdict import comparison, verdict
 from avis_ctrl.report.words import axis, joined
 from avis_ctrl.study.design_result import DesignResult
 
-SECTIONS = (verdict, comparison, transmissibility, rig, generalized_plant, bounds, synthesis, controllers, site,
-            simulation, method, provenance)
+SECTIONS = (
+    verdict,
+    comparison,
+    transmissibility,
+    rig,
+    generalized_plant,
+    bounds,
+    synthesis,
+    controllers,
+    site,
+    simulation,
+    method,
+    provenance,
+)
 
 
 def document(result: DesignResult) -> Document:
     """The report of a design."""
     kept = joined([axis(name) for name in result.plant.axes])
-    return document_of(result.design.title, f"Design report: {kept} of the rig {result.rig.name}", result.provenance,
-                       (make(result) for make in SECTIONS))
+    return document_of(
+        result.design.title,
+        f"Design report: {kept} of the rig {result.rig.name}",
+        result.provenance,
+        (make(result) for make in SECTIONS),
+    )

@@ -38,8 +38,11 @@ class Families:
 
     def __init__(self, plant: DesignPlant) -> None:
         self._stars = sorted([*plant.axes, *plant.actuators, *plant.sensors], key=len, reverse=True)
-        self._parameters = {f"{side}:{tag}" for side in "wz" for tag in (
-            name[2:] for name in plant.rig.system.inputs if name.startswith("w:"))}
+        self._parameters = {
+            f"{side}:{tag}"
+            for side in "wz"
+            for tag in (name[2:] for name in plant.rig.system.inputs if name.startswith("w:"))
+        }
         self.parts = self._part_families(plant.full.parts)
         self.signals = self._signal_families(plant.full.signals)
 

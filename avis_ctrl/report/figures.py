@@ -122,8 +122,11 @@ class Heat:
         """Stops of the colour scale: position on the logarithmic scale, 0 to 1, and colour."""
         low, high, middle = (float(np.log10(v)) for v in (*self.range, self.neutral))
         white = (middle - low) / (high - low)
-        return [(0.0, "#9ecae1"), (white, "#ffffff"),
-                *((white + share * (1 - white), colour) for share, colour in WARM)]
+        return [
+            (0.0, "#9ecae1"),
+            (white, "#ffffff"),
+            *((white + share * (1 - white), colour) for share, colour in WARM),
+        ]
 
     @property
     def decades(self) -> tuple[list[float], list[str]]:
@@ -205,13 +208,14 @@ def ticks_log(low: float, high: float) -> tuple[list[float], list[str]]:
     first, last = int(np.floor(np.log10(low) + 1e-9)), int(np.ceil(np.log10(high) - 1e-9))
     steps = (1, 2, 5) if last - first <= 2 else (1,)
     stride = 1 if last - first <= 8 else 2
-    places = [m * 10.0 ** d for d in range(first, last + 1, stride) for m in steps]
+    places = [m * 10.0**d for d in range(first, last + 1, stride) for m in steps]
     shown = [p for p in places if low * (1 - 1e-9) <= p <= high * (1 + 1e-9)]
     return shown, [f"{p:g}" if 1e-3 <= p <= 1e4 else f"{p:.0e}".replace("e-0", "e-").replace("e+0", "e") for p in shown]
 
 
-def log_limits(values: np.ndarray, below: float, above: float, default: tuple[float, float] = (0.1, 10.0),
-               quantile: float = 0.0) -> tuple[float, float]:
+def log_limits(
+    values: np.ndarray, below: float, above: float, default: tuple[float, float] = (0.1, 10.0), quantile: float = 0.0
+) -> tuple[float, float]:
     """Range of a logarithmic axis for the positive values; `default` without any.
 
     below : factor on the smallest value, or on a quantile of the values. above : factor on the largest value.
@@ -224,7 +228,9 @@ def log_range(panel: Panel) -> tuple[float, float]:
     """Range of the y axis of a logarithmic panel, from the data if none is given."""
     if panel.y.range is not None:
         return panel.y.range
-    values = [np.asarray(v, float) for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands),
-                                             *(b.high for b in panel.bands))]
+    values = [
+        np.asarray(v, float)
+        for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands), *(b.high for b in panel.bands))
+    ]
     values += [c.y + sign * c.error for c in panel.curves if c.error is not None and c.along == "y" for sign in (1, -1)]
     return log_limits(np.concatenate(values or [np.array([])]), 1 / 1.3, 1.3)

@@ -23,18 +23,26 @@ PAGE = "#set page(width: auto, height: auto, margin: 2pt, fill: none)\n#set text
 def render(document: Document) -> bytes:
     """The document as HTML; the template engine escapes all text."""
     files = resources.files("avis_ctrl.report")
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True,
-                                     undefined=jinja2.StrictUndefined,
-                                     finalize=lambda value: typeset(value) if type(value) is str else value)
+    environment = jinja2.Environment(
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: typeset(value) if type(value) is str else value,
+    )
     template = environment.from_string((files / "report.html.j2").read_text(encoding="utf-8"))
     formulas = [p for section in document.sections for p in section.flat() if isinstance(p, Formula)]
     graphs = {f.name: plotly_backend.graph(f) for f in document.figures() if isinstance(f, Figure)}
     text = template.render(
-        document=document, kind=lambda piece: type(piece).__name__, Markup=Markup,
+        document=document,
+        kind=lambda piece: type(piece).__name__,
+        Markup=Markup,
         style=Markup((files / "report.css").read_text(encoding="utf-8")),
         script=Markup((files / "report.js").read_text(encoding="utf-8")),
         formula=dict(zip(formulas, map(Markup, formula_images(formulas)), strict=True)),
-        graphs=Markup(in_script(graphs)), library=plotly_backend.library())
+        graphs=Markup(in_script(graphs)),
+        library=plotly_backend.library(),
+    )
     return text.encode()
 
 

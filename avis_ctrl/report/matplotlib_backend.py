@@ -25,9 +25,17 @@ BAR_IN, BAR_HEIGHT_IN = 0.5, 0.09
 LETTER = 0.54
 LINES = {"solid": "-", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 # Reproducible output: element ids derive from the salt, and no date is written.
-SETTINGS: Any = {"svg.fonttype": "none", "svg.hashsalt": "avis_ctrl", "font.size": 8.0,
-                 "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
-                 "axes.unicode_minus": True, "axes.formatter.useoffset": False, "path.simplify": True}
+SETTINGS: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "avis_ctrl",
+    "font.size": 8.0,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.unicode_minus": True,
+    "axes.formatter.useoffset": False,
+    "path.simplify": True,
+}
 
 
 def svg(figure: Figure) -> str:
@@ -48,8 +56,15 @@ def svg(figure: Figure) -> str:
             bar = canvas.add_axes((0.25, (BAR_IN - BAR_HEIGHT_IN) / height, 0.5, BAR_HEIGHT_IN / height))
             _colour_bar(canvas, bar, heat)
         elif legend:
-            canvas.legend([_key(e) for e in entries], [e.label for e in entries], loc="lower center", borderaxespad=0.1,
-                          ncols=keys, frameon=False, handlelength=2.6)
+            canvas.legend(
+                [_key(e) for e in entries],
+                [e.label for e in entries],
+                loc="lower center",
+                borderaxespad=0.1,
+                ncols=keys,
+                frameon=False,
+                handlelength=2.6,
+            )
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
@@ -100,8 +115,15 @@ def _key(entry: Curve | Band) -> Any:
     if isinstance(entry, Band):
         return Patch(facecolor=entry.style.colour, alpha=0.25)
     if not entry.line:
-        return Line2D([], [], color=entry.style.colour, marker="o", markersize=3.5, linestyle="none",
-                      markerfacecolor="none" if entry.hollow else entry.style.colour)
+        return Line2D(
+            [],
+            [],
+            color=entry.style.colour,
+            marker="o",
+            markersize=3.5,
+            linestyle="none",
+            markerfacecolor="none" if entry.hollow else entry.style.colour,
+        )
     return Line2D([], [], marker="o" if entry.points else None, markersize=3, **_line(entry.style))
 
 
@@ -109,8 +131,14 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
     small = figure.shared
     if panel.heat is not None:
         rows = np.arange(len(panel.heat.z) + 1) - 0.5
-        ax.pcolormesh(panel.heat.x_edges, rows, np.ma.masked_invalid(panel.heat.logarithm), edgecolors="white",
-                      linewidth=0.3, **_colours(panel.heat))
+        ax.pcolormesh(
+            panel.heat.x_edges,
+            rows,
+            np.ma.masked_invalid(panel.heat.logarithm),
+            edgecolors="white",
+            linewidth=0.3,
+            **_colours(panel.heat),
+        )
     for band in panel.bands:
         ax.fill_between(band.x, band.low, band.high, color=band.style.colour, alpha=0.25, linewidth=0)
     for curve in panel.curves:
@@ -126,15 +154,23 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
         if curve.error is not None:
             error = {f"{curve.along}err": np.where(np.isfinite(curve.error), curve.error, np.nan)}
             ax.errorbar(curve.x, curve.y, **error, fmt="none", ecolor=curve.style.colour, elinewidth=0.9, capsize=1.8)
-        ax.plot(curve.x, np.where(np.isfinite(curve.y), curve.y, np.nan), marker="o" if curve.points else None,
-                **{"markersize": 3, **look})
+        ax.plot(
+            curve.x,
+            np.where(np.isfinite(curve.y), curve.y, np.nan),
+            marker="o" if curve.points else None,
+            **{"markersize": 3, **look},
+        )
     _scale(ax, "x", panel.x, panel.x.range)
     _scale(ax, "y", panel.y, log_range(panel) if panel.y.scale == "log" else panel.y.range)
     if panel.heat is None:
         ax.grid(True, linewidth=0.4, color="#dddddd")
     if panel.title:
-        ax.set_title(panel.title, fontsize=_fitting(panel.title, width, 6.5 if small else 8.5), loc="left",
-                     pad=2.5 if small else None)
+        ax.set_title(
+            panel.title,
+            fontsize=_fitting(panel.title, width, 6.5 if small else 8.5),
+            loc="left",
+            pad=2.5 if small else None,
+        )
     ax.yaxis.label.set_fontsize(_fitting(panel.y.label, PLOT_IN * figure.height + 0.2, 6.5 if small else 8.0))
     if small:
         ax.tick_params(labelsize=5.5)

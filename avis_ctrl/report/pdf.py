@@ -43,19 +43,32 @@ def render(document: Document) -> bytes:
     """
     figures = [one for one in document.figures() if isinstance(one, Figure)]
     drawn = dict(zip(map(id, figures), each(matplotlib_backend.svg, figures), strict=True))
-    content = {"title": document.title, "subtitle": document.subtitle, "stamp": document.stamp, "sections": [
-        {"title": s.title, "anchor": s.anchor, "alone": s.alone, "pieces": [_piece(p, drawn) for p in s.pieces]}
-        for s in document.sections]}
+    content = {
+        "title": document.title,
+        "subtitle": document.subtitle,
+        "stamp": document.stamp,
+        "sections": [
+            {"title": s.title, "anchor": s.anchor, "alone": s.alone, "pieces": [_piece(p, drawn) for p in s.pieces]}
+            for s in document.sections
+        ],
+    }
     template = (resources.files("avis_ctrl.report") / "report.typ").read_bytes()
     # Sans-serif text of the drawings uses the font bundled with matplotlib, the same on every machine.
     folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
     fonts = typst.Fonts(include_system_fonts=False, include_embedded_fonts=True, font_paths=[str(folder)])
     try:
-        made = typst.compile(template, format="pdf", font_paths=fonts, ignore_system_fonts=True, timestamp=0,
-                             sys_inputs={"document": json.dumps(content, allow_nan=False)})
+        made = typst.compile(
+            template,
+            format="pdf",
+            font_paths=fonts,
+            ignore_system_fonts=True,
+            timestamp=0,
+            sys_inputs={"document": json.dumps(content, allow_nan=False)},
+        )
     except typst.TypstError as error:
-        raise ComputationError("the PDF report was not typeset", cause=str(error),
-                               next_step="the HTML report has the same content") from error
+        raise ComputationError(
+            "the PDF report was not typeset", cause=str(error), next_step="the HTML report has the same content"
+        ) from error
     assert isinstance(made, bytes)  # one PDF for any number of pages
     return made
 
@@ -72,9 +85,13 @@ def _piece(piece: Piece, drawn: Mapping[int, str]) -> dict[str, Any]:
         case Formula(source, _):
             return {"kind": "formula", "typst": source}
         case Table():
-            return {"kind": "table", "caption": typeset(piece.caption), "header": [typeset(h) for h in piece.header],
-                    "align": [piece.alignment(k) for k in range(len(piece.header))],
-                    "rows": [[_cell(c) for c in row] for row in piece.rows]}
+            return {
+                "kind": "table",
+                "caption": typeset(piece.caption),
+                "header": [typeset(h) for h in piece.header],
+                "align": [piece.alignment(k) for k in range(len(piece.header))],
+                "rows": [[_cell(c) for c in row] for row in piece.rows],
+            }
         case Drawing(_, caption, image, alternative):
             return _image(DRAWING_WIDTH, caption, image, alternative)
         case Figure():

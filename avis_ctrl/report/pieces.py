@@ -132,8 +132,12 @@ class Document:
 def document_of(title: str, subtitle: str, provenance: Mapping[str, Any], sections: Iterable[Section]) -> Document:
     """A report with the date under its title, and version and hash of the inputs in its page header."""
     date = str(provenance.get("date", ""))[:10]
-    return Document(title, subtitle + (f", {date}" if date else ""), f"avis_ctrl {provenance.get('avis_ctrl', '')}, "
-                    f"inputs {str(provenance.get('inputs_sha256', ''))[:12]}", tuple(sections))
+    return Document(
+        title,
+        subtitle + (f", {date}" if date else ""),
+        f"avis_ctrl {provenance.get('avis_ctrl', '')}, inputs {str(provenance.get('inputs_sha256', ''))[:12]}",
+        tuple(sections),
+    )
 
 
 def yes_or_no(good: bool) -> Mark:

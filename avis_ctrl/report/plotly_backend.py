@@ -38,7 +38,9 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
     rows = -(-len(figure.panels) // columns)
     layout: dict[str, Any] = {
         "height": round(PANEL_PX * figure.height * rows) + 90 + LEGEND_ROW_PX * (len(figure.legend()) // 3),
-        "annotations": [], "showlegend": len(figure.legend()) > 1}
+        "annotations": [],
+        "showlegend": len(figure.legend()) > 1,
+    }
     if (heat := figure.heat()) is not None:
         layout["coloraxis"] = _colour_bar(heat)
     # Room for title and tick labels: the same number of pixels whatever the height of the panels.
@@ -78,9 +80,17 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 def _curve(curve: Curve) -> dict[str, Any]:
     mode = "+".join(["lines"] * curve.line + ["markers"] * curve.points)
-    return {"type": "scatter", "mode": mode, "x": _numbers(curve.x), "y": _numbers(curve.y), "name": _text(curve.label),
-            "legendgroup": curve.label, "key": True, "marker": {"size": 6, "color": curve.style.colour},
-            "line": {"color": curve.style.colour, "dash": curve.style.dash, "width": curve.style.width}} | _more(curve)
+    return {
+        "type": "scatter",
+        "mode": mode,
+        "x": _numbers(curve.x),
+        "y": _numbers(curve.y),
+        "name": _text(curve.label),
+        "legendgroup": curve.label,
+        "key": True,
+        "marker": {"size": 6, "color": curve.style.colour},
+        "line": {"color": curve.style.colour, "dash": curve.style.dash, "width": curve.style.width},
+    } | _more(curve)
 
 
 def _more(curve: Curve) -> dict[str, Any]:
@@ -89,62 +99,114 @@ def _more(curve: Curve) -> dict[str, Any]:
     if curve.hollow:
         more["marker"] = {"size": 8, "color": curve.style.colour, "symbol": "circle-open", "line": {"width": 1.6}}
     if curve.error is not None:
-        more[f"error_{curve.along}"] = {"type": "data", "array": _numbers(curve.error), "color": curve.style.colour,
-                                        "thickness": 1.3, "width": 3}
+        more[f"error_{curve.along}"] = {
+            "type": "data",
+            "array": _numbers(curve.error),
+            "color": curve.style.colour,
+            "thickness": 1.3,
+            "width": 3,
+        }
     if curve.bars:
         more |= {"type": "bar", "width": curve.bars, "marker": {"color": curve.style.colour}}
     return more
 
 
 def _band(band: Band) -> list[dict[str, Any]]:
-    edge = {"type": "scatter", "mode": "lines", "x": _numbers(band.x), "line": {"width": 0, "color": band.style.colour},
-            "hoverinfo": "skip", "legendgroup": band.label, "name": _text(band.label)}
-    red, green, blue = (int(band.style.colour[k:k + 2], 16) for k in (1, 3, 5))
-    return [{**edge, "y": _numbers(band.low), "key": False},
-            {**edge, "y": _numbers(band.high), "fill": "tonexty", "key": True,
-             "fillcolor": f"rgba({red},{green},{blue},0.25)"}]
+    edge = {
+        "type": "scatter",
+        "mode": "lines",
+        "x": _numbers(band.x),
+        "line": {"width": 0, "color": band.style.colour},
+        "hoverinfo": "skip",
+        "legendgroup": band.label,
+        "name": _text(band.label),
+    }
+    red, green, blue = (int(band.style.colour[k : k + 2], 16) for k in (1, 3, 5))
+    return [
+        {**edge, "y": _numbers(band.low), "key": False},
+        {
+            **edge,
+            "y": _numbers(band.high),
+            "fill": "tonexty",
+            "key": True,
+            "fillcolor": f"rgba({red},{green},{blue},0.25)",
+        },
+    ]
 
 
 def _heat(panel: Panel) -> dict[str, Any]:
     heat = panel.heat
     assert heat is not None
     names = dict(panel.y.ticks)
-    cells = [[f"{_text(names.get(float(row), str(row)))}, {low:.3g} to {high:.3g} Hz: {value:.3g}"
-              for low, high, value in zip(heat.x_edges[:-1], heat.x_edges[1:], values, strict=True)]
-             for row, values in enumerate(heat.z)]
-    return {"type": "heatmap", "x": _numbers(heat.x_edges), "y": [k - 0.5 for k in range(len(heat.z) + 1)],
-            "z": [_numbers(row) for row in heat.logarithm], "coloraxis": "coloraxis", "text": cells,
-            "hovertemplate": "%{text}<extra></extra>", "xgap": 1, "ygap": 1, "hoverongaps": False}
+    cells = [
+        [
+            f"{_text(names.get(float(row), str(row)))}, {low:.3g} to {high:.3g} Hz: {value:.3g}"
+            for low, high, value in zip(heat.x_edges[:-1], heat.x_edges[1:], values, strict=True)
+        ]
+        for row, values in enumerate(heat.z)
+    ]
+    return {
+        "type": "heatmap",
+        "x": _numbers(heat.x_edges),
+        "y": [k - 0.5 for k in range(len(heat.z) + 1)],
+        "z": [_numbers(row) for row in heat.logarithm],
+        "coloraxis": "coloraxis",
+        "text": cells,
+        "hovertemplate": "%{text}<extra></extra>",
+        "xgap": 1,
+        "ygap": 1,
+        "hoverongaps": False,
+    }
 
 
 def _colour_bar(heat: Heat) -> dict[str, Any]:
     places, text = heat.decades
     low, high = (float(np.log10(v)) for v in heat.range)
-    bar = {"title": {"text": _text(heat.label), "side": "right"}, "thickness": 14, "tickvals": places, "ticktext": text,
-           "outlinewidth": 0.5}
+    bar = {
+        "title": {"text": _text(heat.label), "side": "right"},
+        "thickness": 14,
+        "tickvals": places,
+        "ticktext": text,
+        "outlinewidth": 0.5,
+    }
     return {"cmin": low, "cmax": high, "colorscale": [list(stop) for stop in heat.colours], "colorbar": bar}
 
 
 def _axis(axis: Axis, limits: tuple[float, float] | None) -> dict[str, Any]:
-    found: dict[str, Any] = {"title": {"text": _text(axis.label), "standoff": 6}, "type": axis.scale,
-                             "automargin": True}
+    found: dict[str, Any] = {
+        "title": {"text": _text(axis.label), "standoff": 6},
+        "type": axis.scale,
+        "automargin": True,
+    }
     if limits is not None:
         found["range"] = [float(np.log10(v)) for v in limits] if axis.scale == "log" else list(limits)
     if axis.scale == "log" and limits is not None:
         values, text = ticks_log(*limits)
         found |= {"tickvals": values, "ticktext": text, "tickmode": "array"}
     if axis.ticks:
-        found |= {"tickvals": [place for place, _ in axis.ticks], "tickmode": "array",
-                  # Line breaks inside a name are kept; leading ones, which stagger the names, are not needed here.
-                  "ticktext": [_text(word.strip("\n")).replace("\n", "<br>") for _, word in axis.ticks]}
+        found |= {
+            "tickvals": [place for place, _ in axis.ticks],
+            "tickmode": "array",
+            # Line breaks inside a name are kept; leading ones, which stagger the names, are not needed here.
+            "ticktext": [_text(word.strip("\n")).replace("\n", "<br>") for _, word in axis.ticks],
+        }
     if axis.silent:
         found |= {"showticklabels": False, "title": {"text": ""}}
     return found
 
 
 def _title(panel: Panel, top: float, left: float, small: bool) -> dict[str, Any]:
-    return {"text": _text(panel.title), "xref": "paper", "yref": "paper", "x": left, "y": top, "xanchor": "left",
-            "yanchor": "bottom", "showarrow": False, "font": {"size": 11 if small else 13}}
+    return {
+        "text": _text(panel.title),
+        "xref": "paper",
+        "yref": "paper",
+        "x": left,
+        "y": top,
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 11 if small else 13},
+    }
 
 
 def _text(text: str) -> str:

@@ -15,16 +15,27 @@ def records(campaign: Campaign, use: Mapping[str, str], divided: str) -> Table:
     for record in campaign.records:
         h = record.header
         quiet = h.excitation in ("rest", "floor")
-        rows.append((h.name, h.excitation, "silent" if quiet else f"{words.number(h.level_V)} {h.u_unit}",
-                     f"{words.number(h.start_s)} s", f"{words.number(h.duration_s)} s",
-                     f"{h.periods} of {words.number(h.period_s)} s" if h.period_s else "none",
-                     words.yes(bool(h.floor_names)), use.get(h.name, "not used")))
-    return table(f"The records{f' ({campaign.source})' if campaign.source else ''}, sampled at "
-                 f"{words.number(campaign.sample_rate_Hz)} Hz; {len(campaign.u_names)} drives, "
-                 f"{len(campaign.y_names)} sensors. Levels are r.m.s. values of the drive voltages; in records at rest "
-                 f"or with a shaken floor the drives are silent.{f' {words.sentence(divided)}' if divided else ''}",
-                 ("record", "excitation", "level", "starts at", "duration", "periods", "floor measured", "used as"),
-                 rows, "llrrrrcl")
+        rows.append(
+            (
+                h.name,
+                h.excitation,
+                "silent" if quiet else f"{words.number(h.level_V)} {h.u_unit}",
+                f"{words.number(h.start_s)} s",
+                f"{words.number(h.duration_s)} s",
+                f"{h.periods} of {words.number(h.period_s)} s" if h.period_s else "none",
+                words.yes(bool(h.floor_names)),
+                use.get(h.name, "not used"),
+            )
+        )
+    return table(
+        f"The records{f' ({campaign.source})' if campaign.source else ''}, sampled at "
+        f"{words.number(campaign.sample_rate_Hz)} Hz; {len(campaign.u_names)} drives, "
+        f"{len(campaign.y_names)} sensors. Levels are r.m.s. values of the drive voltages; in records at rest "
+        f"or with a shaken floor the drives are silent.{f' {words.sentence(divided)}' if divided else ''}",
+        ("record", "excitation", "level", "starts at", "duration", "periods", "floor measured", "used as"),
+        rows,
+        "llrrrrcl",
+    )
 
 
 def remarks(campaign: Campaign) -> list[Piece]:

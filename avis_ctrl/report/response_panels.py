@@ -52,11 +52,14 @@ def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) ->
     keep, lines = thin(len(f), MOST_POINTS), [(label, np.abs(G[:, i, j]), style) for label, G, style in models]
     low = 0.5 * float(min(np.quantile(size, 0.02), *(line.min() for _, line, _ in lines)))
     high = 2.0 * float(max(size.max(), *(line.max() for _, line, _ in lines)))
-    curves = (Curve(f[keep], size[keep], "measured", MEASURED, points=True, line=False),
-              *(Curve(f, line, label, style) for label, line, style in lines))
+    curves = (
+        Curve(f[keep], size[keep], "measured", MEASURED, points=True, line=False),
+        *(Curve(f, line, label, style) for label, line, style in lines),
+    )
     band = Band(f, np.maximum(size - two, low), np.maximum(size + two, low), "measured, ± 2 σ", SCATTER)
-    return Panel(frequencies(seen), Axis(f"magnitude [{unit(seen, j)}]", "log", (low, high)), curves, (band,),
-                 title(seen, i, j))
+    return Panel(
+        frequencies(seen), Axis(f"magnitude [{unit(seen, j)}]", "log", (low, high)), curves, (band,), title(seen, i, j)
+    )
 
 
 def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
@@ -64,6 +67,8 @@ def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -
     f, two = seen.frequency_Hz, 2 * seen.measured_std[:, i, j]
     lines = [(label, np.abs(seen.measured[:, i, j] - G[:, i, j]), style) for label, G, style in models]
     limits = log_limits(np.concatenate([two, *(line for _, line, _ in lines)]), 0.5, 2, (1e-3, 1.0), 0.01)
-    curves = (*(Curve(f, line, f"measured less {label}", style) for label, line, style in lines),
-              Curve(f, two, "two standard deviations of the measured", TWO_SIGMA))
+    curves = (
+        *(Curve(f, line, f"measured less {label}", style) for label, line, style in lines),
+        Curve(f, two, "two standard deviations of the measured", TWO_SIGMA),
+    )
     return Panel(frequencies(seen), Axis(f"difference [{unit(seen, j)}]", "log", limits), curves, (), title(seen, i, j))

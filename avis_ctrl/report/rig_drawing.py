@@ -41,8 +41,9 @@ def _top(canvas: Canvas, rig: Rig, reach: np.ndarray, at: View) -> None:
     canvas.text((16, 22), "from above", 13, anchor="start", bold=True)
     _axes(canvas, (30, 120), ("x", "y"))
     (left, low), (right, high) = at(-reach), at(reach)
-    canvas.rectangle(((left + right) / 2, (low + high) / 2), right - left + 44, low - high + 44, "#f3f3f4", "#888888",
-                     corner=6)
+    canvas.rectangle(
+        ((left + right) / 2, (low + high) / 2), right - left + 44, low - high + 44, "#f3f3f4", "#888888", corner=6
+    )
     for place in rig.points().values():
         if place.kind == "isolator":
             canvas.rectangle(at(place.position), 24, 24, "#ffffff", ISOLATOR, 1.6)
@@ -79,8 +80,11 @@ def _mark(canvas: Canvas, place: Point, name: str, kind: str) -> None:
     canvas.line([(x - 6, y), (x + 6, y)], colour, 1.6)
     canvas.line([(x, y - 6), (x, y + 6)], colour, 1.6)
     # Marks may coincide, so each kind has its name on a different side.
-    sides: dict[str, tuple[float, float, Anchor]] = {"centre of mass": (9, 4, "start"), "load": (0, -10, "middle"),
-                                                     "measured point": (0, 18, "middle")}
+    sides: dict[str, tuple[float, float, Anchor]] = {
+        "centre of mass": (9, 4, "start"),
+        "load": (0, -10, "middle"),
+        "measured point": (0, 18, "middle"),
+    }
     dx, dy, anchor = sides[kind]
     canvas.text((x + dx, y + dy), name, 11, colour, anchor)
 
@@ -106,14 +110,18 @@ def _labels(canvas: Canvas, rig: Rig, at: View) -> None:
 def _side(canvas: Canvas, rig: Rig, reach: np.ndarray, at: View) -> None:
     canvas.text((16, TOP_HEIGHT + 22), "from the side, along −x", 13, anchor="start", bold=True)
     _axes(canvas, (30, TOP_HEIGHT + 110), ("y", "z"))
-    isolators = {(round(p.position[1], 6), round(p.position[2], 6)): p.position for p in rig.points().values()
-                 if p.kind == "isolator"}
+    isolators = {
+        (round(p.position[1], 6), round(p.position[2], 6)): p.position
+        for p in rig.points().values()
+        if p.kind == "isolator"
+    }
     foot = min(at(p)[1] for p in isolators.values())
     lower, upper = max(at(p)[1] for p in isolators.values()), at(np.array([0.0, 0.0, 0.05]))[1]
     left, right = at(-reach)[0] - 22, at(reach)[0] + 22
     upper = min(upper, at(reach)[1]) - 24
-    canvas.rectangle(((left + right) / 2, (upper + lower) / 2), right - left, max(lower - upper, 24), "#f3f3f4",
-                     "#888888", corner=6)
+    canvas.rectangle(
+        ((left + right) / 2, (upper + lower) / 2), right - left, max(lower - upper, 24), "#f3f3f4", "#888888", corner=6
+    )
     floor = max(foot, lower) + 62
     canvas.line([(left - 30, floor), (right + 30, floor)], "#333333", 2.0)
     canvas.text((right + 36, floor + 4), "floor", 11.5, anchor="start")

@@ -8,5 +8,16 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES, EquationsOfMotion
 from avis_ctrl.rigs.subsystem import reduce_rig, reduction_error
 
-__all__ = ["COORDINATES", "AvisTable", "EquationsOfMotion", "Halcyonics", "Parameter", "Rig", "actuator_axes",
-           "load_rig", "reduce_rig", "reduction_error", "sensor_axes"]
+__all__ = [
+    "COORDINATES",
+    "AvisTable",
+    "EquationsOfMotion",
+    "Halcyonics",
+    "Parameter",
+    "Rig",
+    "actuator_axes",
+    "load_rig",
+    "reduce_rig",
+    "reduction_error",
+    "sensor_axes",
+]

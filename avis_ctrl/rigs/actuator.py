@@ -19,8 +19,7 @@ def pade_coefficients(order: int) -> np.ndarray:
     """
     if not (isinstance(order, int) and 1 <= order <= 10):
         raise InputError("a whole number from 1 to 10", field="pade_order", value=order)
-    return np.array([comb(order, k) * factorial(2 * order - k) / factorial(2 * order)
-                     for k in range(order, -1, -1)])
+    return np.array([comb(order, k) * factorial(2 * order - k) / factorial(2 * order) for k in range(order, -1, -1)])
 
 
 def pade_delay(delay_s: float, order: int = 2, input_name: str = "u", output_name: str = "y") -> StateSpace:
@@ -45,8 +44,7 @@ def pade_delay(delay_s: float, order: int = 2, input_name: str = "u", output_nam
     return StateSpace(unit.A / delay_s, unit.B * root, unit.C * root, unit.D, 0.0, (input_name,), (output_name,))
 
 
-def zero_order_hold(sample_time_s: float, order: int = 2, input_name: str = "u",
-                    output_name: str = "y") -> StateSpace:
+def zero_order_hold(sample_time_s: float, order: int = 2, input_name: str = "u", output_name: str = "y") -> StateSpace:
     """Continuous model (1 - exp(-s T))/(s T) of a zero-order hold, with the Pade approximant of the exponential.
 
     The factor s of the numerator is cancelled analytically, so that the gain at zero frequency is exactly 1.

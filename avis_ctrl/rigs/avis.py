@@ -112,8 +112,10 @@ class AvisTable(Rig):
     @cached_property
     def all_drives(self) -> tuple[Drive, ...]:
         """Motors of the isolators, then the drives at other positions."""
-        motors = (Drive(motor.name, self._at(motor.isolator), _unit(motor.axis), motor.constant_N_per_V)
-                  for motor in self.motors)
+        motors = (
+            Drive(motor.name, self._at(motor.isolator), _unit(motor.axis), motor.constant_N_per_V)
+            for motor in self.motors
+        )
         return (*motors, *self.drives)
 
     def drive_limits_V(self) -> np.ndarray:
@@ -154,7 +156,8 @@ class AvisTable(Rig):
             for kind, values in (("k", isolator.stiffness), ("c", isolator.damping), ("p", isolator.position)):
                 for axis, value in zip(AXES, values, strict=True):
                     found[f"isolator{number}.{kind}_{axis}"] = Parameter(
-                        value, _UNITS[kind], f"{_WORDS[kind]} of isolator {number} along {axis}")
+                        value, _UNITS[kind], f"{_WORDS[kind]} of isolator {number} along {axis}"
+                    )
         for drive in self.all_drives:
             found[f"actuator.{drive.name}"] = Parameter(drive.constant_N_per_V, "N/V", "force constant")
         for one in (*self.drives, *self.instruments):
@@ -162,7 +165,8 @@ class AvisTable(Rig):
                 found[f"place.{one.name}.{axis}"] = Parameter(place, "m", f"position of {one.name} along {axis}")
             for k in _across(one.direction):
                 found[f"direction.{one.name}.{AXES[k]}"] = Parameter(
-                    one.direction[k], "", f"component of the unit direction of {one.name} along {AXES[k]}")
+                    one.direction[k], "", f"component of the unit direction of {one.name} along {AXES[k]}"
+                )
         return found
 
     def slopes(self, name: str) -> list[tuple[str, str, np.ndarray]] | None:
@@ -208,8 +212,11 @@ class AvisTable(Rig):
         for which, values in (("K", np.diag(one.stiffness)), ("C", np.diag(one.damping))):
             half = arm.T @ values @ G
             found += [(which, "", half + half.T), (f"{which}_floor", "", arm.T @ values @ G_c + G.T @ values @ arm)]
-        found += [("T", motor.name, arm[AXES.index(motor.axis)] * motor.constant_N_per_V) for motor in self.motors
-                  if motor.isolator == number]
+        found += [
+            ("T", motor.name, arm[AXES.index(motor.axis)] * motor.constant_N_per_V)
+            for motor in self.motors
+            if motor.isolator == number
+        ]
         g = self.geophones
         at = zip(g.names, g.isolator, g.axis, strict=True) if g else ()
         return found + [("R", sensor, arm[AXES.index(axis)]) for sensor, own, axis in at if own == number]
@@ -241,27 +248,40 @@ class AvisTable(Rig):
 
     def with_channels_apart(self) -> AvisTable:
         """The same table with motors and geophones at positions that do not move with the isolators."""
-        return replace(self, motors=(), drives=self.all_drives, geophones=None,
-                       instruments=(*self._attached(), *self.instruments))
+        return replace(
+            self, motors=(), drives=self.all_drives, geophones=None, instruments=(*self._attached(), *self.instruments)
+        )
 
     def _with_values(self, values: dict[str, float]) -> AvisTable:
         get = values.get
-        tables = {"k": [list(i.stiffness) for i in self.isolators], "c": [list(i.damping) for i in self.isolators],
-                  "p": [list(i.position) for i in self.isolators]}
+        tables = {
+            "k": [list(i.stiffness) for i in self.isolators],
+            "c": [list(i.damping) for i in self.isolators],
+            "p": [list(i.position) for i in self.isolators],
+        }
         for name, value in values.items():
             if match := _ISOLATOR_PARAMETER.fullmatch(name):
                 number, kind, axis = match.groups()
                 tables[kind][int(number) - 1][AXES.index(axis)] = value
-        isolators = tuple(replace(old, stiffness=tuple(k), damping=tuple(c), position=tuple(p))
-                          for old, k, c, p in zip(self.isolators, tables["k"], tables["c"], tables["p"], strict=True))
-        motors = tuple(replace(m, constant_N_per_V=get(f"actuator.{m.name}", m.constant_N_per_V))
-                       for m in self.motors)
+        isolators = tuple(
+            replace(old, stiffness=tuple(k), damping=tuple(c), position=tuple(p))
+            for old, k, c, p in zip(self.isolators, tables["k"], tables["c"], tables["p"], strict=True)
+        )
+        motors = tuple(replace(m, constant_N_per_V=get(f"actuator.{m.name}", m.constant_N_per_V)) for m in self.motors)
         drives = tuple(replace(d, constant_N_per_V=get(f"actuator.{d.name}", d.constant_N_per_V)) for d in self.drives)
         drives, instruments = (tuple(_moved(one, values) for one in some) for some in (drives, self.instruments))
         inertia = tuple(get(name, old) for name, old in zip(INERTIA, self.inertia, strict=True))
         com = tuple(get(f"com_{axis}", old) for axis, old in zip(AXES, self.centre_of_mass, strict=True))
-        return replace(self, mass=get("mass", self.mass), inertia=inertia, centre_of_mass=com,
-                       isolators=isolators, motors=motors, drives=drives, instruments=instruments)
+        return replace(
+            self,
+            mass=get("mass", self.mass),
+            inertia=inertia,
+            centre_of_mass=com,
+            isolators=isolators,
+            motors=motors,
+            drives=drives,
+            instruments=instruments,
+        )
 
     def mounted_body(self) -> MountedBody:
         return self._body
@@ -270,11 +290,19 @@ class AvisTable(Rig):
     @cached_property
     def _body(self) -> MountedBody:
         mounts = tuple(
-            Mount(f"isolator{number}", np.array(one.position), np.add(one.position, one.chassis_offset),
-                  np.diag(one.stiffness), np.diag(one.damping))
-            for number, one in enumerate(self.isolators, 1))
-        actuators = tuple(PointActuator(one.name, np.array(one.position), np.array(one.direction), one.constant_N_per_V)
-                          for one in self.all_drives)
+            Mount(
+                f"isolator{number}",
+                np.array(one.position),
+                np.add(one.position, one.chassis_offset),
+                np.diag(one.stiffness),
+                np.diag(one.damping),
+            )
+            for number, one in enumerate(self.isolators, 1)
+        )
+        actuators = tuple(
+            PointActuator(one.name, np.array(one.position), np.array(one.direction), one.constant_N_per_V)
+            for one in self.all_drives
+        )
         return MountedBody(self.mass, self.inertia_matrix(), np.array(self.centre_of_mass), mounts, actuators)
 
     def equations_of_motion(self) -> EquationsOfMotion:
@@ -297,26 +325,47 @@ class AvisTable(Rig):
 
     @cached_property
     def _sensors(self) -> tuple[Sensor, ...]:
-        return tuple(one.sensor(self.acquisition, self.ambient).with_electronics(
-            self.electronics, one.preamplifier_gain, self.converter, self.sample_rate_Hz)
-                     for one in (*self._attached(), *self.instruments))
+        return tuple(
+            one.sensor(self.acquisition, self.ambient).with_electronics(
+                self.electronics, one.preamplifier_gain, self.converter, self.sample_rate_Hz
+            )
+            for one in (*self._attached(), *self.instruments)
+        )
 
     def _attached(self) -> tuple[GeophoneAt, ...]:
         if (g := self.geophones) is None:
             return ()
         channels = zip(g.names, g.isolator, g.axis, g.sensitivity_Vs_per_m, strict=True)
-        return tuple(GeophoneAt(name, self._at(isolator), _unit(axis), sensitivity, g.suspension_Hz,
-                                g.suspension_damping, g.compensated_Hz, g.compensated_damping, g.preamplifier_gain)
-                     for name, isolator, axis, sensitivity in channels)
+        return tuple(
+            GeophoneAt(
+                name,
+                self._at(isolator),
+                _unit(axis),
+                sensitivity,
+                g.suspension_Hz,
+                g.suspension_damping,
+                g.compensated_Hz,
+                g.compensated_damping,
+                g.preamplifier_gain,
+            )
+            for name, isolator, axis, sensitivity in channels
+        )
 
     def with_sensor_gains(self, gains: Mapping[str, float]) -> AvisTable:
         g = self.geophones
         if g is not None:
-            volts = (gains[name] / g.preamplifier_gain if name in gains else old
-                     for name, old in zip(g.names, g.sensitivity_Vs_per_m, strict=True))
+            volts = (
+                gains[name] / g.preamplifier_gain if name in gains else old
+                for name, old in zip(g.names, g.sensitivity_Vs_per_m, strict=True)
+            )
             g = replace(g, sensitivity_Vs_per_m=tuple(volts))
-        return replace(self, geophones=g, instruments=tuple(
-            with_gain(one, gains[one.name]) if one.name in gains else one for one in self.instruments))
+        return replace(
+            self,
+            geophones=g,
+            instruments=tuple(
+                with_gain(one, gains[one.name]) if one.name in gains else one for one in self.instruments
+            ),
+        )
 
     def _at(self, isolator: int) -> Triple:
         if not 1 <= isolator <= len(self.isolators):

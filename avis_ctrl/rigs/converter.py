@@ -53,7 +53,7 @@ class Converter:
     @property
     def lsb_V(self) -> float:
         """Voltage of one code step, the least significant bit."""
-        return 2.0 * self.range_V / 2 ** self.bits
+        return 2.0 * self.range_V / 2**self.bits
 
     @property
     def limits_V(self) -> tuple[float, float]:

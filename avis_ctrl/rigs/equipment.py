@@ -88,8 +88,9 @@ class Electronics:
         sensor = 10e-6 * preamplifier_gain + 100e-6 if self.sensor_offset_V is None else self.sensor_offset_V
         return sensor + (2 * code_V if self.converter_offset_V is None else self.converter_offset_V)
 
-    def flicker_rms_V(self, preamplifier_gain: float, noise_rms_V: float, rounding_rms_V: float, sample_rate_Hz: float
-                      ) -> float:
+    def flicker_rms_V(
+        self, preamplifier_gain: float, noise_rms_V: float, rounding_rms_V: float, sample_rate_Hz: float
+    ) -> float:
         """R.m.s. per sample of a white noise whose density is that of the channel's 1/f noise at 1 Hz.
 
         noise_rms_V, rounding_rms_V : r.m.s. per sample of the sensor's white noise and of the converter's rounding.
@@ -106,6 +107,6 @@ class Electronics:
         angles = np.pi * (2 * np.arange(n) + n + 1) / (2 * max(n, 1))
         poles = 2 * np.pi * (self.anti_alias_corner_Hz or 0.0) * np.exp(1j * angles)
         # Exact conjugate pairs, and a real pole without round-off in its imaginary part.
-        upper = [complex(pole) for pole in poles[:n // 2]]
+        upper = [complex(pole) for pole in poles[: n // 2]]
         real = [complex(-abs(poles[n // 2]))] if n % 2 else []
         return (*upper, *real, *(pole.conjugate() for pole in upper))

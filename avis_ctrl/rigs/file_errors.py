@@ -15,20 +15,57 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from avis_ctrl.errors import InputError
 
 Content = TypeVar("Content", bound=BaseModel)
-_UNITS = {"kg", "g", "t", "lb", "m", "mm", "cm", "um", "in", "N", "kN", "mN", "Nm", "Ns", "Nms", "kNs", "per", "rad",
-          "deg", "V", "mV", "kV", "Hz", "kHz", "rtHz", "s", "ms", "us", "s2", "Vs", "Vs2", "kgm2", "gmm2", "kgmm2",
-          "gcm2"}
+_UNITS = {
+    "kg",
+    "g",
+    "t",
+    "lb",
+    "m",
+    "mm",
+    "cm",
+    "um",
+    "in",
+    "N",
+    "kN",
+    "mN",
+    "Nm",
+    "Ns",
+    "Nms",
+    "kNs",
+    "per",
+    "rad",
+    "deg",
+    "V",
+    "mV",
+    "kV",
+    "Hz",
+    "kHz",
+    "rtHz",
+    "s",
+    "ms",
+    "us",
+    "s2",
+    "Vs",
+    "Vs2",
+    "kgm2",
+    "gmm2",
+    "kgmm2",
+    "gcm2",
+}
 
 # Wording of pydantic, such as "Input should be greater than or equal to 1", replaced by that of these messages.
-_PLAIN = (("^Input should be ", "expected "), ("expected a valid number", "expected a number"),
-          ("expected a valid integer", "expected a whole number"),
-          ("expected a valid string", "expected text in quotes"),
-          ("expected a valid list", "expected a list in square brackets"),
-          ("expected a valid boolean", "expected true or false"),
-          (r"expected greater than or equal to (\S+)", r"expected a number, \1 or more"),
-          (r"expected less than or equal to (\S+)", r"expected a number, \1 or less"),
-          ("expected (greater|less) than", r"expected a number \1 than"),
-          (r"^List should have (.* items?) after validation, not (\d+)", r"expected \1; the list has \2"))
+_PLAIN = (
+    ("^Input should be ", "expected "),
+    ("expected a valid number", "expected a number"),
+    ("expected a valid integer", "expected a whole number"),
+    ("expected a valid string", "expected text in quotes"),
+    ("expected a valid list", "expected a list in square brackets"),
+    ("expected a valid boolean", "expected true or false"),
+    (r"expected greater than or equal to (\S+)", r"expected a number, \1 or more"),
+    (r"expected less than or equal to (\S+)", r"expected a number, \1 or less"),
+    ("expected (greater|less) than", r"expected a number \1 than"),
+    (r"^List should have (.* items?) after validation, not (\d+)", r"expected \1; the list has \2"),
+)
 
 
 class Section(BaseModel):
@@ -75,8 +112,9 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
 
 def dotted(place: Sequence[int | str]) -> str:
     """("isolator", 1, "position_m") as isolator[2].position_m, counted from 1 as in the sources."""
-    words = (f"[{part + 1}]" if isinstance(part, int) else f".{part if part.isprintable() else repr(part)}"
-             for part in place)
+    words = (
+        f"[{part + 1}]" if isinstance(part, int) else f".{part if part.isprintable() else repr(part)}" for part in place
+    )
     return "".join(words).lstrip(".")
 
 

@@ -21,10 +21,13 @@ DERIVATIVES: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration":
 def check_spectrum(frequency_Hz: np.ndarray, asd: np.ndarray, field: str = "asd") -> None:
     """Raise InputError unless both are finite positive vectors (n,), n >= 2, and the frequencies increase."""
     if np.ndim(frequency_Hz) != 1 or np.shape(frequency_Hz) != np.shape(asd) or np.size(asd) < 2:
-        raise InputError(f"two vectors of one length, at least 2 points; got {np.shape(frequency_Hz)} and "
-                         f"{np.shape(asd)}", field=field)
-    if not (np.all(np.isfinite(frequency_Hz)) and np.all(np.asarray(frequency_Hz) > 0)
-            and np.all(np.diff(frequency_Hz) > 0)):
+        raise InputError(
+            f"two vectors of one length, at least 2 points; got {np.shape(frequency_Hz)} and {np.shape(asd)}",
+            field=field,
+        )
+    if not (
+        np.all(np.isfinite(frequency_Hz)) and np.all(np.asarray(frequency_Hz) > 0) and np.all(np.diff(frequency_Hz) > 0)
+    ):
         raise InputError("finite, positive, increasing frequencies", field="frequency_Hz")
     if not (np.all(np.isfinite(asd)) and np.all(np.asarray(asd) > 0)):
         raise InputError("finite, positive densities", field=field)
@@ -48,8 +51,12 @@ def band_rms(frequency_Hz: np.ndarray, asd: np.ndarray, low_Hz: float, high_Hz: 
     # Integral of c f^m over one piece; it is a logarithm if the exponent m + 1 vanishes.
     exponent = np.log(power[1:] / power[:-1]) / ratio + 1.0
     growth = exponent * ratio
-    pieces = power[:-1] * points[:-1] * ratio * np.where(np.abs(growth) < 1e-9, 1.0 + growth / 2,
-                                                         np.expm1(growth) / np.where(growth == 0, 1.0, growth))
+    pieces = (
+        power[:-1]
+        * points[:-1]
+        * ratio
+        * np.where(np.abs(growth) < 1e-9, 1.0 + growth / 2, np.expm1(growth) / np.where(growth == 0, 1.0, growth))
+    )
     return float(np.sqrt(np.sum(pieces)))
 
 
@@ -67,11 +74,12 @@ def third_octave_midbands(low_Hz: float, high_Hz: float) -> np.ndarray:
 def third_octave_edges(midband_Hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper edge of each third-octave band: midband times 10^(-+1/20)."""
     midband_Hz = np.asarray(midband_Hz, float)
-    return midband_Hz * 10 ** -0.05, midband_Hz * 10 ** 0.05
+    return midband_Hz * 10**-0.05, midband_Hz * 10**0.05
 
 
-def third_octave_rms(frequency_Hz: np.ndarray, asd: np.ndarray,
-                     midband_Hz: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def third_octave_rms(
+    frequency_Hz: np.ndarray, asd: np.ndarray, midband_Hz: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Midbands [Hz] and r.m.s. of the given third octaves, by default of all that lie entirely inside the data.
 
     Raises InputError if a given band is not inside the data, or if no band is.
@@ -82,7 +90,10 @@ def third_octave_rms(frequency_Hz: np.ndarray, asd: np.ndarray,
         lower, upper = third_octave_edges(every)
         midband_Hz = every[(lower >= frequency_Hz[0] * (1 - 1e-9)) & (upper <= frequency_Hz[-1] * (1 + 1e-9))]
         if not midband_Hz.size:
-            raise InputError("data that span at least one third-octave band", field="frequency_Hz",
-                             value=(float(frequency_Hz[0]), float(frequency_Hz[-1])))
+            raise InputError(
+                "data that span at least one third-octave band",
+                field="frequency_Hz",
+                value=(float(frequency_Hz[0]), float(frequency_Hz[-1])),
+            )
     edges = zip(*third_octave_edges(midband_Hz), strict=True)
     return np.asarray(midband_Hz, float), np.array([band_rms(frequency_Hz, asd, lo, hi) for lo, hi in edges])

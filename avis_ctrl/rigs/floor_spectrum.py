@@ -50,8 +50,11 @@ class SpectrumModel:
         if not (np.isfinite(self.low_Hz) and np.isfinite(self.high_Hz) and 0 < self.low_Hz < self.high_Hz):
             raise InputError("0 < low_Hz < high_Hz", field="band_Hz", value=(self.low_Hz, self.high_Hz))
         if self.shape.relative_degree < 2:
-            raise InputError("relative degree at least 2 (velocity must be strictly proper)", field="shape",
-                             value=self.shape.relative_degree)
+            raise InputError(
+                "relative degree at least 2 (velocity must be strictly proper)",
+                field="shape",
+                value=self.shape.relative_degree,
+            )
 
     def asd(self, frequency_Hz: np.ndarray, quantity: Quantity = "displacement") -> np.ndarray:
         """One-sided ASD at the frequencies [Hz], (n,)."""
@@ -65,15 +68,20 @@ class SpectrumModel:
         frequency = np.geomspace(low_Hz, high_Hz, 4000)
         return band_rms(frequency, self.asd(frequency, quantity), low_Hz, high_Hz)
 
-    def scaled_to_rms(self, rms: float, low_Hz: float, high_Hz: float,
-                      quantity: Quantity = "velocity") -> SpectrumModel:
+    def scaled_to_rms(
+        self, rms: float, low_Hz: float, high_Hz: float, quantity: Quantity = "velocity"
+    ) -> SpectrumModel:
         """The same shape, scaled to an r.m.s. in a band."""
         require_positive(rms, "rms")
         factor = rms / self.rms(low_Hz, high_Hz, quantity)
         return replace(self, name=f"{self.name}, scaled by {factor:.4g}", shape=self.shape.scaled(factor))
 
-    def system(self, input_name: str = "white_noise", output_name: str = "floor_displacement",
-               quantity: Quantity = "displacement") -> StateSpace:
+    def system(
+        self,
+        input_name: str = "white_noise",
+        output_name: str = "floor_displacement",
+        quantity: Quantity = "displacement",
+    ) -> StateSpace:
         """Shaping filter: unit-intensity white noise -> displacement, velocity or acceleration."""
         if quantity not in DERIVATIVES:
             raise InputError(f"one of {list(DERIVATIVES)}", field="quantity", value=quantity)
@@ -97,21 +105,36 @@ def shipped_spectrum(name: str) -> SpectrumModel:
 
 def spectrum_from_table(name: str, table: dict[str, Any]) -> SpectrumModel:
     """A model from its TOML table: corner frequencies in Hz, damping ratios, static ASD."""
+
     def pairs(key: str) -> tuple[tuple[float, float], ...]:
         return tuple((2 * np.pi * float(f), float(z)) for f, z in table.get(key, []))
 
     def singles(key: str) -> tuple[float, ...]:
         return tuple(2 * np.pi * float(f) for f in table.get(key, []))
+
     try:
-        unit = Rational(1.0, pairs("zeros_Hz_damping"), pairs("poles_Hz_damping"), singles("real_zeros_Hz"),
-                        singles("real_poles_Hz"))
+        unit = Rational(
+            1.0,
+            pairs("zeros_Hz_damping"),
+            pairs("poles_Hz_damping"),
+            singles("real_zeros_Hz"),
+            singles("real_poles_Hz"),
+        )
         shape = unit.scaled(float(table["static_asd_m_rtHz"]) / (ONE_SIDED * abs(complex(unit(np.array(0.0))))))
         low, high = table["band_Hz"]
-        return SpectrumModel(name, table["source"], shape, float(low), float(high),
-                             float(table["error_rms_dB"]), float(table["error_max_dB"]))
+        return SpectrumModel(
+            name,
+            table["source"],
+            shape,
+            float(low),
+            float(high),
+            float(table["error_rms_dB"]),
+            float(table["error_max_dB"]),
+        )
     except (KeyError, TypeError, ValueError) as error:
-        raise error if isinstance(error, InputError) else InputError(
-            f"a spectrum table: {error!r}", field=name) from error
+        raise (
+            error if isinstance(error, InputError) else InputError(f"a spectrum table: {error!r}", field=name)
+        ) from error
 
 
 class FloorRecord(NamedTuple):
@@ -137,8 +160,11 @@ def realise(spectrum: SpectrumModel, duration_s: float, dt: float, rng: np.rando
     require_positive(dt, "dt")
     n = round(duration_s / dt)
     if n < 4 or 1.0 / (n * dt) > spectrum.high_Hz or spectrum.low_Hz >= 0.5 / dt:
-        raise InputError(f"a record with lines inside {spectrum.low_Hz:g} to {spectrum.high_Hz:g} Hz",
-                         field="duration_s", value=(duration_s, dt))
+        raise InputError(
+            f"a record with lines inside {spectrum.low_Hz:g} to {spectrum.high_Hz:g} Hz",
+            field="duration_s",
+            value=(duration_s, dt),
+        )
     frequency = np.fft.rfftfreq(n, dt)
     active = frequency >= spectrum.low_Hz * (1 - 1e-9)
     if n % 2 == 0:

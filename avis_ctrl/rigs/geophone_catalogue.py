@@ -48,13 +48,18 @@ def check_against_name(entry: CatalogueEntry, tolerance: float = 0.02) -> list[s
     """
     s = 2j * np.pi * entry.normalisation_Hz
     w = 2 * np.pi * entry.corner_Hz
-    response = abs(s ** 2 / (s ** 2 + 2 * entry.damping * w * s + w ** 2))
-    pairs = [("corner from the poles", entry.corner_Hz, "the name's", entry.named_corner_Hz, "Hz"),
-             ("gain", entry.gain_Vs_per_m, "the name's", entry.named_gain_Vs_per_m, "V s/m"),
-             ("gain of stage 1", entry.gain_Vs_per_m, "the overall sensitivity", entry.overall_sensitivity, "V s/m"),
-             ("normalisation factor", entry.normalisation, "what the poles imply", 1 / response, "")]
-    return [f"{what} is {value:.4g} {unit}".rstrip() + f", {against} {other:.4g} {unit}".rstrip()
-            for what, value, against, other, unit in pairs if abs(value - other) > tolerance * abs(other)]
+    response = abs(s**2 / (s**2 + 2 * entry.damping * w * s + w**2))
+    pairs = [
+        ("corner from the poles", entry.corner_Hz, "the name's", entry.named_corner_Hz, "Hz"),
+        ("gain", entry.gain_Vs_per_m, "the name's", entry.named_gain_Vs_per_m, "V s/m"),
+        ("gain of stage 1", entry.gain_Vs_per_m, "the overall sensitivity", entry.overall_sensitivity, "V s/m"),
+        ("normalisation factor", entry.normalisation, "what the poles imply", 1 / response, ""),
+    ]
+    return [
+        f"{what} is {value:.4g} {unit}".rstrip() + f", {against} {other:.4g} {unit}".rstrip()
+        for what, value, against, other, unit in pairs
+        if abs(value - other) > tolerance * abs(other)
+    ]
 
 
 def read_response(path: str | Path) -> CatalogueEntry:
@@ -93,11 +98,20 @@ def _parse(text: str, name: str) -> CatalogueEntry:
     gains = _stage_gains(text)
     analogue = float(np.prod([value for stage_number, value in gains.items() if stage_number > 0]))
     named = _from_name(name)
-    return CatalogueEntry(file=name, model=name.split(".")[5], corner_Hz=w / (2 * np.pi),
-                          damping=float(-np.sum(poles.real) / (2 * w)), gain_Vs_per_m=analogue,
-                          overall_sensitivity=gains[0], normalisation=_number(stage, "B053F07"),
-                          normalisation_Hz=_number(stage, "B053F08"), coil_ohm=named["coil"], shunt_ohm=named["shunt"],
-                          named_corner_Hz=_given(named, "corner"), named_gain_Vs_per_m=_given(named, "gain"))
+    return CatalogueEntry(
+        file=name,
+        model=name.split(".")[5],
+        corner_Hz=w / (2 * np.pi),
+        damping=float(-np.sum(poles.real) / (2 * w)),
+        gain_Vs_per_m=analogue,
+        overall_sensitivity=gains[0],
+        normalisation=_number(stage, "B053F07"),
+        normalisation_Hz=_number(stage, "B053F08"),
+        coil_ohm=named["coil"],
+        shunt_ohm=named["shunt"],
+        named_corner_Hz=_given(named, "corner"),
+        named_gain_Vs_per_m=_given(named, "gain"),
+    )
 
 
 def _poles_and_zeros_stage(text: str) -> str:
@@ -152,8 +166,9 @@ def _from_name(name: str) -> dict[str, float | None]:
     """Coil, shunt, corner and gain as stated in the file's name; None for missing values."""
     parts = name.split(".")
     if len(parts) not in (8, 10):
-        raise InputError("a name RESP.network.station.location.channel.model[.coil.shunt].corner.gain", field="name",
-                         value=name)
+        raise InputError(
+            "a name RESP.network.station.location.channel.model[.coil.shunt].corner.gain", field="name", value=name
+        )
     if len(parts) == 8:
         order = ["corner", "gain"]
     elif parts[5].startswith("GS11"):

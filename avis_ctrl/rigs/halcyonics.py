@@ -54,8 +54,9 @@ class Load:
 
     def inertia(self) -> np.ndarray:
         """(3, 3) tensor about the load's own centre of mass, eq. 11."""
-        return np.array([[self.Ixx, -self.Ixy, -self.Ixz], [-self.Ixy, self.Iyy, -self.Iyz],
-                         [-self.Ixz, -self.Iyz, self.Izz]])
+        return np.array(
+            [[self.Ixx, -self.Ixy, -self.Ixz], [-self.Ixy, self.Iyy, -self.Iyz], [-self.Ixz, -self.Iyz, self.Izz]]
+        )
 
 
 @dataclass(frozen=True)
@@ -68,16 +69,23 @@ class ReactionMass:
 
 
 _SCALARS = {  # field: unit, description
-    "mass": ("kg", "mass m of the upper plate"), "Ixx": ("kg m^2", "inertia of the plate"),
-    "Iyy": ("kg m^2", "inertia of the plate"), "Izz": ("kg m^2", "inertia of the plate"),
-    "L1": ("m", "distance of the springs along x"), "L2": ("m", "distance of the springs along y"),
+    "mass": ("kg", "mass m of the upper plate"),
+    "Ixx": ("kg m^2", "inertia of the plate"),
+    "Iyy": ("kg m^2", "inertia of the plate"),
+    "Izz": ("kg m^2", "inertia of the plate"),
+    "L1": ("m", "distance of the springs along x"),
+    "L2": ("m", "distance of the springs along y"),
     "L3": ("m", "places the vertical actuators: arm L3 - L1/2 along x"),
     "L4_plus_L5": ("m", "places the horizontal actuators: yaw arm (L4 + L5)/sqrt(2)"),
     "L6": ("m", "height of the centre of mass above the horizontal actuators"),
-    "k_a": ("N/m", "stiffness of an actuator"), "k_t": ("N/m", "transverse stiffness of the suspension"),
-    "k_r": ("N m/rad", "yaw stiffness of the suspension"), "d1": ("N s/m", "damping along x and along y"),
-    "d3": ("N s/m", "damping along z"), "d4": ("N m s/rad", "damping of phi_x"),
-    "d5": ("N m s/rad", "damping of phi_y"), "d6": ("N m s/rad", "damping of phi_z"),
+    "k_a": ("N/m", "stiffness of an actuator"),
+    "k_t": ("N/m", "transverse stiffness of the suspension"),
+    "k_r": ("N m/rad", "yaw stiffness of the suspension"),
+    "d1": ("N s/m", "damping along x and along y"),
+    "d3": ("N s/m", "damping along z"),
+    "d4": ("N m s/rad", "damping of phi_x"),
+    "d5": ("N m s/rad", "damping of phi_y"),
+    "d6": ("N m s/rad", "damping of phi_z"),
     "M2_arm": ("m", "measured point M2 from the centre of mass, along x (assumed)"),
     "M3_arm": ("m", "measured point M3 from the centre of mass, along y (assumed)"),
 }
@@ -131,8 +139,9 @@ class Halcyonics(Rig):
             raise InputError(f"expected 4 springs and 8 actuators, got {len(self.k_s)}, {len(self.e)}", field="k_s, e")
         plate = np.array([self.mass, self.Ixx, self.Iyy, self.Izz])
         if not np.all(np.isfinite(plate)) or np.any(plate <= 0) or np.min(np.linalg.eigvalsh(self.mass_matrix())) <= 0:
-            raise InputError("expected positive mass and inertia [kg, kg m^2]", field="mass, Ixx, Iyy, Izz",
-                             value=plate.tolist())
+            raise InputError(
+                "expected positive mass and inertia [kg, kg m^2]", field="mass, Ixx, Iyy, Izz", value=plate.tolist()
+            )
 
     @property
     def edge_m(self) -> float:
@@ -144,8 +153,9 @@ class Halcyonics(Rig):
         return self.accelerometers.drive_limit_V
 
     def with_drives_limited(self, limit_V: float) -> Halcyonics:
-        return replace(self, accelerometers=replace(self.accelerometers,
-                                                    drive_limit_V=min(self.drive_limit_V, limit_V)))
+        return replace(
+            self, accelerometers=replace(self.accelerometers, drive_limit_V=min(self.drive_limit_V, limit_V))
+        )
 
     def with_loop_delay(self, delay_s: float) -> Halcyonics:
         return replace(self, accelerometers=replace(self.accelerometers, loop_delay_s=delay_s))
@@ -169,8 +179,12 @@ class Halcyonics(Rig):
         M[:3, 3:] += coupling
         M[3:, :3] += coupling.T
         M[3:, 3:] += self.load.inertia() + m_e * np.array(
-            [[L8**2 + L9**2, -L7 * L8, -L7 * L9], [-L7 * L8, L7**2 + L9**2, -L8 * L9],
-             [-L7 * L9, -L8 * L9, L7**2 + L8**2]])
+            [
+                [L8**2 + L9**2, -L7 * L8, -L7 * L9],
+                [-L7 * L8, L7**2 + L9**2, -L8 * L9],
+                [-L7 * L9, -L8 * L9, L7**2 + L8**2],
+            ]
+        )
         return M
 
     def damping_matrix(self) -> np.ndarray:
@@ -181,10 +195,16 @@ class Halcyonics(Rig):
         """K of eq. 18, corrected; the sums over k_s become 4 k_s, 0, k_s L2^2, k_s L1^2 for equal springs."""
         k_a, k_s, L6 = self.k_a, np.array(self.k_s), self.L6
         x, y = CORNERS[:, 0] * self.L1 / 2, CORNERS[:, 1] * self.L2 / 2
-        K = np.diag([2 * k_a + self.k_t, 2 * k_a + self.k_t, 4 * k_a + k_s.sum(),
-                     k_a * self.L2**2 + k_s @ y**2 + 2 * k_a * L6**2,
-                     k_a * ((self.L1 - 2 * self.L3)**2 + 2 * L6**2) + k_s @ x**2,
-                     2 * k_a * self.L4_plus_L5**2 + self.k_r])
+        K = np.diag(
+            [
+                2 * k_a + self.k_t,
+                2 * k_a + self.k_t,
+                4 * k_a + k_s.sum(),
+                k_a * self.L2**2 + k_s @ y**2 + 2 * k_a * L6**2,
+                k_a * ((self.L1 - 2 * self.L3) ** 2 + 2 * L6**2) + k_s @ x**2,
+                2 * k_a * self.L4_plus_L5**2 + self.k_r,
+            ]
+        )
         K[0, 4] = K[4, 0] = -2 * k_a * L6
         K[1, 3] = K[3, 1] = 2 * k_a * L6
         K[2, 3] = K[3, 2] = k_s @ y
@@ -196,12 +216,16 @@ class Halcyonics(Rig):
         """E of eq. 19, corrected, (6, 8) in N/V and N m/V."""
         a, b, r = self.L3 - self.L1 / 2, self.L2 / 2, _ROOT_HALF
         h, g = self.L6 * r, self.L4_plus_L5 * r
-        return np.array([[0, 0, 0, 0, -r, r, r, -r],
-                         [0, 0, 0, 0, r, r, -r, -r],
-                         [1, 1, 1, 1, 0, 0, 0, 0],
-                         [-b, -b, b, b, h, h, -h, -h],
-                         [-a, a, a, -a, h, -h, -h, h],
-                         [0, 0, 0, 0, -g, g, -g, g]]) * np.array(self.e)
+        return np.array(
+            [
+                [0, 0, 0, 0, -r, r, r, -r],
+                [0, 0, 0, 0, r, r, -r, -r],
+                [1, 1, 1, 1, 0, 0, 0, 0],
+                [-b, -b, b, b, h, h, -h, -h],
+                [-a, a, a, -a, h, -h, -h, h],
+                [0, 0, 0, 0, -g, g, -g, g],
+            ]
+        ) * np.array(self.e)
 
     def equations_of_motion(self) -> EquationsOfMotion:
         """Eq. 15: the floor acts through the same K and D as the plate."""
@@ -220,13 +244,17 @@ class Halcyonics(Rig):
         """The rig described by positions: springs at (+-L1/2, +-L2/2), actuators as springs along their axes."""
         z = np.diag([0.0, 0.0, 1.0])
         corners = [np.array([cx * self.L1 / 2, cy * self.L2 / 2, 0.0]) for cx, cy in CORNERS]
-        mounts = [Mount(f"spring{k}", place, place, stiffness * z, np.zeros((3, 3)))
-                  for k, (place, stiffness) in enumerate(zip(corners, self.k_s, strict=True), 1)]
+        mounts = [
+            Mount(f"spring{k}", place, place, stiffness * z, np.zeros((3, 3)))
+            for k, (place, stiffness) in enumerate(zip(corners, self.k_s, strict=True), 1)
+        ]
         axes = self.actuator_axes()
-        mounts += [Mount(name, place, place, self.k_a * np.outer(n, n), np.zeros((3, 3)))
-                   for name, (place, n) in axes.items()]
-        actuators = tuple(PointActuator(name, place, n, e)
-                          for (name, (place, n)), e in zip(axes.items(), self.e, strict=True))
+        mounts += [
+            Mount(name, place, place, self.k_a * np.outer(n, n), np.zeros((3, 3))) for name, (place, n) in axes.items()
+        ]
+        actuators = tuple(
+            PointActuator(name, place, n, e) for (name, (place, n)), e in zip(axes.items(), self.e, strict=True)
+        )
         mass, inertia, centre = self._rigid_body()
         suspension = np.diag([self.k_t, self.k_t, 0.0, 0.0, 0.0, self.k_r])
         return MountedBody(mass, inertia, centre, tuple(mounts), actuators, suspension, self.damping_matrix())
@@ -239,18 +267,19 @@ class Halcyonics(Rig):
         total = self.mass + self.load.mass
         centre = self.load.mass / total * self.load.position()
         to_plate, to_load = cross_matrix(-centre), cross_matrix(self.load.position() - centre)
-        inertia = (plate - self.mass * to_plate @ to_plate
-                   + self.load.inertia() - self.load.mass * to_load @ to_load)
+        inertia = plate - self.mass * to_plate @ to_plate + self.load.inertia() - self.load.mass * to_load @ to_load
         return total, inertia, centre
 
     def points(self) -> dict[str, Place]:
         found = {m.name: Place(m.position, "isolator") for m in self.mounted_body().mounts[:4]}
         found |= {name: Place(place, "actuator") for name, (place, _) in self.actuator_axes().items()}
         found |= {name: Place(place, "sensor") for name, (place, _) in self.sensor_axes().items()}
-        found |= {"M1": Place(np.zeros(3), "measured point"),
-                  "M2": Place(np.array([self.M2_arm, 0.0, 0.0]), "measured point"),
-                  "M3": Place(np.array([0.0, self.M3_arm, 0.0]), "measured point"),
-                  "centre of mass": Place(self._rigid_body()[2], "centre of mass")}
+        found |= {
+            "M1": Place(np.zeros(3), "measured point"),
+            "M2": Place(np.array([self.M2_arm, 0.0, 0.0]), "measured point"),
+            "M3": Place(np.array([0.0, self.M3_arm, 0.0]), "measured point"),
+            "centre of mass": Place(self._rigid_body()[2], "centre of mass"),
+        }
         return found | ({"load": Place(self.load.position(), "load")} if self.load else {})
 
     def sensors(self) -> tuple[Sensor, ...]:
@@ -258,8 +287,20 @@ class Halcyonics(Rig):
         axes, acc = self.actuator_axes(), self.accelerometers
         noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
         pole = complex(-2 * np.pi * acc.low_corner_Hz)
-        bare = [Sensor(f"acc_{name}", triple(axes[name][0]), triple(axes[name][1]), "acceleration", (0j,), (pole,),
-                       acc.sensitivity_Vs2_per_m, noise, noise_density=acc.noise_m_per_s2_rtHz) for name in acc.at]
+        bare = [
+            Sensor(
+                f"acc_{name}",
+                triple(axes[name][0]),
+                triple(axes[name][1]),
+                "acceleration",
+                (0j,),
+                (pole,),
+                acc.sensitivity_Vs2_per_m,
+                noise,
+                noise_density=acc.noise_m_per_s2_rtHz,
+            )
+            for name in acc.at
+        ]
         return tuple(one.with_electronics(self.electronics, 1.0, self.converter, self.sample_rate_Hz) for one in bare)
 
     def parameters(self) -> dict[str, Parameter]:
@@ -280,7 +321,9 @@ class Halcyonics(Rig):
         """`k_s` sets all four springs; k_s1..k_s4, if given, take precedence."""
         springs = tuple(values.get(f"k_s{k}", values.get("k_s", old)) for k, old in enumerate(self.k_s, 1))
         constants = tuple(values.get(f"e{k}", old) for k, old in enumerate(self.e, 1))
-        load = self.load and replace(self.load, **{name.removeprefix("load."): value for name, value in values.items()
-                                                   if name.startswith("load.")})
+        load = self.load and replace(
+            self.load,
+            **{name.removeprefix("load."): value for name, value in values.items() if name.startswith("load.")},
+        )
         plain: dict[str, Any] = {name: value for name, value in values.items() if name in _SCALARS}
         return replace(self, k_s=springs, e=constants, load=load, **plain)

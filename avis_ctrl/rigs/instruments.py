@@ -114,15 +114,19 @@ class Sensor(Channel):
         """One-sided density of the 1/f noise at 1 Hz, as motion in the passband [unit/sqrt(Hz)]."""
         return white_density(self.flicker_rms_V, sample_rate_Hz) / self.gain
 
-    def with_electronics(self, electronics: Electronics, preamplifier_gain: float, converter: Converter | None,
-                         sample_rate_Hz: float) -> Sensor:
+    def with_electronics(
+        self, electronics: Electronics, preamplifier_gain: float, converter: Converter | None, sample_rate_Hz: float
+    ) -> Sensor:
         """The sensor with the offset, 1/f noise and anti-alias filter of its channel."""
         lags = electronics.low_pass()
         code, rounding = (converter.lsb_V, converter.noise_rms_V) if converter else (0.0, 0.0)
-        return replace(self, poles=(*self.poles, *lags), low_pass=lags,
-                       offset_V=electronics.offset_V(preamplifier_gain, code),
-                       flicker_rms_V=electronics.flicker_rms_V(preamplifier_gain, self.noise_rms_V, rounding,
-                                                               sample_rate_Hz))
+        return replace(
+            self,
+            poles=(*self.poles, *lags),
+            low_pass=lags,
+            offset_V=electronics.offset_V(preamplifier_gain, code),
+            flicker_rms_V=electronics.flicker_rms_V(preamplifier_gain, self.noise_rms_V, rounding, sample_rate_Hz),
+        )
 
     def as_velocity(self, omega: np.ndarray) -> np.ndarray:
         """Response (n,) of the chain from velocity with unit passband gain, at omega > 0 [rad/s]."""
@@ -154,10 +158,17 @@ class GeophoneAt(Channel):
             # The filter is assumed to match this suspension exactly: its zeros cancel the geophone's poles.
             corner, damping = self.compensated_Hz, self.compensated_damping
         noise = _noise_rms(self.noise_rms_V, None, 1.0, acquisition, ambient)
-        return Sensor(self.name, self.position, self.direction, "velocity", (0j, 0j),
-                      tuple(second_order_roots(corner, damping).tolist()),
-                      self.sensitivity_Vs_per_m * self.preamplifier_gain, noise,
-                      (self.suspension_Hz, self.suspension_damping))
+        return Sensor(
+            self.name,
+            self.position,
+            self.direction,
+            "velocity",
+            (0j, 0j),
+            tuple(second_order_roots(corner, damping).tolist()),
+            self.sensitivity_Vs_per_m * self.preamplifier_gain,
+            noise,
+            (self.suspension_Hz, self.suspension_damping),
+        )
 
 
 @dataclass(frozen=True)
@@ -174,9 +185,17 @@ class AccelerometerAt(Channel):
         """The channel of this instrument."""
         gain = self.sensitivity_Vs2_per_m * self.preamplifier_gain
         noise = _noise_rms(self.noise_rms_V, self.noise_m_per_s2_rtHz, gain, acquisition, ambient)
-        return Sensor(self.name, self.position, self.direction, "acceleration", (0j,),
-                      (complex(-2 * np.pi * self.low_corner_Hz),), gain, noise,
-                      noise_density=self.noise_m_per_s2_rtHz)
+        return Sensor(
+            self.name,
+            self.position,
+            self.direction,
+            "acceleration",
+            (0j,),
+            (complex(-2 * np.pi * self.low_corner_Hz),),
+            gain,
+            noise,
+            noise_density=self.noise_m_per_s2_rtHz,
+        )
 
 
 def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
@@ -184,8 +203,9 @@ def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
     return float(density * gain * np.sqrt(sample_rate_Hz / 2))
 
 
-def _noise_rms(rms_V: float | None, density: float | None, gain: float, acquisition: Acquisition,
-               ambient: Ambient | None) -> float:
+def _noise_rms(
+    rms_V: float | None, density: float | None, gain: float, acquisition: Acquisition, ambient: Ambient | None
+) -> float:
     """Noise stated in the file for a sensor, otherwise the ambient noise of the channels."""
     if rms_V is not None:
         return rms_V
@@ -209,8 +229,17 @@ class PositionSensorAt(Channel):
         gain = self.sensitivity_V_per_m * self.preamplifier_gain
         poles = () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
         noise = _noise_rms(self.noise_rms_V, self.noise_m_rtHz, gain, acquisition, ambient)
-        return Sensor(self.name, self.position, self.direction, "displacement", (), poles, gain, noise,
-                      noise_density=self.noise_m_rtHz)
+        return Sensor(
+            self.name,
+            self.position,
+            self.direction,
+            "displacement",
+            (),
+            poles,
+            gain,
+            noise,
+            noise_density=self.noise_m_rtHz,
+        )
 
 
 Instrument = GeophoneAt | AccelerometerAt | PositionSensorAt

@@ -82,8 +82,7 @@ class SensorAxes:
     inertial: np.ndarray
 
 
-def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES,
-                  actuators: Sequence[str] | None = None) -> ActuatorAxes:
+def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES, actuators: Sequence[str] | None = None) -> ActuatorAxes:
     """Allocation of forces on `axes` to the actuators (all of them by default).
 
     Raises
@@ -96,8 +95,9 @@ def actuator_axes(rig: Rig, axes: Sequence[str] = COORDINATES,
     T = eom.T[:, _positions(eom.actuators, names, "actuators")]
     wanted = _positions(COORDINATES, axes, "axes")
     others = [k for k in range(6) if k not in wanted]
-    inverse, condition = _blind_inverse(T.T, wanted, others, rig.edge_m,
-                                        f"cannot be pushed independently by the actuators {list(names)}")
+    inverse, condition = _blind_inverse(
+        T.T, wanted, others, rig.edge_m, f"cannot be pushed independently by the actuators {list(names)}"
+    )
     arms = _arms(rig)
     leftover = (T[others] @ inverse.T) * arms[wanted] / arms[others][:, None]
     return ActuatorAxes(names, tuple(axes), T, inverse.T, condition, leftover)
@@ -134,18 +134,26 @@ def sensor_axes(rig: Rig, axes: Sequence[str] = COORDINATES, sensors: Sequence[s
         order = [*absolute, *(k for k in range(6) if k not in absolute), *absolute]
         rows = [wanted.index(k) for k in absolute]
         decoding[rows], condition = _blind_inverse(
-            np.array([*own, *both, *against]).T, list(range(len(own))), list(range(len(own), len(order))), rig.edge_m,
-            complaint, noise, order)
+            np.array([*own, *both, *against]).T,
+            list(range(len(own))),
+            list(range(len(own), len(order))),
+            rig.edge_m,
+            complaint,
+            noise,
+            order,
+        )
     if relative:
         rows, least = [wanted.index(k) for k in relative], ~inertial
-        part, worse = _blind_inverse(H[least], relative, [k for k in range(6) if k not in relative], rig.edge_m,
-                                     complaint, noise[least])
+        part, worse = _blind_inverse(
+            H[least], relative, [k for k in range(6) if k not in relative], rig.edge_m, complaint, noise[least]
+        )
         decoding[np.array(rows)[:, None], np.flatnonzero(least)] = part
         condition = max(condition, worse)
     arms = _arms(rig)
     leftover = (decoding @ H[:, others]) * arms[wanted][:, None] / arms[others]
-    return SensorAxes(names, tuple(axes), H, decoding, condition, leftover,
-                      tuple(COORDINATES[k] for k in relative), inertial)
+    return SensorAxes(
+        names, tuple(axes), H, decoding, condition, leftover, tuple(COORDINATES[k] for k in relative), inertial
+    )
 
 
 def drivable(rig: Rig) -> tuple[str, ...]:
@@ -162,8 +170,7 @@ def _spanned(H: np.ndarray, edge_m: float) -> tuple[str, ...]:
     """Coordinates that lie in the row space of H (n, 6)."""
     _, sizes, V = np.linalg.svd(H * _edge_scale(edge_m), full_matrices=False)
     kept = V[sizes > REACH.weakest * sizes[0]]
-    return tuple(name for k, name in enumerate(COORDINATES)
-                 if np.linalg.norm(kept[:, k]) > 1 - 0.5 * REACH.weakest ** 2)
+    return tuple(name for k, name in enumerate(COORDINATES) if np.linalg.norm(kept[:, k]) > 1 - 0.5 * REACH.weakest**2)
 
 
 def _absolute(H: np.ndarray, wanted: list[int], edge_m: float, noise: np.ndarray) -> list[int]:
@@ -203,8 +210,15 @@ def _arms(rig: Rig) -> np.ndarray:
     return 1 / _edge_scale(rig.edge_m)
 
 
-def _blind_inverse(H: np.ndarray, wanted: list[int], others: list[int], edge_m: float, complaint: str,
-                   noise: np.ndarray | None = None, order: list[int] | None = None) -> tuple[np.ndarray, float]:
+def _blind_inverse(
+    H: np.ndarray,
+    wanted: list[int],
+    others: list[int],
+    edge_m: float,
+    complaint: str,
+    noise: np.ndarray | None = None,
+    order: list[int] | None = None,
+) -> tuple[np.ndarray, float]:
     """D (n_wanted, n) with D H = I on `wanted`, minimum response to `others` and, of these, minimum noise.
 
     H : (n, m), its columns the coordinates `order` (m,), by default all six.

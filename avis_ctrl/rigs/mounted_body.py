@@ -94,14 +94,14 @@ class MountedBody:
         if not (np.isfinite(self.mass) and self.mass > 0):
             raise InputError("expected a positive mass in kg", field="mass", value=self.mass)
         if not np.allclose(self.inertia, self.inertia.T) or np.min(np.linalg.eigvalsh(self.inertia)) <= 0:
-            raise InputError("expected a symmetric positive definite inertia in kg m^2", field="inertia",
-                             value=self.inertia.tolist())
+            raise InputError(
+                "expected a symmetric positive definite inertia in kg m^2", field="inertia", value=self.inertia.tolist()
+            )
 
     def mass_matrix(self) -> np.ndarray:
         """M, (6, 6), about the reference point, parallel-axis terms included."""
         S = cross_matrix(self.centre_of_mass)
-        return np.block([[self.mass * np.eye(3), -self.mass * S],
-                         [self.mass * S, self.inertia - self.mass * S @ S]])
+        return np.block([[self.mass * np.eye(3), -self.mass * S], [self.mass * S, self.inertia - self.mass * S @ S]])
 
     def equations_of_motion(self) -> EquationsOfMotion:
         """Equations linearised about rest (Rademakers, eq. 2.36, with the chassis motion included)."""
@@ -114,5 +114,4 @@ class MountedBody:
             K_floor += G.T @ mount.stiffness @ G_chassis
             C_floor += G.T @ mount.damping @ G_chassis
         T = np.column_stack([point_map(a.position).T @ a.direction * a.constant_N_per_V for a in self.actuators])
-        return EquationsOfMotion(self.mass_matrix(), C, K, C_floor, K_floor, T,
-                                 tuple(a.name for a in self.actuators))
+        return EquationsOfMotion(self.mass_matrix(), C, K, C_floor, K_floor, T, tuple(a.name for a in self.actuators))

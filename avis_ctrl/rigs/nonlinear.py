@@ -53,13 +53,20 @@ def rig_arrays(body: MountedBody) -> RigArrays:
     def stack(rows: list[np.ndarray], *shape: int) -> np.ndarray:
         return np.ascontiguousarray(np.reshape(rows, (-1, *shape)), dtype=float)
 
-    return RigArrays(float(body.mass), np.array(body.centre_of_mass), np.ascontiguousarray(M[3:, 3:]),
-                     np.ascontiguousarray(np.linalg.inv(M)),
-                     stack([m.position for m in mounts], 3), stack([m.chassis_point for m in mounts], 3),
-                     stack([m.stiffness for m in mounts], 3, 3), stack([m.damping for m in mounts], 3, 3),
-                     np.array(body.stiffness), np.array(body.damping),
-                     stack([a.position for a in actuators], 3),
-                     stack([a.direction * a.constant_N_per_V for a in actuators], 3))
+    return RigArrays(
+        float(body.mass),
+        np.array(body.centre_of_mass),
+        np.ascontiguousarray(M[3:, 3:]),
+        np.ascontiguousarray(np.linalg.inv(M)),
+        stack([m.position for m in mounts], 3),
+        stack([m.chassis_point for m in mounts], 3),
+        stack([m.stiffness for m in mounts], 3, 3),
+        stack([m.damping for m in mounts], 3, 3),
+        np.array(body.stiffness),
+        np.array(body.damping),
+        stack([a.position for a in actuators], 3),
+        stack([a.direction * a.constant_N_per_V for a in actuators], 3),
+    )
 
 
 @njit(cache=True)
@@ -98,8 +105,15 @@ def body_rates(omega: np.ndarray, angles: np.ndarray, rates: np.ndarray) -> None
 
 
 @njit(cache=True)
-def _point_motion(place: np.ndarray, speed: np.ndarray, R: np.ndarray, omega: np.ndarray, p: np.ndarray, q: np.ndarray,
-                  q_dot: np.ndarray) -> None:
+def _point_motion(
+    place: np.ndarray,
+    speed: np.ndarray,
+    R: np.ndarray,
+    omega: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    q_dot: np.ndarray,
+) -> None:
     """Displacement and velocity of the body-fixed point p in earth axes."""
     # Scalars, not small arrays: this runs for every mount at every step.
     t0, t1, t2 = omega[1] * p[2] - omega[2] * p[1], omega[2] * p[0] - omega[0] * p[2], omega[0] * p[1] - omega[1] * p[0]
@@ -123,13 +137,25 @@ def _add_force(wrench: np.ndarray, arm: np.ndarray, R: np.ndarray, force: np.nda
 
 
 @njit(cache=True)
-def _mount_wrench(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.ndarray, q_dot: np.ndarray,
-                  q_ch: np.ndarray, q_ch_dot: np.ndarray, arrays: RigArrays) -> None:
+def _mount_wrench(
+    wrench: np.ndarray,
+    R: np.ndarray,
+    omega: np.ndarray,
+    q: np.ndarray,
+    q_dot: np.ndarray,
+    q_ch: np.ndarray,
+    q_ch_dot: np.ndarray,
+    arrays: RigArrays,
+) -> None:
     """Force and moment of the springs and dampers of eqs. 2.15-2.16, in body axes about the reference point."""
     R_ch, omega_ch = rotation(q_ch[3:]), np.empty_like(omega)
     body_rates(omega_ch, q_ch[3:], q_ch_dot[3:])
-    place, speed, place_ch, speed_ch = (np.empty_like(omega), np.empty_like(omega), np.empty_like(omega),
-                                        np.empty_like(omega))
+    place, speed, place_ch, speed_ch = (
+        np.empty_like(omega),
+        np.empty_like(omega),
+        np.empty_like(omega),
+        np.empty_like(omega),
+    )
     force = np.empty_like(omega)
     for k in range(arrays.mount_position.shape[0]):
         p = arrays.mount_position[k]
@@ -138,21 +164,28 @@ def _mount_wrench(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.nd
         for i in range(3):
             force[i] = 0.0
             for j in range(3):
-                force[i] -= (arrays.mount_stiffness[k, i, j] * (place[j] - place_ch[j])
-                             + arrays.mount_damping[k, i, j] * (speed[j] - speed_ch[j]))
+                force[i] -= arrays.mount_stiffness[k, i, j] * (place[j] - place_ch[j]) + arrays.mount_damping[
+                    k, i, j
+                ] * (speed[j] - speed_ch[j])
         _add_force(wrench, p, R, force)
 
 
 @njit(cache=True)
-def _generalised_wrench(wrench: np.ndarray, R: np.ndarray, q: np.ndarray, q_dot: np.ndarray, q_ch: np.ndarray,
-                        q_ch_dot: np.ndarray, arrays: RigArrays) -> None:
+def _generalised_wrench(
+    wrench: np.ndarray,
+    R: np.ndarray,
+    q: np.ndarray,
+    q_dot: np.ndarray,
+    q_ch: np.ndarray,
+    q_ch_dot: np.ndarray,
+    arrays: RigArrays,
+) -> None:
     """Generalised forces of the 6 x 6 stiffness and damping, converted to body axes by inv(W)^T."""
     Q = np.empty_like(wrench)
     for i in range(6):
         Q[i] = 0.0
         for j in range(6):
-            Q[i] -= (arrays.stiffness[i, j] * (q[j] - q_ch[j])
-                     + arrays.damping[i, j] * (q_dot[j] - q_ch_dot[j]))
+            Q[i] -= arrays.stiffness[i, j] * (q[j] - q_ch[j]) + arrays.damping[i, j] * (q_dot[j] - q_ch_dot[j])
     c1, s1, c2, s2 = np.cos(q[3]), np.sin(q[3]), np.cos(q[4]), np.sin(q[4])
     yaw = (Q[5] + s2 * Q[3]) / c2
     for i in range(3):
@@ -163,8 +196,9 @@ def _generalised_wrench(wrench: np.ndarray, R: np.ndarray, q: np.ndarray, q_dot:
 
 
 @njit(cache=True)
-def _accelerations(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.ndarray, q_dot: np.ndarray,
-                   arrays: RigArrays) -> np.ndarray:
+def _accelerations(
+    wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.ndarray, q_dot: np.ndarray, arrays: RigArrays
+) -> np.ndarray:
     """Newton-Euler equations about the reference point in body axes, eqs. 2.8-2.14; returns q''."""
     c = arrays.centre_of_mass
     turning, momentum = np.empty_like(omega), np.empty_like(omega)
@@ -172,15 +206,19 @@ def _accelerations(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.n
     _cross(turning, omega, c)
     _cross(centrifugal, omega, turning)
     for i in range(3):
-        momentum[i] = (arrays.inertia_ref[i, 0] * omega[0] + arrays.inertia_ref[i, 1] * omega[1]
-                       + arrays.inertia_ref[i, 2] * omega[2])
+        momentum[i] = (
+            arrays.inertia_ref[i, 0] * omega[0]
+            + arrays.inertia_ref[i, 1] * omega[1]
+            + arrays.inertia_ref[i, 2] * omega[2]
+        )
     _cross(gyroscopic, omega, momentum)
     body = np.empty_like(wrench)
     for i in range(6):
         body[i] = 0.0
         for j in range(3):
-            body[i] += (arrays.inverse_mass[i, j] * (wrench[j] - arrays.mass * centrifugal[j])
-                        + arrays.inverse_mass[i, 3 + j] * (wrench[3 + j] - gyroscopic[j]))
+            body[i] += arrays.inverse_mass[i, j] * (wrench[j] - arrays.mass * centrifugal[j]) + arrays.inverse_mass[
+                i, 3 + j
+            ] * (wrench[3 + j] - gyroscopic[j])
 
     c1, s1, c2, s2 = np.cos(q[3]), np.sin(q[3]), np.cos(q[4]), np.sin(q[4])
     a1, a2, a3 = q_dot[3], q_dot[4], q_dot[5]
@@ -198,8 +236,9 @@ def _accelerations(wrench: np.ndarray, R: np.ndarray, omega: np.ndarray, q: np.n
 
 
 @njit(cache=True)
-def payload_acceleration(q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, q_ch: np.ndarray, q_ch_dot: np.ndarray,
-                         arrays: RigArrays) -> np.ndarray:
+def payload_acceleration(
+    q: np.ndarray, q_dot: np.ndarray, u: np.ndarray, q_ch: np.ndarray, q_ch_dot: np.ndarray, arrays: RigArrays
+) -> np.ndarray:
     """q'' (6,) of the payload.
 
     Parameters

@@ -101,10 +101,14 @@ def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = R
         hint = f"; {likely[0].field}: {_asked(likely)}" if likely else ""
         return f"unusual for a table: {words}{hint}"
     if likely:
-        raise InputError(f"{words}: not possible for a real table; {_asked(likely)}", field=likely[0].field,
-                         value=likely[0].value)
-    raise InputError(f"{words}: not possible for a real table, and no single wrong unit explains it; check the units "
-                     "of the keys", field=odd[0].field or "payload, isolators or drives", value=odd[0].value)
+        raise InputError(
+            f"{words}: not possible for a real table; {_asked(likely)}", field=likely[0].field, value=likely[0].value
+        )
+    raise InputError(
+        f"{words}: not possible for a real table, and no single wrong unit explains it; check the units of the keys",
+        field=odd[0].field or "payload, isolators or drives",
+        value=odd[0].value,
+    )
 
 
 def _of_numbers(value: Any) -> bool:
@@ -143,15 +147,18 @@ def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now:
             # The problem does not depend on these numbers.
             idle.update(entry.place for entry in slip.entries)
         elif not refused and cost <= COST.better * now:
-            cost += COST.scope * slip.scope ** 2 + COST.rank * slip.rank + COST.apart * apart(slip, mended)
+            cost += COST.scope * slip.scope**2 + COST.rank * slip.rank + COST.apart * apart(slip, mended)
             found.append((cost, slip))
     if not found:
         return []
     found.sort(key=lambda one: one[0])
     least, best = found[0]
     places = {entry.place for entry in best.entries}
-    others = [slip for cost, slip in found if cost <= least + COST.near
-              and not places & {entry.place for entry in slip.entries}]
+    others = [
+        slip
+        for cost, slip in found
+        if cost <= least + COST.near and not places & {entry.place for entry in slip.entries}
+    ]
     return [best, *others[:1]]
 
 
@@ -168,7 +175,7 @@ def _outcome(content: dict[str, Any], build: Build, ranges: PlausibleRanges) -> 
 
 def _cost(properties: Sequence[Property]) -> float:
     of_table = [one.off_centre for one in properties if not one.field]
-    return sum(one.unusual ** 2 for one in properties) + COST.off_centre * float(np.mean(np.square(of_table)))
+    return sum(one.unusual**2 for one in properties) + COST.off_centre * float(np.mean(np.square(of_table)))
 
 
 def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) -> list[Property]:
@@ -183,6 +190,7 @@ def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) 
         if unusual > 1e-9:
             words = f"{words} ({_expected(within, refused > 0)})"
         found.append(Property(kind, refused, unusual, within.off_centre(value), words, field, value if field else None))
+
     numbers = list(entries(content))
     _single_keys(numbers, ranges, judge)
     eom, body = rig.equations_of_motion(), rig.mounted_body()
@@ -234,15 +242,23 @@ def judge_modes(eom: EquationsOfMotion, modes: Modes, judge: Judge) -> None:
 
 
 def _shape(rig: Rig, body: Any, centre: np.ndarray, radius: float, judge: Judge) -> None:
-    slab = body.mass / (np.pi * radius ** 2)
+    slab = body.mass / (np.pi * radius**2)
     judge("slab_kg_per_m2", slab, f"{slab:.3g} kg per m^2 of the area between the mounts")
     for J in np.linalg.eigvalsh(body.inertia):
         r = np.sqrt(max(J, 0.0) / body.mass)
-        judge("gyration", r / radius, f"radius of gyration {r:.3g} m, {r / radius:.2g} times the mounts' distance from "
-                                      f"their centre ({radius:.3g} m)")
+        judge(
+            "gyration",
+            r / radius,
+            f"radius of gyration {r:.3g} m, {r / radius:.2g} times the mounts' distance from "
+            f"their centre ({radius:.3g} m)",
+        )
     away = float(np.linalg.norm(body.centre_of_mass - centre))
-    judge("mounts_height", away / radius, f"centre of mass {away:.3g} m from the mounts' centre, {away / radius:.2g} "
-                                          "times the radius of the circle of the mounts")
+    judge(
+        "mounts_height",
+        away / radius,
+        f"centre of mass {away:.3g} m from the mounts' centre, {away / radius:.2g} "
+        "times the radius of the circle of the mounts",
+    )
     near = np.median([np.linalg.norm(mount.position - centre) for mount in body.mounts])
     for name, place in rig.points().items():
         distance = float(np.linalg.norm(place.position - centre)) / max(near, 1e-12)
@@ -262,8 +278,12 @@ def _drives(rig: Rig, eom: Any, radius: float, judge: Judge) -> None:
     judge("acceleration", a, f"{together} accelerate the payload by {a:.2g} m/s^2")
     judge("travel_m", travel, f"{together} move the payload by {travel:.2g} m")
     if radius > 0:
-        judge("travel_share", travel / radius, f"{together} move the payload by {travel:.2g} m, {travel / radius:.2g} "
-                                               "times the radius of the circle of the mounts")
+        judge(
+            "travel_share",
+            travel / radius,
+            f"{together} move the payload by {travel:.2g} m, {travel / radius:.2g} "
+            "times the radius of the circle of the mounts",
+        )
 
 
 def _alike(numbers: Sequence[Entry], body: Any, judge: Judge) -> None:
@@ -288,19 +308,28 @@ def _unequal(values: np.ndarray, names: list[str], judge: Judge) -> None:
 
 
 def _clock(rig: Rig, f: float, judge: Judge) -> None:
-    judge("samples_per_cycle", rig.sample_rate_Hz / f, f"{rig.sample_rate_Hz / f:.2g} samples per cycle of the "
-                                                            f"fastest mode at {f:.3g} Hz")
-    judge("delay_cycles", rig.loop_delay_s * f, f"loop delay {rig.loop_delay_s:g} s "
-          f"({rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples), {rig.loop_delay_s * f:.2g} cycles of the "
-          "fastest mode")
+    judge(
+        "samples_per_cycle",
+        rig.sample_rate_Hz / f,
+        f"{rig.sample_rate_Hz / f:.2g} samples per cycle of the fastest mode at {f:.3g} Hz",
+    )
+    judge(
+        "delay_cycles",
+        rig.loop_delay_s * f,
+        f"loop delay {rig.loop_delay_s:g} s "
+        f"({rig.loop_delay_s * rig.sample_rate_Hz:.3g} samples), {rig.loop_delay_s * f:.2g} cycles of the "
+        "fastest mode",
+    )
 
 
 def _signal_levels(content: dict[str, Any], judge: Judge) -> None:
     """Full scale of the velocity sensors, and their signal and noise relative to converter range and floor motion."""
+
     def of(section: str, key: str) -> float | None:
         part = content.get(section)
         value = part.get(key) if isinstance(part, dict) else None
         return float(value) if isinstance(value, (int, float)) and value > 0 else None
+
     full = of("acquisition", "adc_range_V")
     bits = of("acquisition", "adc_bits") or 16
     noise = of("ambient", "sensor_noise_rms_V") or 0.0
@@ -310,8 +339,12 @@ def _signal_levels(content: dict[str, Any], judge: Judge) -> None:
             judge("full_scale_m_per_s", full / gain, f"full scale {full / gain:.2g} m/s of {name}")
         if full is not None and floor is not None:
             share = floor * gain / full
-            judge("floor_share", share, f"the floor motion alone, {floor:.2g} m/s, uses a fraction of {share:.2g} of "
-                                        f"the converter's range at {name}")
+            judge(
+                "floor_share",
+                share,
+                f"the floor motion alone, {floor:.2g} m/s, uses a fraction of {share:.2g} of "
+                f"the converter's range at {name}",
+            )
             own = max(noise, full * 2.0 ** (1 - bits) / np.sqrt(12)) / gain
             ratio = own / floor
             judge("noise_ratio", ratio, f"noise of {name} {own:.2g} m/s, {ratio:.3g} times the floor motion")

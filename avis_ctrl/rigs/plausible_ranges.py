@@ -29,8 +29,10 @@ class Range:
 
     def beyond(self, value: float) -> tuple[float, float]:
         """Decades by which a positive value exceeds the (possible, usual) range, 0 inside."""
-        return tuple(max(log10(low / value) if low else 0.0, log10(value / high), 0.0)  # type: ignore[return-value]
-                     for low, high in ((self.lowest, self.highest), (self.low, self.high)))
+        return tuple(
+            max(log10(low / value) if low else 0.0, log10(value / high), 0.0)  # type: ignore[return-value]
+            for low, high in ((self.lowest, self.highest), (self.low, self.high))
+        )
 
     def off_centre(self, value: float) -> float:
         """Distance of a positive value from the middle of the usual range, 1 at its ends; 0 without a lower end."""
@@ -73,41 +75,53 @@ class PlausibleRanges:
     mounts_height: Range = Range(0.0, 0.0, 2.0, 5.0, "", "a table whose weight is that far from its feet falls over")
     outlier: Range = Range(0.0, 0.0, 4.0, 8.0, "", "drives and sensors are on the table")
     unequal: Range = Range(1 / 150, 1 / 30, 30.0, 150.0, "", "like parts of one table are alike")
-    acceleration: Range = Range(3e-4, 1e-3, 100.0, 400.0, "m/s^2", "weaker ones do not answer a footstep, stronger "
-                                                                   "ones throw the table off")
+    acceleration: Range = Range(
+        3e-4, 1e-3, 100.0, 400.0, "m/s^2", "weaker ones do not answer a footstep, stronger ones throw the table off"
+    )
     travel_m: Range = Range(6e-7, 1.5e-6, 0.1, 1.0, "m", "the shortest piezo stack moves by micrometres")
     travel_share: Range = Range(0.0, 0.0, 0.25, 0.6, "", "drives do not push a table by its own size")
     samples_per_cycle: Range = Range(3.0, 6.0, 1e6, 1e8, "", "a loop needs several samples in a cycle of its modes")
     delay_cycles: Range = Range(0.0, 0.0, 0.4, 1.5, "", "a loop that is late by a cycle of the modes damps none")
-    full_scale_m_per_s: Range = Range(2e-5, 1e-4, 0.5, 3.0, "m/s", "a table moves by micrometres to millimetres a "
-                                                                   "second")
+    full_scale_m_per_s: Range = Range(
+        2e-5, 1e-4, 0.5, 3.0, "m/s", "a table moves by micrometres to millimetres a second"
+    )
     noise_ratio: Range = Range(0.0, 0.0, 12.0, 50.0, "", "a sensor that does not hear the floor measures nothing")
     floor_share: Range = Range(0.0, 0.0, 0.1, 0.3, "", "the floor alone must not fill the converter")
-    keys: Mapping[str, Range] = field(default_factory=lambda: MappingProxyType({
-        "mass_kg": Range(0.02, 0.3, 1e5, 1e6, "kg", "from a mirror to a foundation"),
-        "reaction_mass_kg": Range(1e-5, 1e-3, 50.0, 500.0, "kg", "the moving part of a drive"),
-        "limit_V": Range(0.02, 0.5, 1e3, 3e3, "V", "amplifiers give 1 V to 1 kV"),
-        "drive_limit_V": Range(0.02, 0.5, 1e3, 3e3, "V", "amplifiers give 1 V to 1 kV"),
-        "adc_range_V": Range(0.02, 0.4, 50.0, 200.0, "V", "converters take 1 V to 10 V"),
-        "sample_rate_Hz": Range(10.0, 100.0, 2e5, 5e6, "Hz", "loops of tables run at 0.2 kHz to 100 kHz"),
-        "loop_delay_s": Range(1e-9, 1e-8, 0.05, 0.3, "s", "a loop delay is a few samples"),
-        "suspension_Hz": Range(3e-3, 0.02, 60.0, 300.0, "Hz", "seismometers have 0.008, geophones 1 to 28"),
-        "compensated_Hz": Range(1e-3, 4e-3, 60.0, 300.0, "Hz", "filters lower the corner of a geophone"),
-        "low_corner_Hz": Range(1e-5, 1e-3, 15.0, 100.0, "Hz", "charge amplifiers begin at 0.01 to 5"),
-        "bandwidth_Hz": Range(0.5, 5.0, 1e7, 1e9, "Hz", "of a position sensor"),
-        "suspension_damping": Range(0.01, 0.1, 3.0, 10.0, "", "a damping ratio, 0.7 as a rule"),
-        "compensated_damping": Range(0.01, 0.1, 3.0, 10.0, "", "a damping ratio, 0.7 as a rule"),
-        "sensitivity_Vs_per_m": Range(0.3, 3.0, 3e3, 5e4, "V s/m", "geophones have 10 to 400, seismometers 2000"),
-        "sensitivity_Vs2_per_m": Range(2e-3, 5e-3, 200.0, 2e3, "V s^2/m", "100 mV/g are 0.01; 10 V/g, amplified, 100"),
-        "sensitivity_V_per_m": Range(1.0, 50.0, 1e8, 1e10, "V/m", "from long inductive to capacitive sensors"),
-        "preamplifier_gain": Range(1e-3, 0.05, 1e5, 1e7, "", "of a preamplifier"),
-        "noise_m_per_s2_rtHz": Range(1e-11, 1e-9, 1e-2, 0.3, "m/s^2/sqrt(Hz)", "1e-9 to 1e-3 can be bought"),
-        "noise_m_rtHz": Range(1e-17, 1e-15, 1e-5, 1e-3, "m/sqrt(Hz)", "from interferometers to potentiometers"),
-        "noise_rms_m_per_s": Range(1e-12, 1e-10, 1e-4, 1e-2, "m/s", "noise of a floor sensor"),
-        "floor_velocity_rms_m_per_s": Range(1e-10, 1e-9, 2e-4, 1.5e-3, "m/s", "a quiet cave 1e-9, a workshop 8e-4"),
-        "sensor_noise_rms_V": Range(1e-9, 1e-8, 0.1, 1.0, "V", "noise of one sample"),
-        "noise_rms_V": Range(1e-9, 1e-8, 0.1, 1.0, "V", "noise of one sample"),
-    }))
+    keys: Mapping[str, Range] = field(
+        default_factory=lambda: MappingProxyType(
+            {
+                "mass_kg": Range(0.02, 0.3, 1e5, 1e6, "kg", "from a mirror to a foundation"),
+                "reaction_mass_kg": Range(1e-5, 1e-3, 50.0, 500.0, "kg", "the moving part of a drive"),
+                "limit_V": Range(0.02, 0.5, 1e3, 3e3, "V", "amplifiers give 1 V to 1 kV"),
+                "drive_limit_V": Range(0.02, 0.5, 1e3, 3e3, "V", "amplifiers give 1 V to 1 kV"),
+                "adc_range_V": Range(0.02, 0.4, 50.0, 200.0, "V", "converters take 1 V to 10 V"),
+                "sample_rate_Hz": Range(10.0, 100.0, 2e5, 5e6, "Hz", "loops of tables run at 0.2 kHz to 100 kHz"),
+                "loop_delay_s": Range(1e-9, 1e-8, 0.05, 0.3, "s", "a loop delay is a few samples"),
+                "suspension_Hz": Range(3e-3, 0.02, 60.0, 300.0, "Hz", "seismometers have 0.008, geophones 1 to 28"),
+                "compensated_Hz": Range(1e-3, 4e-3, 60.0, 300.0, "Hz", "filters lower the corner of a geophone"),
+                "low_corner_Hz": Range(1e-5, 1e-3, 15.0, 100.0, "Hz", "charge amplifiers begin at 0.01 to 5"),
+                "bandwidth_Hz": Range(0.5, 5.0, 1e7, 1e9, "Hz", "of a position sensor"),
+                "suspension_damping": Range(0.01, 0.1, 3.0, 10.0, "", "a damping ratio, 0.7 as a rule"),
+                "compensated_damping": Range(0.01, 0.1, 3.0, 10.0, "", "a damping ratio, 0.7 as a rule"),
+                "sensitivity_Vs_per_m": Range(
+                    0.3, 3.0, 3e3, 5e4, "V s/m", "geophones have 10 to 400, seismometers 2000"
+                ),
+                "sensitivity_Vs2_per_m": Range(
+                    2e-3, 5e-3, 200.0, 2e3, "V s^2/m", "100 mV/g are 0.01; 10 V/g, amplified, 100"
+                ),
+                "sensitivity_V_per_m": Range(1.0, 50.0, 1e8, 1e10, "V/m", "from long inductive to capacitive sensors"),
+                "preamplifier_gain": Range(1e-3, 0.05, 1e5, 1e7, "", "of a preamplifier"),
+                "noise_m_per_s2_rtHz": Range(1e-11, 1e-9, 1e-2, 0.3, "m/s^2/sqrt(Hz)", "1e-9 to 1e-3 can be bought"),
+                "noise_m_rtHz": Range(1e-17, 1e-15, 1e-5, 1e-3, "m/sqrt(Hz)", "from interferometers to potentiometers"),
+                "noise_rms_m_per_s": Range(1e-12, 1e-10, 1e-4, 1e-2, "m/s", "noise of a floor sensor"),
+                "floor_velocity_rms_m_per_s": Range(
+                    1e-10, 1e-9, 2e-4, 1.5e-3, "m/s", "a quiet cave 1e-9, a workshop 8e-4"
+                ),
+                "sensor_noise_rms_V": Range(1e-9, 1e-8, 0.1, 1.0, "V", "noise of one sample"),
+                "noise_rms_V": Range(1e-9, 1e-8, 0.1, 1.0, "V", "noise of one sample"),
+            }
+        )
+    )
 
 
 RANGES = PlausibleRanges()

@@ -130,8 +130,11 @@ class Rig(ABC):
 
         Raises InputError if this kind of rig has no gain per sensor.
         """
-        raise InputError("a rig file of this kind has one sensitivity for all; leave these out", field="parameters",
-                         value=[f"sensor.{name}" for name in gains])
+        raise InputError(
+            "a rig file of this kind has one sensitivity for all; leave these out",
+            field="parameters",
+            value=[f"sensor.{name}" for name in gains],
+        )
 
     def slopes(self, name: str) -> list[tuple[str, str, np.ndarray]] | None:
         """Nonzero derivatives of the matrices with respect to a parameter: (matrix, "", (6, 6)) for "M", "C", "K",

@@ -42,8 +42,11 @@ from avis_ctrl.rigs.rig_sections import (
 )
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
-SHIPPED = {"avis": ("avis.toml", False), "halcyonics": ("halcyonics.toml", False),
-           "halcyonics_loaded": ("halcyonics.toml", True)}
+SHIPPED = {
+    "avis": ("avis.toml", False),
+    "halcyonics": ("halcyonics.toml", False),
+    "halcyonics_loaded": ("halcyonics.toml", True),
+}
 
 
 def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> AvisTable | Halcyonics:
@@ -82,8 +85,11 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
     elif "suspension" in content:
         rig = _halcyonics(validated(HalcyonicsFile, content), loaded)
     else:
-        raise InputError("expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",
-                         field="top level", value=sorted(content))
+        raise InputError(
+            "expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",
+            field="top level",
+            value=sorted(content),
+        )
     _check_mass(rig)
     _check_support(rig)
     return rig
@@ -93,8 +99,9 @@ def _check_mass(rig: AvisTable | Halcyonics) -> None:
     """Check that the mass matrix is finite and numerically positive definite."""
     M = rig.equations_of_motion().M
     if not (np.all(np.isfinite(M)) and np.linalg.eigvalsh(M)[0] > 0):
-        raise InputError("expected mass, inertia and centre of mass that make a positive definite mass matrix",
-                         field="payload")
+        raise InputError(
+            "expected mass, inertia and centre of mass that make a positive definite mass matrix", field="payload"
+        )
 
 
 def _check_support(rig: AvisTable | Halcyonics) -> None:
@@ -104,8 +111,10 @@ def _check_support(rig: AvisTable | Halcyonics) -> None:
     softest, motion = (part[..., 0] for part in np.linalg.eigh(K / np.outer(size, size)))
     if softest < 1e-9:
         most = COORDINATES[int(np.argmax(np.abs(motion)))]
-        raise InputError(f"expected a positive definite stiffness; no spring resists motion mainly along {most}",
-                         field="isolator" if isinstance(rig, AvisTable) else "suspension")
+        raise InputError(
+            f"expected a positive definite stiffness; no spring resists motion mainly along {most}",
+            field="isolator" if isinstance(rig, AvisTable) else "suspension",
+        )
 
 
 def _avis(file: AvisFile) -> AvisTable:
@@ -116,8 +125,9 @@ def _avis(file: AvisFile) -> AvisTable:
             continue
         _same_length(name, section.model_dump(), ("names", "isolator", "axis", own))
         if bad := [number for number in section.isolator if not 1 <= number <= len(file.isolator)]:
-            raise InputError(f"expected isolators from 1 to {len(file.isolator)}", field=f"{name}.isolator",
-                             value=bad[0])
+            raise InputError(
+                f"expected isolators from 1 to {len(file.isolator)}", field=f"{name}.isolator", value=bad[0]
+            )
     J = np.diag(payload.inertia_kgm2)
     J[0, 1], J[0, 2], J[1, 2] = payload.inertia_offdiagonal_kgm2
     _check_inertia(J + np.triu(J, 1).T, "payload.inertia_kgm2", payload.inertia_kgm2)
@@ -125,13 +135,23 @@ def _avis(file: AvisFile) -> AvisTable:
     inertia = (*triple(payload.inertia_kgm2), *triple(payload.inertia_offdiagonal_kgm2))
     rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True) if motors else ()
     drives = tuple(Drive(**_at_place(one)) for one in file.drive)
-    table = AvisTable(file.name, payload.mass_kg, inertia, triple(payload.centre_of_mass_m), isolators,
-                      tuple(LinearMotor(*row) for row in rows), _common_limit(file),
-                      Geophones(**_tuples(geophones)) if geophones else None,
-                      Acquisition(**_tuples(file.acquisition)), _ambient(file.ambient), drives=drives,
-                      instruments=_instruments(file),
-                      floor_sensors=tuple(FloorSensor(**_tuples(one)) for one in file.floor_sensor),
-                      tolerances=_tolerances(file.tolerances), electronics=Electronics(**_tuples(file.electronics)))
+    table = AvisTable(
+        file.name,
+        payload.mass_kg,
+        inertia,
+        triple(payload.centre_of_mass_m),
+        isolators,
+        tuple(LinearMotor(*row) for row in rows),
+        _common_limit(file),
+        Geophones(**_tuples(geophones)) if geophones else None,
+        Acquisition(**_tuples(file.acquisition)),
+        _ambient(file.ambient),
+        drives=drives,
+        instruments=_instruments(file),
+        floor_sensors=tuple(FloorSensor(**_tuples(one)) for one in file.floor_sensor),
+        tolerances=_tolerances(file.tolerances),
+        electronics=Electronics(**_tuples(file.electronics)),
+    )
     _distinct("drive", [one.name for one in table.all_drives])
     _distinct("geophone, accelerometer, position_sensor", [one.name for one in table.sensors()])
     _distinct("floor_sensor.axis", [one.axis for one in table.floor_sensors], some=False)
@@ -144,8 +164,9 @@ def _common_limit(file: AvisFile) -> float:
         return file.actuators.limit_V
     for k, one in enumerate(file.drive, 1):
         if one.limit_V is None:
-            raise InputError("this key is missing, and [actuators] has no limit_V for all drives",
-                             field=f"drive[{k}].limit_V")
+            raise InputError(
+                "this key is missing, and [actuators] has no limit_V for all drives", field=f"drive[{k}].limit_V"
+            )
     return max((one.limit_V for one in file.drive if one.limit_V is not None), default=1.0)
 
 
@@ -153,18 +174,24 @@ def _instruments(file: AvisFile) -> tuple[Instrument, ...]:
     for k, geophone in enumerate(file.geophone, 1):
         if (geophone.compensated_Hz is None) != (geophone.compensated_damping is None):
             absent = "compensated_Hz" if geophone.compensated_Hz is None else "compensated_damping"
-            raise InputError("expected compensated_Hz and compensated_damping, both or neither",
-                             field=f"geophone[{k}].{absent}")
+            raise InputError(
+                "expected compensated_Hz and compensated_damping, both or neither", field=f"geophone[{k}].{absent}"
+            )
     for name, sections in (("accelerometer", file.accelerometer), ("position_sensor", file.position_sensor)):
         for k, one in enumerate(sections, 1):
             density = "noise_m_per_s2_rtHz" if name == "accelerometer" else "noise_m_rtHz"
             content = one.model_dump()
             if content["noise_rms_V"] is not None and content[density] is not None:
-                raise InputError(f"expected noise_rms_V or {density}, not both", field=f"{name}[{k}].noise_rms_V",
-                                 value=content["noise_rms_V"])
-    return (*(GeophoneAt(**_at_place(one)) for one in file.geophone),
-            *(AccelerometerAt(**_at_place(one)) for one in file.accelerometer),
-            *(PositionSensorAt(**_at_place(one)) for one in file.position_sensor))
+                raise InputError(
+                    f"expected noise_rms_V or {density}, not both",
+                    field=f"{name}[{k}].noise_rms_V",
+                    value=content["noise_rms_V"],
+                )
+    return (
+        *(GeophoneAt(**_at_place(one)) for one in file.geophone),
+        *(AccelerometerAt(**_at_place(one)) for one in file.accelerometer),
+        *(PositionSensorAt(**_at_place(one)) for one in file.position_sensor),
+    )
 
 
 def _at_place(section: BaseModel) -> dict[str, Any]:
@@ -184,8 +211,12 @@ def _distinct(field: str, names: list[str], some: bool = True) -> None:
 
 def _isolator(section: IsolatorSection) -> Isolator:
     offset = np.subtract(section.chassis_point_m or section.position_m, section.position_m)
-    return Isolator(triple(section.position_m), triple(section.stiffness_N_per_m), triple(section.damping_Ns_per_m),
-                    triple(offset.tolist()))
+    return Isolator(
+        triple(section.position_m),
+        triple(section.stiffness_N_per_m),
+        triple(section.damping_Ns_per_m),
+        triple(offset.tolist()),
+    )
 
 
 def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
@@ -200,16 +231,31 @@ def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
         raise InputError("the loaded table was requested, but the rig file has no [load] section", field="load")
     stiffness = {name.partition("_N")[0]: value for name, value in suspension.model_dump().items()}
     k_s, each = stiffness.pop("k_s"), stiffness.pop("k_s_each")
-    lengths = {name.removesuffix("_m"): getattr(plate, name) for name in ("L1_m", "L2_m", "L3_m", "L4_plus_L5_m",
-                                                                          "L6_m", "M2_arm_m", "M3_arm_m")}
+    lengths = {
+        name.removesuffix("_m"): getattr(plate, name)
+        for name in ("L1_m", "L2_m", "L3_m", "L4_plus_L5_m", "L6_m", "M2_arm_m", "M3_arm_m")
+    }
     Ixx, Iyy, Izz = plate.inertia_kgm2
-    return Halcyonics(file.name, plate.mass_kg, Ixx, Iyy, Izz, **lengths, **stiffness, k_s=tuple(each or (k_s,) * 4),
-                      e=tuple(actuators.constant_N_per_V), actuator_names=tuple(actuators.names),
-                      reaction=ReactionMass(actuators.reaction_mass_kg, actuators.reaction_damping_Ns_per_m,
-                                            actuators.free_constant_N_per_V),
-                      accelerometers=Accelerometers(**_tuples(file.accelerometers)),
-                      ambient=_ambient(file.ambient), load=load if loaded else None,
-                      tolerances=_tolerances(file.tolerances), electronics=Electronics(**_tuples(file.electronics)))
+    return Halcyonics(
+        file.name,
+        plate.mass_kg,
+        Ixx,
+        Iyy,
+        Izz,
+        **lengths,
+        **stiffness,
+        k_s=tuple(each or (k_s,) * 4),
+        e=tuple(actuators.constant_N_per_V),
+        actuator_names=tuple(actuators.names),
+        reaction=ReactionMass(
+            actuators.reaction_mass_kg, actuators.reaction_damping_Ns_per_m, actuators.free_constant_N_per_V
+        ),
+        accelerometers=Accelerometers(**_tuples(file.accelerometers)),
+        ambient=_ambient(file.ambient),
+        load=load if loaded else None,
+        tolerances=_tolerances(file.tolerances),
+        electronics=Electronics(**_tuples(file.electronics)),
+    )
 
 
 def _ambient(section: AmbientSection | None) -> Ambient | None:
@@ -224,10 +270,24 @@ def _load(section: LoadSection, plate: PlateSection) -> Load:
     """Load from the totals of table 2, plate plus load (I_xx + I^e_xx) without the terms m_e L^2: see `Load`."""
     totals = np.array([section.Ixx_total_kgm2, section.Iyy_total_kgm2, section.Izz_total_kgm2])
     Ixx, Iyy, Izz = (float(value) for value in totals - plate.inertia_kgm2)
-    load = Load(section.mass_kg, section.L7_m, section.L8_m, section.L9_m, Ixx, Iyy, Izz, section.Ixy_load_kgm2,
-                section.Ixz_load_kgm2, section.Iyz_load_kgm2)
-    _check_inertia(load.inertia(), "load.Ixx_total_kgm2 .. Iyz_load_kgm2",
-                   [*totals, section.Ixy_load_kgm2, section.Ixz_load_kgm2, section.Iyz_load_kgm2], slender=True)
+    load = Load(
+        section.mass_kg,
+        section.L7_m,
+        section.L8_m,
+        section.L9_m,
+        Ixx,
+        Iyy,
+        Izz,
+        section.Ixy_load_kgm2,
+        section.Ixz_load_kgm2,
+        section.Iyz_load_kgm2,
+    )
+    _check_inertia(
+        load.inertia(),
+        "load.Ixx_total_kgm2 .. Iyz_load_kgm2",
+        [*totals, section.Ixy_load_kgm2, section.Ixz_load_kgm2, section.Iyz_load_kgm2],
+        slender=True,
+    )
     return load
 
 
@@ -240,9 +300,12 @@ def _check_inertia(J: np.ndarray, field: str, value: Any, slender: bool = False)
     moments = np.linalg.eigvalsh(J)
     slack = (1e-3 if slender else 1e-9) * moments[-1]
     if moments[0] < (-slack if slender else slack) or moments[2] > moments[0] + moments[1] + slack:
-        raise InputError("expected an inertia that a body can have (principal moments positive, none above the sum "
-                         f"of the other two); they are {np.round(moments, 6).tolist()} kg m^2", field=field,
-                         value=[float(entry) for entry in value])
+        raise InputError(
+            "expected an inertia that a body can have (principal moments positive, none above the sum "
+            f"of the other two); they are {np.round(moments, 6).tolist()} kg m^2",
+            field=field,
+            value=[float(entry) for entry in value],
+        )
 
 
 def _same_length(section: str, content: dict[str, Any], keys: tuple[str, ...]) -> None:
@@ -251,9 +314,12 @@ def _same_length(section: str, content: dict[str, Any], keys: tuple[str, ...]) -
         raise InputError("expected different names", field=f"{section}.{keys[0]}", value=names)
     for key in keys[1:]:
         if len(content[key]) != len(names):
-            raise InputError(f"expected as many entries as {section}.{keys[0]} has, which is {len(names)}; there are "
-                             f"{len(content[key])}",
-                             field=f"{section}.{key}", value=content[key])
+            raise InputError(
+                f"expected as many entries as {section}.{keys[0]} has, which is {len(names)}; there are "
+                f"{len(content[key])}",
+                field=f"{section}.{key}",
+                value=content[key],
+            )
 
 
 def _tuples(section: BaseModel) -> dict[str, Any]:

@@ -62,8 +62,9 @@ def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = 
             own = [left.pop(known) for known in (dotted, *line.parameters) if known in left]
             text += f"{line.key} = {_toml(line.value)}" + (f"  {_comment('; '.join(own))}" if own else "") + "\n"
     if left:
-        raise InputError(f"the file of the rig {rig.name} has no such line or parameter", field="comments",
-                         value=next(iter(left)))
+        raise InputError(
+            f"the file of the rig {rig.name} has no such line or parameter", field="comments", value=next(iter(left))
+        )
     return text
 
 
@@ -107,38 +108,73 @@ def _sum_for(parts: Iterable[float], bases: Iterable[float]) -> list[float]:
 def _avis_sections(rig: AvisTable) -> list[_Section]:
     sections: list[_Section] = [
         ("", "", [_Line("name", rig.name)]),
-        ("[payload]", "payload", [
-            _Line("mass_kg", rig.mass, ("mass",)), _Line("inertia_kgm2", rig.inertia[:3], INERTIA[:3]),
-            _Line("inertia_offdiagonal_kgm2", rig.inertia[3:], INERTIA[3:]),
-            _Line("centre_of_mass_m", rig.centre_of_mass, tuple(f"com_{axis}" for axis in AXES))])]
+        (
+            "[payload]",
+            "payload",
+            [
+                _Line("mass_kg", rig.mass, ("mass",)),
+                _Line("inertia_kgm2", rig.inertia[:3], INERTIA[:3]),
+                _Line("inertia_offdiagonal_kgm2", rig.inertia[3:], INERTIA[3:]),
+                _Line("centre_of_mass_m", rig.centre_of_mass, tuple(f"com_{axis}" for axis in AXES)),
+            ],
+        ),
+    ]
     for number, one in enumerate(rig.isolators, 1):
+
         def of(kind: str, number: int = number) -> tuple[str, ...]:
             return tuple(f"isolator{number}.{kind}_{axis}" for axis in AXES)
-        lines = [_Line("position_m", one.position, of("p")), _Line("stiffness_N_per_m", one.stiffness, of("k")),
-                 _Line("damping_Ns_per_m", one.damping, of("c"))]
+
+        lines = [
+            _Line("position_m", one.position, of("p")),
+            _Line("stiffness_N_per_m", one.stiffness, of("k")),
+            _Line("damping_Ns_per_m", one.damping, of("c")),
+        ]
         if any(one.chassis_offset):
             lines.append(_Line("chassis_point_m", _sum_for(one.chassis_offset, one.position)))
         sections.append(("[[isolator]]", f"isolator[{number}]", lines))
     motors, a = rig.motors, rig.acquisition
     lines = [
-        _Line("names", [m.name for m in motors]), _Line("isolator", [m.isolator for m in motors]),
+        _Line("names", [m.name for m in motors]),
+        _Line("isolator", [m.isolator for m in motors]),
         _Line("axis", [m.axis for m in motors]),
-        _Line("constant_N_per_V", [m.constant_N_per_V for m in motors], tuple(f"actuator.{m.name}" for m in motors))]
+        _Line("constant_N_per_V", [m.constant_N_per_V for m in motors], tuple(f"actuator.{m.name}" for m in motors)),
+    ]
     sections.append(("[actuators]", "actuators", [*(lines if motors else []), _Line("limit_V", rig.limit_V)]))
     sections += [("[[drive]]", f"drive[{k}]", _at_place(one)) for k, one in enumerate(rig.drives, 1)]
     if rig.geophones is not None:
-        sections.append(("[geophones]", "geophones", _plain(
-            rig.geophones, "names", "isolator", "axis", "sensitivity_Vs_per_m", "suspension_Hz", "suspension_damping",
-            "compensated_Hz", "compensated_damping", "preamplifier_gain")))
+        sections.append(
+            (
+                "[geophones]",
+                "geophones",
+                _plain(
+                    rig.geophones,
+                    "names",
+                    "isolator",
+                    "axis",
+                    "sensitivity_Vs_per_m",
+                    "suspension_Hz",
+                    "suspension_damping",
+                    "compensated_Hz",
+                    "compensated_damping",
+                    "preamplifier_gain",
+                ),
+            )
+        )
     counted: dict[str, int] = {}
     for instrument in rig.instruments:
-        kind = ("geophone" if isinstance(instrument, GeophoneAt) else "accelerometer"
-                if isinstance(instrument, AccelerometerAt) else "position_sensor")
+        kind = (
+            "geophone"
+            if isinstance(instrument, GeophoneAt)
+            else "accelerometer"
+            if isinstance(instrument, AccelerometerAt)
+            else "position_sensor"
+        )
         counted[kind] = counted.get(kind, 0) + 1
         sections.append((f"[[{kind}]]", f"{kind}[{counted[kind]}]", _at_place(instrument)))
     sections += [("[[floor_sensor]]", f"floor_sensor[{k}]", _all(one)) for k, one in enumerate(rig.floor_sensors, 1)]
-    sections.append(("[acquisition]", "acquisition",
-                     _plain(a, "sample_rate_Hz", "adc_bits", "adc_range_V", "loop_delay_s")))
+    sections.append(
+        ("[acquisition]", "acquisition", _plain(a, "sample_rate_Hz", "adc_bits", "adc_range_V", "loop_delay_s"))
+    )
     return sections + _ambient(rig.ambient) + _tolerances(rig)
 
 
@@ -148,10 +184,15 @@ def _all(thing: Any) -> list[_Line]:
 
 
 def _at_place(thing: Drive | Instrument) -> list[_Line]:
-    held = {"constant_N_per_V": (f"actuator.{thing.name}",), "position": _along("place", thing),
-            "direction": _along("direction", thing)}
-    return [replace(line, key="position_m" if line.key == "position" else line.key, parameters=held.get(line.key, ()))
-            for line in _all(thing)]
+    held = {
+        "constant_N_per_V": (f"actuator.{thing.name}",),
+        "position": _along("place", thing),
+        "direction": _along("direction", thing),
+    }
+    return [
+        replace(line, key="position_m" if line.key == "position" else line.key, parameters=held.get(line.key, ()))
+        for line in _all(thing)
+    ]
 
 
 def _along(kind: str, thing: Drive | Instrument) -> tuple[str, ...]:
@@ -167,8 +208,16 @@ def _tolerances(rig: Rig) -> list[_Section]:
 
 def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
     lengths = ("L1", "L2", "L3", "L4_plus_L5", "L6", "M2_arm", "M3_arm")
-    suspension = {"k_a": "N_per_m", "k_t": "N_per_m", "k_r": "Nm_per_rad", "d1": "Ns_per_m", "d3": "Ns_per_m",
-                  "d4": "Nms_per_rad", "d5": "Nms_per_rad", "d6": "Nms_per_rad"}
+    suspension = {
+        "k_a": "N_per_m",
+        "k_t": "N_per_m",
+        "k_r": "Nm_per_rad",
+        "d1": "Ns_per_m",
+        "d3": "Ns_per_m",
+        "d4": "Nms_per_rad",
+        "d5": "Nms_per_rad",
+        "d6": "Nms_per_rad",
+    }
     springs = [_Line("k_s_N_per_m", float(np.mean(rig.k_s)), ("k_s",))]
     if len(set(rig.k_s)) > 1:
         springs.append(_Line("k_s_each_N_per_m", rig.k_s, tuple(f"k_s{k}" for k in range(1, 5))))
@@ -176,27 +225,65 @@ def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
         springs = [_Line("k_s_N_per_m", rig.k_s[0], ("k_s", "k_s1", "k_s2", "k_s3", "k_s4"))]
     sections: list[_Section] = [
         ("", "", [_Line("name", rig.name)]),
-        ("[payload]", "payload", [
-            _Line("mass_kg", rig.mass, ("mass",)),
-            _Line("inertia_kgm2", (rig.Ixx, rig.Iyy, rig.Izz), ("Ixx", "Iyy", "Izz")),
-            *(_Line(f"{name}_m", getattr(rig, name), (name,)) for name in lengths)]),
-        ("[suspension]", "suspension", springs + [
-            _Line(f"{name}_{unit}", getattr(rig, name), (name,)) for name, unit in suspension.items()]),
-        ("[actuators]", "actuators", [
-            _Line("names", rig.actuator_names),
-            _Line("constant_N_per_V", rig.e, tuple(f"e{k}" for k in range(1, 9))),
-            _Line("reaction_mass_kg", rig.reaction.mass), _Line("reaction_damping_Ns_per_m", rig.reaction.damping),
-            _Line("free_constant_N_per_V", rig.reaction.constant_N_per_V)]),
-        ("[accelerometers]", "accelerometers", _plain(
-            rig.accelerometers, "at", "sensitivity_Vs2_per_m", "low_corner_Hz", "noise_m_per_s2_rtHz",
-            "sample_rate_Hz", "loop_delay_s", "drive_limit_V"))]
+        (
+            "[payload]",
+            "payload",
+            [
+                _Line("mass_kg", rig.mass, ("mass",)),
+                _Line("inertia_kgm2", (rig.Ixx, rig.Iyy, rig.Izz), ("Ixx", "Iyy", "Izz")),
+                *(_Line(f"{name}_m", getattr(rig, name), (name,)) for name in lengths),
+            ],
+        ),
+        (
+            "[suspension]",
+            "suspension",
+            springs + [_Line(f"{name}_{unit}", getattr(rig, name), (name,)) for name, unit in suspension.items()],
+        ),
+        (
+            "[actuators]",
+            "actuators",
+            [
+                _Line("names", rig.actuator_names),
+                _Line("constant_N_per_V", rig.e, tuple(f"e{k}" for k in range(1, 9))),
+                _Line("reaction_mass_kg", rig.reaction.mass),
+                _Line("reaction_damping_Ns_per_m", rig.reaction.damping),
+                _Line("free_constant_N_per_V", rig.reaction.constant_N_per_V),
+            ],
+        ),
+        (
+            "[accelerometers]",
+            "accelerometers",
+            _plain(
+                rig.accelerometers,
+                "at",
+                "sensitivity_Vs2_per_m",
+                "low_corner_Hz",
+                "noise_m_per_s2_rtHz",
+                "sample_rate_Hz",
+                "loop_delay_s",
+                "drive_limit_V",
+            ),
+        ),
+    ]
     if (load := rig.load) is not None:
         moments = ("Ixx", "Iyy", "Izz")
         totals = _sum_for((load.Ixx, load.Iyy, load.Izz), (rig.Ixx, rig.Iyy, rig.Izz))
-        sections.append(("[load]", "load", [
-            _Line("mass_kg", load.mass, ("load.mass",)),
-            *(_Line(f"{name}_m", getattr(load, name), (f"load.{name}",)) for name in ("L7", "L8", "L9")),
-            *(_Line(f"{name}_total_kgm2", total, (f"load.{name}",))
-              for name, total in zip(moments, totals, strict=True)),
-            *(_Line(f"{name}_load_kgm2", getattr(load, name), (f"load.{name}",)) for name in ("Ixy", "Ixz", "Iyz"))]))
+        sections.append(
+            (
+                "[load]",
+                "load",
+                [
+                    _Line("mass_kg", load.mass, ("load.mass",)),
+                    *(_Line(f"{name}_m", getattr(load, name), (f"load.{name}",)) for name in ("L7", "L8", "L9")),
+                    *(
+                        _Line(f"{name}_total_kgm2", total, (f"load.{name}",))
+                        for name, total in zip(moments, totals, strict=True)
+                    ),
+                    *(
+                        _Line(f"{name}_load_kgm2", getattr(load, name), (f"load.{name}",))
+                        for name in ("Ixy", "Ixz", "Iyz")
+                    ),
+                ],
+            )
+        )
     return sections + _ambient(rig.ambient) + _tolerances(rig)

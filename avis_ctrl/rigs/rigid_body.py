@@ -102,8 +102,17 @@ class EquationsOfMotion:
         floor_names = names if floor is None else tuple(floor)
         moved = np.ix_(keep, _indices(self.floor_coordinates, floor_names))
         square = np.ix_(keep, keep)
-        return EquationsOfMotion(self.M[square], self.C[square], self.K[square], self.C_floor[moved],
-                                 self.K_floor[moved], self.T[keep], self.actuators, names, floor_names)
+        return EquationsOfMotion(
+            self.M[square],
+            self.C[square],
+            self.K[square],
+            self.C_floor[moved],
+            self.K_floor[moved],
+            self.T[keep],
+            self.actuators,
+            names,
+            floor_names,
+        )
 
     def state_space(self, forces: bool = False) -> StateSpace:
         """State space in momentum form, which needs no derivative of the floor motion.
@@ -122,8 +131,11 @@ class EquationsOfMotion:
         B = np.vstack([carried, pushed])
         C = np.block([[np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), inverse]])
         D = np.vstack([np.zeros_like(carried), carried])
-        inputs = (*self.actuators, *(f"floor_{name}" for name in self.floor_coordinates),
-                  *(f"force_{name}" for name in self.coordinates[:n_d]))
+        inputs = (
+            *self.actuators,
+            *(f"floor_{name}" for name in self.floor_coordinates),
+            *(f"force_{name}" for name in self.coordinates[:n_d]),
+        )
         outputs = (*self.coordinates, *(f"{name}_dot" for name in self.coordinates))
         states = (*self.coordinates, *(f"p_{name}" for name in self.coordinates))
         return StateSpace(A, B, C, D, 0.0, inputs, outputs, states)

@@ -126,8 +126,13 @@ def sensing(rig: Rig, axes: Sequence[str], integrator_corner_Hz: float) -> Sensi
     decoder, filters = sensor_axes(rig, axes), conditioning(rig, integrator_corner_Hz)
     target, against = _targets(rig, integrator_corner_Hz)
     used = np.any(np.abs(decoder.decoding) > 1e-9 * np.abs(decoder.decoding).max(), axis=0)
-    return Sensing(decoder, target.system() if target else gain(1.0), against.system() if against else None,
-                   tuple(None if one.is_one else one.system() for one in filters), _noise(rig, filters, used))
+    return Sensing(
+        decoder,
+        target.system() if target else gain(1.0),
+        against.system() if against else None,
+        tuple(None if one.is_one else one.system() for one in filters),
+        _noise(rig, filters, used),
+    )
 
 
 def conditioning(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter, ...]:
@@ -155,7 +160,7 @@ def _targets(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter | None, Filt
     relative = None
     if against:
         corner = 2 * np.pi * SETTINGS.differentiator_share * rig.sample_rate_Hz
-        own = [one.poles[:len(one.poles) - len(lags)] for one in against]
+        own = [one.poles[: len(one.poles) - len(lags)] for one in against]
         slowest = min(own, key=lambda poles: abs(poles[0]) if poles else np.inf)
         poles = (*slowest, *lags, complex(-corner))
         relative = Filter((0j,), poles, float(np.prod(np.abs(poles))))
@@ -164,7 +169,7 @@ def _targets(rig: Rig, integrator_corner_Hz: float) -> tuple[Filter | None, Filt
 
 def _high_pass(sensor: Sensor, integrator_corner_Hz: float) -> tuple[complex, ...]:
     """Poles of the second-order high-pass from velocity of a sensor, including its integrator."""
-    own = sensor.poles[:len(sensor.poles) - len(sensor.low_pass)]
+    own = sensor.poles[: len(sensor.poles) - len(sensor.low_pass)]
     return own if sensor.quantity == "velocity" else (*own, complex(-2 * np.pi * integrator_corner_Hz))
 
 
@@ -179,11 +184,16 @@ def _noise(rig: Rig, filters: Sequence[Filter], used: np.ndarray) -> tuple[Noise
         own = np.array([f == one for f in filters]) & used
         largest = float(density[own].max())
         excess = len(one.poles) - len(one.zeros)
-        zeros, leading = (*one.zeros, *[complex(-nyquist)] * excess), one.leading * largest / nyquist ** excess
+        zeros, leading = (*one.zeros, *[complex(-nyquist)] * excess), one.leading * largest / nyquist**excess
         shape = gain([[largest]]) if one.is_one else Filter(zeros, one.poles, leading).system()
         share = np.where(own, density / largest if largest else 1.0, 0.0)
-        groups.append(NoiseGroup(shape, share, *(float(np.max(values[own])) / largest if largest else 0.0
-                                                 for values in (flicker, offset))))
+        groups.append(
+            NoiseGroup(
+                shape,
+                share,
+                *(float(np.max(values[own])) / largest if largest else 0.0 for values in (flicker, offset)),
+            )
+        )
     if not groups:
         raise InputError("expected sensors that measure the axes", field="sensors", value=[one.name for one in sensors])
     return tuple(groups)

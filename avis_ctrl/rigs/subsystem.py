@@ -127,10 +127,18 @@ def reduction_error(rig: Rig, keep: Sequence[str] = Z_PHIX, omega: ArrayLike | N
     n = len(keep)
     largest = [np.linalg.norm(full[:, :, part], ord=2, axis=(1, 2)) for part in (slice(None, n), slice(n, None))]
     relative = np.abs(reduced - full) / np.repeat(np.stack(largest, axis=1), n, axis=1)[:, None, :]
-    channels = [((out, inp), relative[:, i, j]) for i, out in enumerate(keep)
-                for j, inp in enumerate([*floors, *forces])]
+    channels = [
+        ((out, inp), relative[:, i, j]) for i, out in enumerate(keep) for j, inp in enumerate([*floors, *forces])
+    ]
     return ReductionError(
-        keep, (*floors, *forces), dropped, omega, reduced, full, relative,
+        keep,
+        (*floors, *forces),
+        dropped,
+        omega,
+        reduced,
+        full,
+        relative,
         response(full_rig.system, dropped, outside),
         {name: decibels(np.max(e)) for name, e in channels},
-        {name: decibels(np.sqrt(np.mean(e**2))) for name, e in channels})
+        {name: decibels(np.sqrt(np.mean(e**2))) for name, e in channels},
+    )

@@ -19,8 +19,14 @@ KILO = 1e3
 # Unit suffix of a key, with the units used by mistake: (factor to the key's unit, mistaken unit), the most likely
 # first. A key without a unit is a ratio.
 UNITS: dict[str, tuple[tuple[float, str], ...]] = {
-    "_kgm2": ((1e-4, "kg cm^2"), (1e-6, "kg mm^2"), (1e-9, "g mm^2"), (1e-7, "g cm^2"), (KILO, "t m^2"),
-              (1e-3, "g m^2")),
+    "_kgm2": (
+        (1e-4, "kg cm^2"),
+        (1e-6, "kg mm^2"),
+        (1e-9, "g mm^2"),
+        (1e-7, "g cm^2"),
+        (KILO, "t m^2"),
+        (1e-3, "g m^2"),
+    ),
     "_kg": ((1e-3, "g"), (KILO, "t"), (1e-6, "mg")),
     "_Nm_per_rad": ((KILO, "kN m/rad"), (1e-3, "N mm/rad"), (180 / np.pi, "N m/deg")),
     "_Nms_per_rad": ((KILO, "kN m s/rad"), (1e-3, "N mm s/rad"), (180 / np.pi, "N m s/deg")),
@@ -38,8 +44,11 @@ UNITS: dict[str, tuple[tuple[float, str], ...]] = {
     "_s": ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns")),
     "_m": ((1e-3, "mm"), (1e-2, "cm"), (INCH, "in"), (1e-6, "um")),
 }
-RATIOS = {"suspension_damping": ((1e-2, "per cent"),), "compensated_damping": ((1e-2, "per cent"),),
-          "preamplifier_gain": ((1e-3, "a thousand times too large"), (KILO, "a thousand times too small"))}
+RATIOS = {
+    "suspension_damping": ((1e-2, "per cent"),),
+    "compensated_damping": ((1e-2, "per cent"),),
+    "preamplifier_gain": ((1e-3, "a thousand times too large"), (KILO, "a thousand times too small")),
+}
 # Sections without properties of the table.
 APART = ("tolerances",)
 
@@ -133,8 +142,9 @@ def unit_errors(content: dict[str, Any]) -> Iterator[UnitError]:
         numbered = [k for k, part in enumerate(entry.place) if isinstance(part, int)]
         plain = tuple(part for part in entry.place if not isinstance(part, int))
         of_list = entry.place[:-1] if numbered and numbered[-1] == len(entry.place) - 1 else entry.place
-        for scope, name in enumerate((entry.place, of_list, plain, (plain[0], unit_of(entry.key)),
-                                      (unit_of(entry.key),))):
+        for scope, name in enumerate(
+            (entry.place, of_list, plain, (plain[0], unit_of(entry.key)), (unit_of(entry.key),))
+        ):
             groups.setdefault((scope, name), []).append(entry)
     seen: set[tuple[Place, ...]] = set()
     listed = {entry.place for entry in found if isinstance(entry.place[-1], int)}
@@ -158,8 +168,9 @@ def _named(scope: int, name: tuple[Any, ...], members: list[Entry]) -> tuple[str
     if scope in (1, 2):
         shown = values if scope == 1 or len(values) <= 6 else values[:3]
         return dotted(name), shown if len(shown) > 1 else shown[0]
-    keys = list(dict.fromkeys(dotted(tuple(part for part in entry.place if not isinstance(part, int)))
-                              for entry in members))
+    keys = list(
+        dict.fromkeys(dotted(tuple(part for part in entry.place if not isinstance(part, int))) for entry in members)
+    )
     shown_keys = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
     return shown_keys, values[:3] if len(values) > 1 else values[0]
 
@@ -168,8 +179,14 @@ def apart(slip: UnitError, mended: dict[str, Any]) -> float:
     """Mean squared distance, in decades, of the corrected numbers from the median of the others of their unit."""
     there = {entry.place for entry in slip.entries}
     first = slip.entries[0]
-    others = [abs(entry.value) for entry in entries(mended) if entry.place not in there and entry.value
-              and entry.place[0] == first.place[0] and unit_of(entry.key) == unit_of(first.key)]
+    others = [
+        abs(entry.value)
+        for entry in entries(mended)
+        if entry.place not in there
+        and entry.value
+        and entry.place[0] == first.place[0]
+        and unit_of(entry.key) == unit_of(first.key)
+    ]
     if not others:
         return 0.0
     middle = np.median(others)

@@ -33,16 +33,21 @@ class Criterion:
         """Limit [m/s r.m.s.] at midbands [Hz]; inf outside the bands of the criterion."""
         f = np.asarray(frequency_Hz, float)
         bands = self.midbands()
-        inside = (f > bands[0] * 10 ** -0.05) & (f < bands[-1] * 10 ** 0.05)
+        inside = (f > bands[0] * 10**-0.05) & (f < bands[-1] * 10**0.05)
         knee = self.constant_acceleration_below_Hz
         rise = np.maximum(knee / f, 1.0) if knee else np.ones(f.shape)
         return np.where(inside, self.velocity_m_per_s * rise, np.inf)
 
 
 CRITERIA: tuple[Criterion, ...] = (
-    Criterion("VC-A", 50e-6, 4.0, 8.0), Criterion("VC-B", 25e-6, 4.0, 8.0), Criterion("VC-C", 12.5e-6, 1.0),
-    Criterion("VC-D", 6.25e-6, 1.0), Criterion("VC-E", 3.12e-6, 1.0), Criterion("VC-F", 1.56e-6, 1.0),
-    Criterion("VC-G", 0.78e-6, 1.0))
+    Criterion("VC-A", 50e-6, 4.0, 8.0),
+    Criterion("VC-B", 25e-6, 4.0, 8.0),
+    Criterion("VC-C", 12.5e-6, 1.0),
+    Criterion("VC-D", 6.25e-6, 1.0),
+    Criterion("VC-E", 3.12e-6, 1.0),
+    Criterion("VC-F", 1.56e-6, 1.0),
+    Criterion("VC-G", 0.78e-6, 1.0),
+)
 
 
 @dataclass(frozen=True)
@@ -98,5 +103,11 @@ def rating(midband_Hz: np.ndarray, rms: np.ndarray) -> Rating:
     worst = int(np.argmax(v / against.limit(f)))
     judged = CRITERIA[max(best, 0)].midbands()
     missing = tuple(float(m) for m in judged if not np.any(np.abs(np.log10(f / m)) < 0.05))
-    return Rating(CRITERIA[best].name if best >= 0 else None, float(f[worst]), float(v[worst]),
-                  float(against.limit(f)[worst]), against.name, missing)
+    return Rating(
+        CRITERIA[best].name if best >= 0 else None,
+        float(f[worst]),
+        float(v[worst]),
+        float(against.limit(f)[worst]),
+        against.name,
+        missing,
+    )

@@ -59,8 +59,9 @@ class ControllerEntries:
     def controller(self, x: Array) -> StateSpace:
         """The controller with the normalised entries x."""
         n, whole = self.K.nstates, self.matrix(x)
-        return StateSpace(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], 0.0, self.K.inputs,
-                          self.K.outputs)
+        return StateSpace(
+            whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], 0.0, self.K.inputs, self.K.outputs
+        )
 
     def slope(self, whole: Array) -> Array:
         """Derivatives with respect to x from those with respect to [A B; C D]."""
@@ -106,6 +107,6 @@ def _modal(K: StateSpace) -> tuple[Array, Array, Array, Array, Array]:
     scale = np.sqrt(np.where((rows > 0) & (cols > 0), rows, 1.0) / np.where((rows > 0) & (cols > 0), cols, 1.0))
     for k in range(n - 1):
         if A[k, k + 1] * A[k + 1, k] < 0 and sizes[k] == sizes[k + 1]:
-            scale[k:k + 2] = np.sqrt(scale[k] * scale[k + 1])
+            scale[k : k + 2] = np.sqrt(scale[k] * scale[k + 1])
     rate = np.maximum(np.array(sizes), 1e-6 * max(sizes, default=1.0))
     return A / scale[:, None] * scale, B / scale[:, None], C * scale, rate, np.array(channels, int)

@@ -106,10 +106,15 @@ def disk_margin(L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0,
         poles = N.poles()
         worst = poles[np.argmax(np.abs(poles) if N.dt else poles.real)]
         raise ComputationError(
-            "the nominal loop is not stable, so it has no margin", measured=f"pole {worst:.4g}",
-            cause="the sign of K: the loop has negative feedback, u = -K y" if K is not None else
-            "the sign of the loop: it has negative feedback, 1 + L", next_step="for a K of hinfsyn or musyn, which has "
-            "u = K y, give -K" if K is not None else "give -L if its controller has u = K y")
+            "the nominal loop is not stable, so it has no margin",
+            measured=f"pole {worst:.4g}",
+            cause="the sign of K: the loop has negative feedback, u = -K y"
+            if K is not None
+            else "the sign of the loop: it has negative feedback, 1 + L",
+            next_step="for a K of hinfsyn or musyn, which has u = K y, give -K"
+            if K is not None
+            else "give -L if its controller has u = K y",
+        )
     place = np.concatenate([np.arange(w.start, w.stop) for block, w, _ in blocks.slices() if block.name in names])
     if place.size == blocks.n_w:
         return _margin(mu_peak(N, blocks, slack=slack), skew)
@@ -126,8 +131,17 @@ def _factors(name: str, n: int, skew: float) -> tuple[UncertainSystem, list[str]
 def _margin(peak: MuPeak, skew: float) -> DiskMargin:
     lower = 1 / peak.upper if peak.upper > 0 else np.inf
     low, high = _gains(lower, skew)
-    return DiskMargin(lower, 1 / peak.lower if peak.lower > 0 else np.inf, peak.omega, (low, high),
-                      _phase(low, high), peak.guaranteed, skew, peak.delta, peak)
+    return DiskMargin(
+        lower,
+        1 / peak.lower if peak.lower > 0 else np.inf,
+        peak.omega,
+        (low, high),
+        _phase(low, high),
+        peak.guaranteed,
+        skew,
+        peak.delta,
+        peak,
+    )
 
 
 def _gains(alpha: float, skew: float) -> tuple[float, float]:
@@ -156,11 +170,14 @@ def _worst_case(N: Any, blocks: BlockStructure, place: np.ndarray, skew: float, 
         left = np.ones(blocks.n_z)
         left[rows] = alpha
         return mu_peak(N.scaled(left=left), blocks, slack=slack)
+
     peak = scaled(0.0)
     if peak.upper >= 1:
-        raise ComputationError("the loop is not proved stable for all of its uncertainty, so it has no margin",
-                               measured=f"mu of the uncertainty is between {peak.lower:.4g} and {peak.upper:.4g}",
-                               next_step="reduce the uncertainty; robust_stability says by how much")
+        raise ComputationError(
+            "the loop is not proved stable for all of its uncertainty, so it has no margin",
+            measured=f"mu of the uncertainty is between {peak.lower:.4g} and {peak.upper:.4g}",
+            next_step="reduce the uncertainty; robust_stability says by how much",
+        )
     proved, unproved, alpha = 0.0, np.inf, 1.0
     counter: tuple[float, MuPeak] | None = None
     for _ in range(SETTINGS.steps):

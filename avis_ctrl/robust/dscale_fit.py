@@ -50,8 +50,9 @@ class ScalarFit:
     solves: int
 
 
-def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None = None,
-                  tolerance: float = 1e-3) -> ScalarFit:
+def fit_magnitude(
+    omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None = None, tolerance: float = 1e-3
+) -> ScalarFit:
     """Best log-Chebyshev fit of |d| at the frequencies by a d(s) of the given order.
 
     Parameters
@@ -81,11 +82,13 @@ def fit_magnitude(omega: np.ndarray, magnitude: np.ndarray, order: int, weight: 
         fitted = _spectral_factor(p, q, unit)
         problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
         return fitted, float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
+
     return ScalarFit(*bisection(best, error, attempt, tolerance))
 
 
-def bisection(best: Fitted, error: float, attempt: Callable[[float], tuple[Fitted, float] | None], tolerance: float
-              ) -> tuple[Fitted, float, float, int]:
+def bisection(
+    best: Fitted, error: float, attempt: Callable[[float], tuple[Fitted, float] | None], tolerance: float
+) -> tuple[Fitted, float, float, int]:
     """Bisection on the error of a fit, from the fit `best`: the last fit, its error, the proved bound, and the solves.
 
     attempt : function of a level, a fit with its error, or None if the level is proved infeasible.
@@ -109,8 +112,9 @@ def bisection(best: Fitted, error: float, attempt: Callable[[float], tuple[Fitte
     return best, error, lower, solves
 
 
-def _checked(omega: np.ndarray, magnitude: np.ndarray, order: int,
-             weight: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _checked(
+    omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequencies, log magnitudes and weights as float arrays."""
     omega, magnitude = np.atleast_1d(np.asarray(omega, float)), np.atleast_1d(np.asarray(magnitude, float))
     weight = np.ones(omega.size) if weight is None else np.atleast_1d(np.asarray(weight, float))
@@ -118,8 +122,11 @@ def _checked(omega: np.ndarray, magnitude: np.ndarray, order: int,
         raise InputError(f"omega {omega.shape}, magnitude {magnitude.shape} and weight {weight.shape} must be equal")
     for field, array in (("omega", omega), ("magnitude", magnitude)):
         if not np.all(np.isfinite(array) & (array > 0)):
-            raise InputError("expected positive finite numbers", field=field,
-                             value=float(array[~(np.isfinite(array) & (array > 0))][0]))
+            raise InputError(
+                "expected positive finite numbers",
+                field=field,
+                value=float(array[~(np.isfinite(array) & (array > 0))][0]),
+            )
     if not np.all((weight >= 0) & (weight <= 1)) or not np.any(weight > 0):
         raise InputError("expected weights in 0..1, not all zero", field="weight")
     if int(order) != order or order < 0:
@@ -152,8 +159,16 @@ def initial_roots(omega: np.ndarray, target: np.ndarray, order: int) -> np.ndarr
 class _Feasibility:
     """The semidefinite problem at a level t, in a basis around given roots of p and q."""
 
-    def __init__(self, y: np.ndarray, log_target: np.ndarray, weight: np.ndarray, order: int, zeros: np.ndarray,
-                 poles: np.ndarray | None = None, ratio: np.ndarray | None = None):
+    def __init__(
+        self,
+        y: np.ndarray,
+        log_target: np.ndarray,
+        weight: np.ndarray,
+        order: int,
+        zeros: np.ndarray,
+        poles: np.ndarray | None = None,
+        ratio: np.ndarray | None = None,
+    ):
         self.y, self.log_target, self.weight, self.order = y, log_target, weight, order
         self.poles = zeros if poles is None else poles
         self.e_p, self.e_q = basis_scale(zeros), basis_scale(self.poles)
@@ -173,8 +188,15 @@ class _Feasibility:
         low, high = np.min(self.y) / 100, np.max(self.y) * 100
         near_zeros, near_poles = (np.clip(np.abs(roots), low, high) for roots in (zeros, poles))
         log_ratio = np.sum(np.log(np.abs(self.y[:, None] - poles) / (self.y[:, None] + near_poles)), axis=1)
-        return _Feasibility(self.y, self.log_target, self.weight, self.order, near_zeros, near_poles,
-                            np.exp(np.maximum(log_ratio - np.max(log_ratio), -14.0)))
+        return _Feasibility(
+            self.y,
+            self.log_target,
+            self.weight,
+            self.order,
+            near_zeros,
+            near_poles,
+            np.exp(np.maximum(log_ratio - np.max(log_ratio), -14.0)),
+        )
 
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Coefficients of p and q, ascending in y, or None if the level is infeasible."""
@@ -256,17 +278,24 @@ def maximise_last(A: sp.csc_matrix, b: np.ndarray, cones: list[Any]) -> np.ndarr
     cost[-1] = -1.0
     solution = clarabel.DefaultSolver(sp.csc_matrix((size, size)), cost, A, b, cones, settings).solve()
     if solution.status not in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved):
-        raise ComputationError("the semidefinite program of a scaling was not solved", measured=str(solution.status),
-                               cause="magnitudes or weights spanning too many decades", next_step="a lower order")
+        raise ComputationError(
+            "the semidefinite program of a scaling was not solved",
+            measured=str(solution.status),
+            cause="magnitudes or weights spanning too many decades",
+            next_step="a lower order",
+        )
     return np.asarray(solution.x)
 
 
 def _spectral_factor(p: np.ndarray, q: np.ndarray, unit: float) -> ScalarScaling:
     """d(s) with |d(j omega)|^2 = p / q at y = (omega / unit)^2, all roots in the left half plane."""
     if not p[-1] / q[-1] > 0:
-        raise ComputationError("a positive polynomial came out of the fit with a leading coefficient below zero",
-                               measured=f"{p[-1]:.3g} over {q[-1]:.3g}", cause="frequencies spanning too many decades",
-                               next_step="a lower order or a narrower band")
+        raise ComputationError(
+            "a positive polynomial came out of the fit with a leading coefficient below zero",
+            measured=f"{p[-1]:.3g} over {q[-1]:.3g}",
+            cause="frequencies spanning too many decades",
+            next_step="a lower order or a narrower band",
+        )
     return ScalarScaling.from_roots(float(np.sqrt(p[-1] / q[-1])), stable_roots(p) * unit, stable_roots(q) * unit)
 
 
@@ -274,7 +303,10 @@ def stable_roots(polynomial: np.ndarray) -> np.ndarray:
     """The left half plane roots s of p(-s^2), for p ascending in y = -s^2 and positive on y >= 0."""
     y = np.roots(polynomial[::-1])
     if np.any((np.abs(y.imag) <= 1e-12 * np.abs(y)) & (y.real >= 0)):
-        raise ComputationError("a positive polynomial came out of factorisation with a root on the axis",
-                               measured=f"y = {y[y.real >= 0][0]:.3g}", cause="frequencies spanning too many decades",
-                               next_step="a lower order or a narrower band")
+        raise ComputationError(
+            "a positive polynomial came out of factorisation with a root on the axis",
+            measured=f"y = {y[y.real >= 0][0]:.3g}",
+            cause="frequencies spanning too many decades",
+            next_step="a lower order or a narrower band",
+        )
     return -np.sqrt(-y.astype(complex))

@@ -51,8 +51,9 @@ class HermitianFit:
     solves: int
 
 
-def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndarray | None = None,
-                  tolerance: float = 1e-2) -> HermitianFit:
+def fit_hermitian(
+    omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndarray | None = None, tolerance: float = 1e-2
+) -> HermitianFit:
     """Log-Chebyshev fit of X (n_omega, n, n) at omega [rad/s] by D^H D, where D has n * degree states.
 
     weight (n_omega,) in 0..1; the bisection ends when error and bound differ by at most the tolerance.
@@ -71,11 +72,13 @@ def fit_hermitian(omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndar
             return None
         candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
         return candidate, _error(candidate, omega, X, weight)
+
     return HermitianFit(*bisection(best, _error(best, omega, X, weight), attempt, tolerance))
 
 
-def _checked(omega: np.ndarray, X: np.ndarray, degree: int,
-             weight: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _checked(
+    omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     omega, X = np.atleast_1d(np.asarray(omega, float)), np.asarray(X, complex)
     weight = np.ones(omega.size) if weight is None else np.asarray(weight, float)
     if X.ndim != 3 or X.shape[1] != X.shape[2] or omega.shape != (X.shape[0],) or weight.shape != omega.shape:
@@ -121,10 +124,10 @@ class _Feasibility:
         n = X.shape[1]
         spread = np.log(np.linalg.eigvalsh(X)) / 2
         e = basis_scale(initial_roots(omega, spread[:, -1] + np.sum(np.abs(spread), axis=1), degree))
-        log_scale = np.log(np.polyval(e[::-1], omega ** 2))
-        rows_q, gram_q = half_line_rows(omega ** 2, log_scale, e)
+        log_scale = np.log(np.polyval(e[::-1], omega**2))
+        rows_q, gram_q = half_line_rows(omega**2, log_scale, e)
         power = np.arange(degree + 1)
-        v = 1j ** power * np.exp(0.5 * np.log(e) + np.log(omega)[:, None] * power - 0.5 * log_scale[:, None])
+        v = 1j**power * np.exp(0.5 * np.log(e) + np.log(omega)[:, None] * power - 0.5 * log_scale[:, None])
         # X = L L^H; the constraints are expressed in coordinates where X is the identity.
         inverse = np.linalg.inv(np.linalg.cholesky(X))
         V = np.kron(v[:, None, :], np.eye(n))  # (n_omega, n, n (m + 1))
@@ -136,8 +139,16 @@ class _Feasibility:
         product = product * np.where(i == j, 0.5, 1 / np.sqrt(2.0))[None, :, None, None]
         rows_P = np.swapaxes(_real_vectors(product), 1, 2)
         identity = _real_vectors(np.eye(n)[None, None])[0, 0]
-        return _Feasibility(n, weight, e, rows_P, rows_q, gram_q, identity,
-                            POSITIVITY_MARGIN * _real_vectors((W @ np.conj(np.swapaxes(W, 1, 2)))[:, None])[:, 0])
+        return _Feasibility(
+            n,
+            weight,
+            e,
+            rows_P,
+            rows_q,
+            gram_q,
+            identity,
+            POSITIVITY_MARGIN * _real_vectors((W @ np.conj(np.swapaxes(W, 1, 2)))[:, None])[:, 0],
+        )
 
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Gram matrix of P and coefficients of q in the scaled basis, or None if the level is infeasible."""
@@ -151,8 +162,9 @@ class _Feasibility:
         upper = np.concatenate([inverse_t * P, -q, s], axis=2).reshape(-1, P.shape[2] + q.shape[2] + 1)
         lower = np.concatenate([-P, inverse_t * q, s], axis=2).reshape(-1, P.shape[2] + q.shape[2] + 1)
         margin, unit = self.margin_P[kept], POSITIVITY_MARGIN * self.identity
-        bound = np.concatenate([(unit - inverse_t[:, :, 0] * margin).ravel(),
-                                (margin - inverse_t[:, :, 0] * unit).ravel()])
+        bound = np.concatenate(
+            [(unit - inverse_t[:, :, 0] * margin).ravel(), (margin - inverse_t[:, :, 0] * unit).ravel()]
+        )
         n_P, n_q = P.shape[2], q.shape[2]
         normal = np.r_[np.zeros(n_P), np.mean(self.rows_q[kept], axis=0), 0.0][None, :]
         cones = [clarabel.ZeroConeT(1)] + [gram_cone(2 * self.size)] * (2 * kept.size)
@@ -164,8 +176,10 @@ class _Feasibility:
         gram = np.zeros((self.size * self.e.size,) * 2)
         i, j = triangle(gram.shape[0])
         gram[i, j] = gram[j, i] = x[:n_P] * np.where(i == j, 1.0, 1 / np.sqrt(2.0))
-        return (gram + POSITIVITY_MARGIN * np.eye(gram.shape[0]),
-                half_line_coefficients(x[n_P:-1], self.gram_q, self.e))
+        return (
+            gram + POSITIVITY_MARGIN * np.eye(gram.shape[0]),
+            half_line_coefficients(x[n_P:-1], self.gram_q, self.e),
+        )
 
 
 def _real_vectors(H: np.ndarray) -> np.ndarray:
@@ -195,13 +209,16 @@ def _spectral_factor(gram: np.ndarray, q: np.ndarray, e: np.ndarray, unit: float
     T = np.kron(T, np.eye(n))
     W = T.T @ gram @ T / q[-1]
     A, B = np.kron(A, np.eye(n)), np.kron(B, np.eye(n))
-    Q, S, R = W[:n * degree, :n * degree], W[:n * degree, n * degree:], W[n * degree:, n * degree:]
+    Q, S, R = W[: n * degree, : n * degree], W[: n * degree, n * degree :], W[n * degree :, n * degree :]
     try:
         X = la.solve_continuous_are(A, B, Q, R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ComputationError("the spectral factorisation of a matrix scaling failed", cause=str(error),
-                               measured=f"condition of the direct term {np.linalg.cond(R):.1e}",
-                               next_step="a lower degree") from error
+        raise ComputationError(
+            "the spectral factorisation of a matrix scaling failed",
+            cause=str(error),
+            measured=f"condition of the direct term {np.linalg.cond(R):.1e}",
+            next_step="a lower degree",
+        ) from error
     half = la.cholesky(R)
     C = half @ np.linalg.solve(R, B.T @ X + S.T)
     return StateSpace(A * unit, B * np.sqrt(unit), C * np.sqrt(unit), half)

@@ -111,8 +111,15 @@ class PointwiseScalings:
 
         def both(one: np.ndarray, two: np.ndarray) -> np.ndarray:
             return np.concatenate([one, two])[order]
-        return replace(self, omega=both(self.omega, omega), M=both(self.M, M), mu=both(self.mu, more.mu),
-                       log_d=both(self.log_d, more.log_d), X={k: both(X, more.X[k]) for k, X in self.X.items()})
+
+        return replace(
+            self,
+            omega=both(self.omega, omega),
+            M=both(self.M, M),
+            mu=both(self.mu, more.mu),
+            log_d=both(self.log_d, more.log_d),
+            X={k: both(X, more.X[k]) for k, X in self.X.items()},
+        )
 
 
 @dataclass(frozen=True)
@@ -144,8 +151,14 @@ def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[DSt
             yield _evaluated(points, scalings)
 
 
-def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors: Sequence[float] = (BROAD_FLOOR,),
-            allowed_cost: float = 0.01, max_states: int = 60) -> Iterator[DStep]:
+def d_steps(
+    points: PointwiseScalings,
+    loop: StateSpace,
+    start: Scalings,
+    floors: Sequence[float] = (BROAD_FLOOR,),
+    allowed_cost: float = 0.01,
+    max_states: int = 60,
+) -> Iterator[DStep]:
     """Scalings of the loop N(s) chosen on the grid and checked between its points: peaks there are added to the grid.
 
     For each floor two fits are generated: a new fit, and one continued from `start`, the scalings of the last K-step.
@@ -161,16 +174,18 @@ def d_steps(points: PointwiseScalings, loop: StateSpace, start: Scalings, floors
                 return
 
 
-def tightened(points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float,
-              max_states: int) -> DStep:
+def tightened(
+    points: PointwiseScalings, loop: StateSpace, start: Scalings, allowed_cost: float, max_states: int
+) -> DStep:
     """Scalings continued from `start` that lower only the peak of the scaled loop N(s), not its values below."""
     points = replace(points, floor=1.0)
     step = _from_start(points, start, allowed_cost, max_states)
     return _settled(points, loop, step, start, allowed_cost, max_states)
 
 
-def _settled(points: PointwiseScalings, loop: StateSpace, step: DStep, start: Scalings, allowed_cost: float,
-             max_states: int) -> DStep:
+def _settled(
+    points: PointwiseScalings, loop: StateSpace, step: DStep, start: Scalings, allowed_cost: float, max_states: int
+) -> DStep:
     """The step corrected until there are no peaks between grid points, or `start` if that costs less."""
     dense = np.geomspace(points.omega[0], points.omega[-1], CHECKED_POINTS)
     response = loop.frequency_response(dense)
@@ -186,8 +201,9 @@ def _settled(points: PointwiseScalings, loop: StateSpace, step: DStep, start: Sc
     return min(measured, first, key=lambda found: found.cost)
 
 
-def _measured(points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, response: np.ndarray,
-              scalings: Scalings) -> tuple[DStep, np.ndarray, np.ndarray]:
+def _measured(
+    points: PointwiseScalings, loop: StateSpace, dense: np.ndarray, response: np.ndarray, scalings: Scalings
+) -> tuple[DStep, np.ndarray, np.ndarray]:
     """The step with peak and cost also between grid points, and the frequencies and M where these exceed the grid."""
     step = _evaluated(points, scalings)
     # Lightly damped roots cause the narrowest peaks that scalings can add.
@@ -227,13 +243,16 @@ def _raised_orders(points: PointwiseScalings, best: DStep, allowed_cost: float, 
         if not np.any(contribution > 0):
             break
         most = np.max(contribution)
-        candidates = (_raised(points, best, np.flatnonzero(contribution >= part * most), max_states, by, matrices)
-                      # Matrices last: their scalar factors usually suffice, and are refined jointly with the rest.
-                      for matrices in (False, True)
-                      # One more order may not help where two do: a resonance needs a pair of roots.
-                      for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2)))
-        better = next((new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)),
-                      None)
+        candidates = (
+            _raised(points, best, np.flatnonzero(contribution >= part * most), max_states, by, matrices)
+            # Matrices last: their scalar factors usually suffice, and are refined jointly with the rest.
+            for matrices in (False, True)
+            # One more order may not help where two do: a resonance needs a pair of roots.
+            for part, by in ((0.4, 1), (0.4, 2), (0.999, 1), (0.999, 2))
+        )
+        better = next(
+            (new for new in candidates if new is not None and new.cost < max(0.9 * best.cost, allowed_cost)), None
+        )
         if better is None:
             break
         best = better
@@ -280,8 +299,9 @@ def _groups(points: PointwiseScalings) -> tuple[int, ...]:
     return (*hierarchy.fcluster(tree, GROUPS.groups, "maxclust").tolist(), 0)
 
 
-def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_states: int, by: int,
-            matrices: bool) -> DStep | None:
+def _raised(
+    points: PointwiseScalings, step: DStep, groups: np.ndarray, max_states: int, by: int, matrices: bool
+) -> DStep | None:
     """The step with some groups refitted at a higher order and everything refined; None if the order is not allowed.
 
     matrices : raise the orders of the matrices of repeated blocks, instead of those of their scalar factors.
@@ -314,8 +334,9 @@ def _raised(points: PointwiseScalings, step: DStep, groups: np.ndarray, max_stat
     return _evaluated(points, _refined(points, scalings))
 
 
-def _fitted(points: PointwiseScalings, scalings: Scalings, blocks: tuple[int, ...], order: int,
-            weights: np.ndarray) -> list[Part]:
+def _fitted(
+    points: PointwiseScalings, scalings: Scalings, blocks: tuple[int, ...], order: int, weights: np.ndarray
+) -> list[Part]:
     """The blocks of a group with d(s) fitted to their best scalings at each frequency; `weights` (n_omega, n_blocks)
     are the cost of a misfit."""
     weights = weights[:, blocks]
@@ -328,8 +349,10 @@ def _fitted(points: PointwiseScalings, scalings: Scalings, blocks: tuple[int, ..
     common = np.average(target - own, axis=1, weights=weights)
     fit = fit_magnitude(points.omega, np.exp(common), order, np.max(weights, axis=1), FIT_TOLERANCE)
     theta = fit.scaling.within(band_of(points.omega)).theta
-    return [scalings.parts[k].with_scalar(ScalarScaling(np.r_[theta[0] + gain, theta[1:]]))
-            for k, gain in zip(blocks, own, strict=True)]
+    return [
+        scalings.parts[k].with_scalar(ScalarScaling(np.r_[theta[0] + gain, theta[1:]]))
+        for k, gain in zip(blocks, own, strict=True)
+    ]
 
 
 def _closeness(points: PointwiseScalings) -> np.ndarray:
@@ -342,8 +365,13 @@ def _sensitivities(points: PointwiseScalings, scalings: Scalings) -> np.ndarray:
     """(n_omega, n_blocks) cost of a misfit: closeness to the peak times the contribution to the singular vectors."""
     left, right = scalings.response(points.omega)
     U, _, Vh = np.linalg.svd(left @ points.M @ right)
-    contribution = np.stack([np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
-                             for _, w, z in points.structure.slices()], axis=1)
+    contribution = np.stack(
+        [
+            np.sum(np.abs(U[:, z, 0]) ** 2, axis=1) + np.sum(np.abs(Vh[:, 0, w]) ** 2, axis=1)
+            for _, w, z in points.structure.slices()
+        ],
+        axis=1,
+    )
     # A block that is not part of a loop does not contribute.
     relative = contribution / np.maximum(np.max(contribution, axis=0), np.finfo(float).tiny)
     weight = _closeness(points)[:, None] * np.maximum(relative, 1e-2)
@@ -381,8 +409,9 @@ def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> S
     values, slopes = _linearised(points, scalings)
     level = float(np.max(values))
     for _ in range(steps):
-        move, predicted = _trust_step(values, slopes, np.maximum(box[:, 0] - theta, -radius),
-                                      np.minimum(box[:, 1] - theta, radius))
+        move, predicted = _trust_step(
+            values, slopes, np.maximum(box[:, 0] - theta, -radius), np.minimum(box[:, 1] - theta, radius)
+        )
         if level - predicted < REFINEMENT or radius < 1e-3:
             break
         trial = with_parameters(scalings, theta + move)
@@ -413,11 +442,15 @@ def _linearised(points: PointwiseScalings, scalings: Scalings, kept: int = 3) ->
     return (log_s - log_ref[:, None])[at, which], slopes
 
 
-def _trust_step(values: np.ndarray, slopes: np.ndarray, low: np.ndarray,
-                high: np.ndarray) -> tuple[np.ndarray, float]:
+def _trust_step(values: np.ndarray, slopes: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
     """Move (n_theta,) between low and high that minimises the largest linearised value, and that value."""
     n = slopes.shape[1]
     cost = np.r_[np.zeros(n), 1.0]
-    program = so.linprog(cost, A_ub=np.hstack([slopes, -np.ones((values.size, 1))]), b_ub=-values,
-                         bounds=[*zip(low, high, strict=True), (None, None)], method="highs-ds")
+    program = so.linprog(
+        cost,
+        A_ub=np.hstack([slopes, -np.ones((values.size, 1))]),
+        b_ub=-values,
+        bounds=[*zip(low, high, strict=True), (None, None)],
+        method="highs-ds",
+    )
     return (program.x[:n], float(program.x[n])) if program.status == 0 else (np.zeros(n), float(np.max(values)))

@@ -65,9 +65,11 @@ def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpa
     if task.decentralised:
         K = _diagonal_part(K)
         if not lft_lower(task.P, K).is_stable():
-            raise ComputationError("the diagonal part of the full controller does not stabilise the plant",
-                                   cause="the axes are too strongly coupled for loops of their own",
-                                   next_step="choose other coordinates for u and y")
+            raise ComputationError(
+                "the diagonal part of the full controller does not stabilise the plant",
+                cause="the axes are too strongly coupled for loops of their own",
+                next_step="choose other coordinates for u and y",
+            )
     if K.nstates > order:
         omega = frequency_grid(lft_lower(task.P, K))
         K = reduce_controller(task.P, K, lambda one: task.peak(one, omega), SETTINGS.free, range(order, K.nstates)).K
@@ -79,8 +81,9 @@ def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpa
     starts = [K, *(one for one in others if one.nstates <= order and lft_lower(task.P, one).is_stable())]
     best = min((task.descended(one, task.settings.sharpness[:1]) for one in starts), key=lambda one: one.peak)
     # An added mode may not help, or even make the loop unstable; then the controller without it is kept.
-    best = min(task.descended(_lengthened(task, best.K, order), task.settings.sharpness[1:]), best,
-               key=lambda one: one.peak)
+    best = min(
+        task.descended(_lengthened(task, best.K, order), task.settings.sharpness[1:]), best, key=lambda one: one.peak
+    )
     yield best
     while (step := _exchanged(task, best.K, order)).peak < (1 - SETTINGS.worth) * best.peak:
         yield (best := step)
@@ -92,13 +95,15 @@ def _shortened(task: Task, K: StateSpace, order: int) -> Iterator[Step]:
     while K.nstates > order:
         shorter, peak = _shorter(task, K, order)
         if not peak <= (1 + SETTINGS.costly) * task.peak(K, frequency_grid(lft_lower(task.P, K))):
-            yield (step := task.descended(K, task.settings.sharpness[:SETTINGS.passing]))
+            yield (step := task.descended(K, task.settings.sharpness[: SETTINGS.passing]))
             shorter, peak = _shorter(task, step.K, order)
         if not np.isfinite(peak):
-            raise ComputationError(f"no controller of order {order} to start from",
-                                   measured=f"at order {K.nstates} every mode is needed for stability",
-                                   cause="the plant needs more states to be stabilised",
-                                   next_step="ask for a higher order")
+            raise ComputationError(
+                f"no controller of order {order} to start from",
+                measured=f"at order {K.nstates} every mode is needed for stability",
+                cause="the plant needs more states to be stabilised",
+                next_step="ask for a higher order",
+            )
         K = shorter
     yield Step(K, peak)
 
@@ -107,7 +112,7 @@ def _lengthened(task: Task, K: StateSpace, order: int) -> StateSpace:
     """Add modes to K up to an order, each where it lowers the smoothed peak most, with descent after each."""
     while K.nstates < order:
         K = with_mode(task, K, order - K.nstates)
-        K = task.descended(K, task.settings.sharpness[:SETTINGS.passing]).K
+        K = task.descended(K, task.settings.sharpness[: SETTINGS.passing]).K
     return K
 
 
@@ -154,6 +159,7 @@ def _without_one_mode(K: StateSpace) -> list[StateSpace]:
 
         def other(re: float, im: float, pole: complex = pole) -> bool:
             return abs(complex(re, abs(im)) - pole) > SETTINGS.same_pole * abs(pole)
+
         kept, gone = split(K, other)
         if gone.nstates:
             fewer.append(kept)
@@ -174,14 +180,17 @@ def with_mode(task: Task, K: StateSpace, most: int) -> StateSpace:
     lowest, highest = np.min(omega[omega > 0]), np.max(omega)
     natural = np.geomspace(lowest, highest, int(np.ceil(SETTINGS.per_decade * np.log10(highest / lowest))) + 1)
     dampings = (None, *SETTINGS.damping) if most > 1 else (None,)
-    _, wn, added = max((_best_mode(K, wn, zeta, omega, G, task.decentralised) for wn in natural for zeta in dampings),
-                       key=lambda one: one[0])
+    _, wn, added = max(
+        (_best_mode(K, wn, zeta, omega, G, task.decentralised) for wn in natural for zeta in dampings),
+        key=lambda one: one[0],
+    )
     gain, own = (np.linalg.norm(one.frequency_response(np.array([wn])), 2, (1, 2)) for one in (K, added))
     return K + replace(added, C=added.C * SETTINGS.small * gain / own)
 
 
-def _best_mode(K: StateSpace, wn: float, zeta: float | None, omega: Array, G: Array, decentralised: bool
-               ) -> tuple[float, float, StateSpace]:
+def _best_mode(
+    K: StateSpace, wn: float, zeta: float | None, omega: Array, G: Array, decentralised: bool
+) -> tuple[float, float, StateSpace]:
     """Decrease of the smoothed peak by a mode of unit r.m.s. value, its natural frequency, and the mode itself."""
     # The first state is the output; a mode with two states has one input per numerator.
     A = np.array([[-wn]] if zeta is None else [[-2 * zeta * wn, wn], [-wn, 0.0]])
@@ -193,5 +202,8 @@ def _best_mode(K: StateSpace, wn: float, zeta: float | None, omega: Array, G: Ar
         D *= np.eye(K.noutputs)
     U, s, Vh = np.linalg.svd(np.concatenate(list(D), axis=1))
     v = Vh[0].reshape(len(A), K.ninputs)
-    return s[0], wn, StateSpace(A, B / size @ v, -U[:, :1] @ np.eye(1, len(A)), np.zeros_like(K.D), 0.0, K.inputs,
-                                K.outputs)
+    return (
+        s[0],
+        wn,
+        StateSpace(A, B / size @ v, -U[:, :1] @ np.eye(1, len(A)), np.zeros_like(K.D), 0.0, K.inputs, K.outputs),
+    )

@@ -35,7 +35,7 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
 def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf, damping: float = 0.4) -> np.ndarray:
     """Resonance frequencies [rad/s] of modes with a damping ratio below `damping`, and points half a bandwidth away."""
     light = poles[(poles.imag > 0) & (np.abs(poles.real) < damping * np.abs(poles))]
-    centre = np.sqrt(np.maximum(np.abs(light) ** 2 - 2 * light.real ** 2, 0.0))
+    centre = np.sqrt(np.maximum(np.abs(light) ** 2 - 2 * light.real**2, 0.0))
     points = np.concatenate([centre, centre + light.real, centre - light.real])
     return points[(points > low) & (points < high)]
 

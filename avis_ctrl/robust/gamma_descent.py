@@ -52,8 +52,19 @@ class ScaledProblem:
         """Normal form of the scaled plant, with extra channels if D12 or D21 is rank deficient."""
         S = scalings.scale(self.P)
         w, z = S.ninputs - self.ncon, S.noutputs - self.nmeas
-        plant = Plant(S.A, S.B[:, :w], S.B[:, w:], S.C[:z], S.C[z:], S.D[:z, :w], S.D[:z, w:], S.D[z:, :w], S.D[z:, w:],
-                      S.inputs[w:], S.outputs[z:])
+        plant = Plant(
+            S.A,
+            S.B[:, :w],
+            S.B[:, w:],
+            S.C[:z],
+            S.C[z:],
+            S.D[:z, :w],
+            S.D[:z, w:],
+            S.D[z:, :w],
+            S.D[z:, w:],
+            S.inputs[w:],
+            S.outputs[z:],
+        )
         return normal_form(regularised(plant, REGULARISATION, *self.singular, False) if any(self.singular) else plant)
 
     def reaches(self, scalings: Scalings, gamma: float) -> bool:
@@ -87,8 +98,9 @@ def with_parameters(scalings: Scalings, theta: np.ndarray) -> Scalings:
     return scalings
 
 
-def gamma_and_gradient(problem: ScaledProblem, scalings: Scalings,
-                       hint: float | None = None) -> tuple[float, np.ndarray]:
+def gamma_and_gradient(
+    problem: ScaledProblem, scalings: Scalings, hint: float | None = None
+) -> tuple[float, np.ndarray]:
     """gamma(theta), d log gamma / d theta (n_theta,); ComputationError if rho(X Y) does not determine the optimum."""
     slope, gamma, of_gamma = _coupling(problem, scalings, hint)
     theta = parameters(scalings)
@@ -106,8 +118,12 @@ def _coupling(problem: ScaledProblem, scalings: Scalings, hint: float | None) ->
     plant = problem.normal(scalings).plant
     bracket = find_gamma(plant, GAMMA_TOLERANCE, hint)
     if COUPLED not in bracket.limited_by:
-        raise ComputationError("gamma has no gradient here", cause=f"it is limited by {bracket.limited_by}",
-                               measured=f"gamma = {bracket.upper.gamma:.6g}", next_step="fit D and iterate on K")
+        raise ComputationError(
+            "gamma has no gradient here",
+            cause=f"it is limited by {bracket.limited_by}",
+            measured=f"gamma = {bracket.upper.gamma:.6g}",
+            next_step="fit D and iterate on K",
+        )
     gamma = bracket.upper.gamma
     slope = _CouplingSlope.of(plant, bracket)
     return slope, gamma, slope.along(plant, gamma * (1 + STEP)) / (gamma * STEP) - 2 * slope.rho / gamma
@@ -143,15 +159,25 @@ class _CouplingSlope:
     def along(self, plant: Plant, gamma: float) -> float:
         """First-order change of rho(X Y) from the present plant and gamma to the given ones."""
         total = 0.0
-        for X, L, here, there in ((self.X, self.L_x, self.control, control_riccati(plant, gamma)),
-                                  (self.Y, self.L_y, self.filter, filter_riccati(plant, gamma))):
+        for X, L, here, there in (
+            (self.X, self.L_x, self.control, control_riccati(plant, gamma)),
+            (self.Y, self.L_y, self.filter, filter_riccati(plant, gamma)),
+        ):
             dA, dR, dQ = (new - old for new, old in zip(there, here, strict=True))
             total += 2 * np.sum((L @ X) * dA.T) + np.sum((X @ L @ X) * dR) + np.sum(L * dQ)
         return float(total)
 
 
-def descend(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float], *,
-            evaluations: int = 40, tolerance: float = 1e-3) -> Descent:
+def descend(
+    P: StateSpace,
+    nmeas: int,
+    ncon: int,
+    scalings: Scalings,
+    band: tuple[float, float],
+    *,
+    evaluations: int = 40,
+    tolerance: float = 1e-3,
+) -> Descent:
     """Quasi-Newton descent (BFGS with bounds) on log gamma over the parameters of the scalar scalings.
 
     P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`.
@@ -217,8 +243,15 @@ def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
     return V @ H @ V.T + np.outer(s, s) / curvature
 
 
-def with_added_pairs(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, band: tuple[float, float],
-                     max_states: int, fraction: float = 0.5) -> Scalings | None:
+def with_added_pairs(
+    P: StateSpace,
+    nmeas: int,
+    ncon: int,
+    scalings: Scalings,
+    band: tuple[float, float],
+    max_states: int,
+    fraction: float = 0.5,
+) -> Scalings | None:
     """The scalings with one more zero-pole pair in the blocks, and at the frequencies, where gamma is most sensitive.
 
     A zero and a pole that cancel change nothing, but gamma has a slope with respect to their distance. Pairs are tried
@@ -229,8 +262,12 @@ def with_added_pairs(P: StateSpace, nmeas: int, ncon: int, scalings: Scalings, b
     places = np.geomspace(*band, max(3, int(2 * np.log10(band[1] / band[0]))))[1:-1]
     room = max_states - scalings.added_states
     blocks = scalings.structure.blocks
-    free = [group for group in scalings.members if scalings.parts[group[0]].scalar.order < MAX_ORDER
-            and sum(blocks[k].rows + blocks[k].cols for k in group) <= room]
+    free = [
+        group
+        for group in scalings.members
+        if scalings.parts[group[0]].scalar.order < MAX_ORDER
+        and sum(blocks[k].rows + blocks[k].cols for k in group) <= room
+    ]
     if not free:
         return None
     slopes = np.array([_neutral_slopes(problem, scalings, free, place) for place in places])
@@ -257,8 +294,9 @@ def _with_pair(scalings: Scalings, group: tuple[int, ...], place: float, split: 
     return scalings
 
 
-def _neutral_slopes(problem: ScaledProblem, scalings: Scalings, free: list[tuple[int, ...]], place: float
-                    ) -> np.ndarray:
+def _neutral_slopes(
+    problem: ScaledProblem, scalings: Scalings, free: list[tuple[int, ...]], place: float
+) -> np.ndarray:
     """d log gamma / d split of a neutral pair at a frequency, for each group of blocks."""
     base = scalings
     for group in free:

@@ -70,8 +70,10 @@ def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> HinfLowerB
         poles = np.abs(plant.sample_points())
         omega = np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)
     best = HinfLowerBound(parrott_at_infinity(plant), complex(np.inf), "directions free at infinite frequency")
-    for s, source in [*((1j * w, "directions free at one frequency") for w in omega),
-                      *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant))]:
+    for s, source in [
+        *((1j * w, "directions free at one frequency") for w in omega),
+        *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant)),
+    ]:
         value = pointwise(plant, s, at_zero=s.real > 0)
         if value > best.gamma:
             best = HinfLowerBound(value, complex(s), source)

@@ -92,8 +92,14 @@ def _balanced(plant: Plant) -> Plant:
         return plant
     U, s, Vt = la.svd((x * np.sqrt(lx)).T @ (y * np.sqrt(ly)))
     T, T_inverse = (y * np.sqrt(ly)) @ Vt.T / np.sqrt(s), (U / np.sqrt(s)).T @ (x * np.sqrt(lx)).T
-    return replace(plant, A=T_inverse @ plant.A @ T, B1=T_inverse @ plant.B1, B2=T_inverse @ plant.B2,
-                   C1=plant.C1 @ T, C2=plant.C2 @ T)
+    return replace(
+        plant,
+        A=T_inverse @ plant.A @ T,
+        B1=T_inverse @ plant.B1,
+        B2=T_inverse @ plant.B2,
+        C1=plant.C1 @ T,
+        C2=plant.C2 @ T,
+    )
 
 
 def _scaled(plant: Plant, size: float) -> Plant:
@@ -101,8 +107,19 @@ def _scaled(plant: Plant, size: float) -> Plant:
     poles = np.abs(la.eigvals(plant.A)) if plant.n else np.ones(1)
     rate = float(np.exp(np.mean(np.log(np.maximum(poles, 1e-3 * max(np.max(poles), 1e-12))))))
     root, half = np.sqrt(rate), np.sqrt(size)
-    return Plant(plant.A / rate, plant.B1 / root / half, plant.B2 / root, plant.C1 / root / half, plant.C2 / root,
-                 plant.D11 / size, plant.D12 / half, plant.D21 / half, plant.D22, plant.u, plant.y)
+    return Plant(
+        plant.A / rate,
+        plant.B1 / root / half,
+        plant.B2 / root,
+        plant.C1 / root / half,
+        plant.C2 / root,
+        plant.D11 / size,
+        plant.D12 / half,
+        plant.D21 / half,
+        plant.D22,
+        plant.u,
+        plant.y,
+    )
 
 
 def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float], str]:
@@ -115,9 +132,13 @@ def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float],
     for A, B1, C1, D11, outer in _sides(plant):
         X = cp.Variable((n, n), symmetric=True)
         p, m = D11.shape
-        inner = cp.bmat([[A @ X + X @ A.T, X @ C1.T, B1], [C1 @ X, -gamma * np.eye(p), D11],
-                         [B1.T, D11.T, -gamma * np.eye(m)]]) if n else cp.bmat(
-                             [[-gamma * np.eye(p), D11], [D11.T, -gamma * np.eye(m)]])
+        inner = (
+            cp.bmat(
+                [[A @ X + X @ A.T, X @ C1.T, B1], [C1 @ X, -gamma * np.eye(p), D11], [B1.T, D11.T, -gamma * np.eye(m)]]
+            )
+            if n
+            else cp.bmat([[-gamma * np.eye(p), D11], [D11.T, -gamma * np.eye(m)]])
+        )
         projected = outer.T @ inner @ outer
         constraints.append((projected + projected.T) / 2 << 0)
         variables.append(X)
@@ -130,11 +151,19 @@ def _optimum(plant: Plant) -> tuple[np.ndarray, np.ndarray, tuple[float, float],
             warnings.simplefilter("ignore", UserWarning)
             problem.solve(solver=cp.CLARABEL)
     except cp.SolverError as error:
-        raise ComputationError("the linear matrix inequalities were not solved", measured=str(error),
-                               cause="a badly scaled plant", next_step="use the Riccati method") from error
+        raise ComputationError(
+            "the linear matrix inequalities were not solved",
+            measured=str(error),
+            cause="a badly scaled plant",
+            next_step="use the Riccati method",
+        ) from error
     if gamma.value is None:
-        raise ComputationError("the linear matrix inequalities have no solution", measured=problem.status,
-                               cause="a badly scaled plant", next_step="use the Riccati method")
+        raise ComputationError(
+            "the linear matrix inequalities have no solution",
+            measured=problem.status,
+            cause="a badly scaled plant",
+            next_step="use the Riccati method",
+        )
     R, S = (np.asarray(X.value) if n else np.zeros((0, 0)) for X in variables)
     dual = _dual_value(plant, [np.asarray(one.dual_value) for one in constraints])
     return R, S, (dual, float(gamma.value)), str(problem.status)
@@ -146,27 +175,28 @@ def _dual_value(plant: Plant, multipliers: list[np.ndarray]) -> float:
     for (_, B1, _, D11, N), Z in zip(_sides(plant), multipliers[:2], strict=True):
         p, m, n = *D11.shape, plant.n
         fixed = np.zeros((n + p + m, n + p + m))
-        fixed[:n, n + p:], fixed[n:n + p, n + p:] = B1, D11
+        fixed[:n, n + p :], fixed[n : n + p, n + p :] = B1, D11
         spread = N @ Z @ N.T
         constant += float(np.sum((fixed + fixed.T) * spread))
         weight += float(np.trace(spread[n:, n:]))
     if plant.n:
-        constant -= 2 * float(np.trace(multipliers[2][:plant.n, plant.n:]))
+        constant -= 2 * float(np.trace(multipliers[2][: plant.n, plant.n :]))
     return max(constant / weight, 0.0) if weight > 0 else 0.0
 
 
 def _sides(plant: Plant) -> list[tuple[np.ndarray, ...]]:
     """(A, B1, C1, D11, N) of the inequality of R, and of that of S, which is the same for the transposed plant."""
     sides: list[tuple[np.ndarray, ...]] = []
-    for A, B1, C1, D11, B2, D12 in ((plant.A, plant.B1, plant.C1, plant.D11, plant.B2, plant.D12),
-                                    (plant.A.T, plant.C1.T, plant.B1.T, plant.D11.T, plant.C2.T, plant.D21.T)):
+    for A, B1, C1, D11, B2, D12 in (
+        (plant.A, plant.B1, plant.C1, plant.D11, plant.B2, plant.D12),
+        (plant.A.T, plant.C1.T, plant.B1.T, plant.D11.T, plant.C2.T, plant.D21.T),
+    ):
         kernel = la.null_space(np.hstack([B2.T, D12.T]))
         sides.append((A, B1, C1, D11, la.block_diag(kernel, np.eye(D11.shape[1]))))
     return sides
 
 
-def certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float
-              ) -> tuple[float, float, np.ndarray, np.ndarray]:
+def certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float) -> tuple[float, float, np.ndarray, np.ndarray]:
     """Smallest gamma, from that of the solver upwards, at which the inequalities are verified; largest eigenvalue;
     the R and S of this verification."""
     coupling = la.eigvalsh(np.block([[R, np.eye(plant.n)], [np.eye(plant.n), S]])) if plant.n else np.ones(1)
@@ -179,8 +209,9 @@ def certified(plant: Plant, R: np.ndarray, S: np.ndarray, gamma: float
         worst = -np.inf
         for (A, B1, C1, D11, N), X in zip(_sides(plant), (R, S), strict=True):
             p, m = D11.shape
-            inner = np.block([[A @ X + X @ A.T, X @ C1.T, B1], [C1 @ X, -level * np.eye(p), D11],
-                              [B1.T, D11.T, -level * np.eye(m)]])
+            inner = np.block(
+                [[A @ X + X @ A.T, X @ C1.T, B1], [C1 @ X, -level * np.eye(p), D11], [B1.T, D11.T, -level * np.eye(m)]]
+            )
             worst = max(worst, float(la.eigvalsh(N.T @ inner @ N)[-1]))
         if worst <= 0:
             return level, worst / max(level, 1e-300), R, S

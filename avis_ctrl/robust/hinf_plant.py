@@ -44,8 +44,19 @@ class Plant:
         """Balance P (w, u -> z, y) and split it by its last nmeas outputs and last ncon inputs."""
         P = balance(P)
         w, z = P.ninputs - ncon, P.noutputs - nmeas
-        return Plant(P.A, P.B[:, :w], P.B[:, w:], P.C[:z], P.C[z:], P.D[:z, :w], P.D[:z, w:], P.D[z:, :w],
-                     P.D[z:, w:], P.inputs[w:], P.outputs[z:])
+        return Plant(
+            P.A,
+            P.B[:, :w],
+            P.B[:, w:],
+            P.C[:z],
+            P.C[z:],
+            P.D[:z, :w],
+            P.D[:z, w:],
+            P.D[z:, :w],
+            P.D[z:, w:],
+            P.inputs[w:],
+            P.outputs[z:],
+        )
 
     @property
     def n(self) -> int:
@@ -80,21 +91,28 @@ def as_plant(P: Any, nmeas: int, ncon: int) -> StateSpace:
         if not hasattr(P, "A") and not hasattr(P, "num"):
             raise InputError("expected an avis_ctrl or python-control StateSpace", field="P", value=type(P).__name__)
         P = StateSpace.from_control(P)
-    for field, count, total, what in (("nmeas", nmeas, P.noutputs, "outputs (z, y)"),
-                                      ("ncon", ncon, P.ninputs, "inputs (w, u)")):
+    for field, count, total, what in (
+        ("nmeas", nmeas, P.noutputs, "outputs (z, y)"),
+        ("ncon", ncon, P.ninputs, "inputs (w, u)"),
+    ):
         if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
             raise InputError("expected a whole number of at least 1", field=field, value=count)
         if count >= total:
-            raise InputError(f"expected less than {total}: the plant has {total} {what} and one must be left "
-                             "for the performance channel", field=field, value=count)
+            raise InputError(
+                f"expected less than {total}: the plant has {total} {what} and one must be left "
+                "for the performance channel",
+                field=field,
+                value=count,
+            )
     return P
 
 
 def check_stabilisable(plant: Plant) -> None:
     """Raise ComputationError if an unstable mode, which is named, is uncontrollable or unobservable (PBH test)."""
     for A, B, names, verb, who in (
-            (plant.A, plant.B2, plant.u, "not moved by any of the inputs", "an actuator or input"),
-            (plant.A.T, plant.C2.T, plant.y, "not seen by any of the measurements", "a sensor")):
+        (plant.A, plant.B2, plant.u, "not moved by any of the inputs", "an actuator or input"),
+        (plant.A.T, plant.C2.T, plant.y, "not seen by any of the measurements", "a sensor"),
+    ):
         for pole in np.unique(la.eigvals(A)) if plant.n else ():
             size = la.norm(np.hstack([A, B]), 2)
             if pole.imag < 0 or pole.real < -1e-15 * size:
@@ -104,9 +122,10 @@ def check_stabilisable(plant: Plant) -> None:
                 raise ComputationError(
                     f"mode at {abs(pole.imag) / (2 * np.pi):.4g} Hz is {verb} {list(names)}: no controller exists",
                     measured=f"pole {pole.real:.4g} {pole.imag:+.4g}j rad/s, rank margin {margin:.1e} "
-                             f"of the PBH matrix (at least {SETTINGS.pbh_tolerance:.0e} is needed)",
+                    f"of the PBH matrix (at least {SETTINGS.pbh_tolerance:.0e} is needed)",
                     cause="an integrator or unstable weight outside the loop, or a missing channel",
-                    next_step=f"make the mode stable, or give {who} that reaches it")
+                    next_step=f"make the mode stable, or give {who} that reaches it",
+                )
 
 
 def posed_plant(P: StateSpace, nmeas: int, ncon: int) -> Plant:
@@ -159,9 +178,17 @@ def normal_form(plant: Plant) -> NormalForm:
     Q, S = np.hstack([U[:, m2:], U[:, :m2]]), Vt.T / s
     V, t, Wt = la.svd(plant.D21)
     W, T = np.hstack([Wt[p2:].T, Wt[:p2].T]), (V / t).T
-    normal = replace(plant, B1=plant.B1 @ W, B2=plant.B2 @ S, C1=Q.T @ plant.C1, C2=T @ plant.C2,
-                     D11=Q.T @ plant.D11 @ W, D12=Q.T @ plant.D12 @ S, D21=T @ plant.D21 @ W,
-                     D22=np.zeros_like(plant.D22))
+    normal = replace(
+        plant,
+        B1=plant.B1 @ W,
+        B2=plant.B2 @ S,
+        C1=Q.T @ plant.C1,
+        C2=T @ plant.C2,
+        D11=Q.T @ plant.D11 @ W,
+        D12=Q.T @ plant.D12 @ S,
+        D21=T @ plant.D21 @ W,
+        D22=np.zeros_like(plant.D22),
+    )
     return NormalForm(normal, S, T, plant.D22)
 
 
@@ -176,8 +203,14 @@ def in_usual_units(plant: Plant) -> Plant:
     No bound depends on the units of u and y, but a rank test relative to the largest channel would.
     """
     of_u, of_y = channel_scales(plant)
-    return replace(plant, B2=plant.B2 / of_u, D12=plant.D12 / of_u, C2=plant.C2 / of_y[:, None],
-                   D21=plant.D21 / of_y[:, None], D22=plant.D22 / of_u / of_y[:, None])
+    return replace(
+        plant,
+        B2=plant.B2 / of_u,
+        D12=plant.D12 / of_u,
+        C2=plant.C2 / of_y[:, None],
+        D21=plant.D21 / of_y[:, None],
+        D22=plant.D22 / of_u / of_y[:, None],
+    )
 
 
 def rank_margins(plant: Plant) -> tuple[float, float]:
@@ -192,6 +225,7 @@ def rank_margins(plant: Plant) -> tuple[float, float]:
         if D.shape[0] < D.shape[1] or np.any(length <= SETTINGS.no_column * sizes):
             return 0.0
         return float(la.svdvals(D / length)[-1])
+
     return margin(plant.D12, of_u), margin(plant.D21.T, of_y)
 
 
@@ -253,8 +287,10 @@ def pointwise(plant: Plant, s: complex, at_zero: bool = False) -> float:
     x1, x2 = (np.linalg.solve(resolvent, B) if plant.n else np.zeros(B.shape) for B in (plant.B1, plant.B2))
     P12, P21 = plant.C1 @ x2 + plant.D12, plant.C2 @ x1 + plant.D21
     bases = []
-    for rows, noise in ((P12.conj().T, _rounding(plant.C1, R, resolvent, plant.B2, x2, plant.D12).T),
-                        (P21, _rounding(plant.C2, R, resolvent, plant.B1, x1, plant.D21))):
+    for rows, noise in (
+        (P12.conj().T, _rounding(plant.C1, R, resolvent, plant.B2, x2, plant.D12).T),
+        (P21, _rounding(plant.C2, R, resolvent, plant.B1, x1, plant.D21)),
+    ):
         basis = _kernel_at_zero(rows, noise) if at_zero else _known_kernel(rows, noise)
         if basis is None:
             return 0.0
@@ -262,8 +298,9 @@ def pointwise(plant: Plant, s: complex, at_zero: bool = False) -> float:
     return parrott(plant.C1 @ x1 + plant.D11, *bases)
 
 
-def _rounding(C: np.ndarray, R: np.ndarray, resolvent: np.ndarray, B: np.ndarray, x: np.ndarray, D: np.ndarray
-              ) -> np.ndarray:
+def _rounding(
+    C: np.ndarray, R: np.ndarray, resolvent: np.ndarray, B: np.ndarray, x: np.ndarray, D: np.ndarray
+) -> np.ndarray:
     """Bound of the round-off in the entries of C x + D, x = R B (Higham 2002, section 7.2)."""
     of_x = np.abs(R) @ (np.abs(resolvent) @ np.abs(x) + np.abs(B))
     return (len(R) + 1) * np.finfo(float).eps * (np.abs(C) @ (np.abs(x) + of_x) + np.abs(D))
@@ -295,4 +332,4 @@ def _kernel(rows: np.ndarray, least: float) -> np.ndarray:
     if not len(rows):
         return np.eye(rows.shape[1])
     _, s, Vh = la.svd(rows)
-    return Vh[int(np.sum(s > least)):].conj().T
+    return Vh[int(np.sum(s > least)) :].conj().T

@@ -66,7 +66,7 @@ def direct_term_bound(plant: Plant) -> float:
     """Lower bound of gamma from infinite frequency (Parrott's theorem on D11)."""
     m2, p2 = plant.D12.shape[1], plant.D21.shape[0]
     p, m = plant.D11.shape
-    top, left = plant.D11[:p - m2, :], plant.D11[:, :m - p2]
+    top, left = plant.D11[: p - m2, :], plant.D11[:, : m - p2]
     return float(max(la.norm(top, 2) if top.size else 0.0, la.norm(left, 2) if left.size else 0.0))
 
 
@@ -81,21 +81,33 @@ def gamma_test(plant: Plant, gamma: float) -> GammaTest:
         except (np.linalg.LinAlgError, ValueError) as error:
             return GammaTest(gamma, False, f"the Riccati equation is singular ({error})")
         if found.X is None:
-            return GammaTest(gamma, False, f"{name} Riccati equation: {found.reason}",
-                             forbidden=_forbidden(plant, gamma, found.omega))
+            return GammaTest(
+                gamma,
+                False,
+                f"{name} Riccati equation: {found.reason}",
+                forbidden=_forbidden(plant, gamma, found.omega),
+            )
         if not found.semidefinite:
-            return GammaTest(gamma, False, f"{name} Riccati equation: {letter} is not positive semidefinite",
-                             forbidden=gamma)
+            return GammaTest(
+                gamma, False, f"{name} Riccati equation: {letter} is not positive semidefinite", forbidden=gamma
+            )
         solutions.append(found)
     x, y = solutions
     assert x.X is not None and y.X is not None
-    coupling = float(np.max(la.eigvals(x.X @ y.X).real, initial=0.0)) / gamma ** 2
+    coupling = float(np.max(la.eigvals(x.X @ y.X).real, initial=0.0)) / gamma**2
     doubtful = x.doubtful or y.doubtful
     if coupling < 1:
         return GammaTest(gamma, True, "", coupling, x.X, y.X, doubtful=doubtful)
     certain = not doubtful and _coupled_for_certain(plant, gamma, x.X, y.X)
-    return GammaTest(gamma, False, "control and filter together: rho(X Y) is not below gamma^2", coupling, x.X, y.X,
-                     forbidden=gamma if certain else 0.0)
+    return GammaTest(
+        gamma,
+        False,
+        "control and filter together: rho(X Y) is not below gamma^2",
+        coupling,
+        x.X,
+        y.X,
+        forbidden=gamma if certain else 0.0,
+    )
 
 
 def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
@@ -106,8 +118,10 @@ def _forbidden(plant: Plant, gamma: float, omega: np.ndarray) -> float:
 
 def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarray) -> bool:
     """Whether rho(X Y) of the refined X and Y exceeds gamma^2 by more than its first-order error."""
-    of_x, of_y = (refined_balanced(*control_riccati(one, gamma), solution, rounding(one, gamma))
-                  for one, solution in ((plant, X), (_dual(plant), Y)))
+    of_x, of_y = (
+        refined_balanced(*control_riccati(one, gamma), solution, rounding(one, gamma))
+        for one, solution in ((plant, X), (_dual(plant), Y))
+    )
     if of_x is None or of_y is None:
         return False
     (X, E_x), (Y, E_y) = of_x, of_y
@@ -115,7 +129,7 @@ def _coupled_for_certain(plant: Plant, gamma: float, X: np.ndarray, Y: np.ndarra
     r = vectors[:, int(np.argmax(values.real))].real
     # Y r is the left eigenvector of X Y.
     rho, q = float(np.max(values.real)), Y @ r
-    return bool(q @ r > 0 and rho - (q @ E_x @ q + rho * r @ E_y @ r) / (q @ r) > gamma ** 2)
+    return bool(q @ r > 0 and rho - (q @ E_x @ q + rho * r @ E_y @ r) / (q @ r) > gamma**2)
 
 
 def norm_is_confirmed(plant: Plant, test: GammaTest) -> bool:
@@ -124,15 +138,20 @@ def norm_is_confirmed(plant: Plant, test: GammaTest) -> bool:
     form = NormalForm(plant, np.eye(m2), np.eye(p2), np.zeros((p2, m2)))
     try:
         K = central_controller(form, test)
-        P = StateSpace(plant.A, np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2]),
-                       np.block([[plant.D11, plant.D12], [plant.D21, plant.D22]]))
+        P = StateSpace(
+            plant.A,
+            np.hstack([plant.B1, plant.B2]),
+            np.vstack([plant.C1, plant.C2]),
+            np.block([[plant.D11, plant.D12], [plant.D21, plant.D22]]),
+        )
         return norm_is_below(lft_lower(P, balance(K)), test.gamma * (1 + SETTINGS.norm_accuracy))
     except (ComputationError, InputError, np.linalg.LinAlgError):
         return False
 
 
-def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit: float = 1e10,
-               proved: bool = True) -> GammaBracket:
+def find_gamma(
+    plant: Plant, tolerance: float, hint: float | None = None, limit: float = 1e10, proved: bool = True
+) -> GammaBracket:
     """Bracket the optimum to a relative tolerance: geometric steps, then regula falsi on rho(X Y), or bisection.
 
     proved : search for a proved lower bound if the test is in doubt just below the optimum.
@@ -145,9 +164,13 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
     step, factor, largest = start, 1.05 if hint else 4.0, limit * max(start, natural)
     while not search.try_gamma(step):
         if step >= largest:
-            raise ComputationError("no controller was found at any gamma", measured=f"gamma up to {step:.3g} tried",
-                                   cause=search.reason, next_step="check weights and scaling of the plant")
-        step, factor = min(step * factor, largest), factor ** 2
+            raise ComputationError(
+                "no controller was found at any gamma",
+                measured=f"gamma up to {step:.3g} tried",
+                cause=search.reason,
+                next_step="check weights and scaling of the plant",
+            )
+        step, factor = min(step * factor, largest), factor**2
     assert search.upper is not None
     factor = 1.05 if hint else 4.0
     while search.failed <= max(floor, 0.0) and search.upper.gamma > nothing:
@@ -157,14 +180,13 @@ def find_gamma(plant: Plant, tolerance: float, hint: float | None = None, limit:
             if step == 0.0 or search.upper.gamma <= step * (1 + tolerance / 4):
                 break
         search.try_gamma(step)
-        factor = min(factor ** 2, 1e3)
+        factor = min(factor**2, 1e3)
     if search.upper.gamma <= 100 * nothing:
         return GammaBracket(0.0, search.upper, "nothing: the optimum is zero to working precision", search.tests)
     search.refine(tolerance, nothing)
     if proved:
         search.prove(tolerance)
-    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests,
-                        search.failed)
+    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests, search.failed)
 
 
 class _Search:
@@ -249,17 +271,17 @@ def central_controller(form: NormalForm, test: GammaTest) -> StateSpace:
     Dc, Rt = _column_terms(P, gamma)
     F = -np.linalg.solve(R, D1.T @ P.C1 + B.T @ X)
     L = -np.linalg.solve(Rt, Dc @ P.B1.T + C @ Y).T
-    F12, F2 = F[m1:m1 + p2], F[m1 + p2:]
-    L12, L2 = L[:, p1:p1 + m2], L[:, p1 + m2:]
+    F12, F2 = F[m1 : m1 + p2], F[m1 + p2 :]
+    L12, L2 = L[:, p1 : p1 + m2], L[:, p1 + m2 :]
     D1111, D1112 = P.D11[:p1, :m1], P.D11[:p1, m1:]
     D1121, D1122 = P.D11[p1:, :m1], P.D11[p1:, m1:]
-    D = -D1121 @ D1111.T @ np.linalg.solve(gamma ** 2 * np.eye(p1) - D1111 @ D1111.T, D1112) - D1122
-    left = np.eye(m2) - D1121 @ np.linalg.solve(gamma ** 2 * np.eye(m1) - D1111.T @ D1111, D1121.T)
-    right = np.eye(p2) - D1112.T @ np.linalg.solve(gamma ** 2 * np.eye(p1) - D1111 @ D1111.T, D1112)
+    D = -D1121 @ D1111.T @ np.linalg.solve(gamma**2 * np.eye(p1) - D1111 @ D1111.T, D1112) - D1122
+    left = np.eye(m2) - D1121 @ np.linalg.solve(gamma**2 * np.eye(m1) - D1111.T @ D1111, D1121.T)
+    right = np.eye(p2) - D1112.T @ np.linalg.solve(gamma**2 * np.eye(p1) - D1111 @ D1111.T, D1112)
     D = D + _off_centre(form, D, left, right, gamma)
     inner = P.C2 + F12
     # Z = inv(I - Y X / gamma^2); the controller's states are chosen so that Z appears only in its input matrix.
-    B_hat = np.linalg.solve(np.eye(P.n) - Y @ X / gamma ** 2, (P.B2 + L12) @ D - L2)
+    B_hat = np.linalg.solve(np.eye(P.n) - Y @ X / gamma**2, (P.B2 + L12) @ D - L2)
     C_hat = F2 - D @ inner
     A_hat = P.A + B @ F - B_hat @ inner
     return _restored(form, A_hat, B_hat, C_hat, D)
@@ -285,14 +307,23 @@ def _restored(form: NormalForm, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: 
     direct = form.T @ form.D22 @ form.S
     loop = np.eye(D.shape[0]) + D @ direct
     if np.linalg.cond(loop) > 1e12:
-        raise ComputationError("the controller's loop around D22 is not well posed",
-                               measured=f"condition of I + D_K D22 is {np.linalg.cond(loop):.1e}",
-                               cause="a direct term from u to y that cancels the controller's own",
-                               next_step="put a low-pass filter in the plant's actuators or sensors")
+        raise ComputationError(
+            "the controller's loop around D22 is not well posed",
+            measured=f"condition of I + D_K D22 is {np.linalg.cond(loop):.1e}",
+            cause="a direct term from u to y that cancels the controller's own",
+            next_step="put a low-pass filter in the plant's actuators or sensors",
+        )
     M = np.linalg.inv(loop)
     C, D = M @ C, M @ D
-    return StateSpace(A - B @ direct @ C, B @ (np.eye(B.shape[1]) - direct @ D) @ form.T, form.S @ C,
-                      form.S @ D @ form.T, 0.0, form.plant.y, form.plant.u)
+    return StateSpace(
+        A - B @ direct @ C,
+        B @ (np.eye(B.shape[1]) - direct @ D) @ form.T,
+        form.S @ C,
+        form.S @ D @ form.T,
+        0.0,
+        form.plant.y,
+        form.plant.u,
+    )
 
 
 def _row_terms(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray]:
@@ -300,7 +331,7 @@ def _row_terms(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray]:
     D1 = np.hstack([P.D11, P.D12])
     R = D1.T @ D1
     w = P.D11.shape[1]
-    R[:w, :w] -= gamma ** 2 * np.eye(w)
+    R[:w, :w] -= gamma**2 * np.eye(w)
     return D1, R
 
 
@@ -319,7 +350,7 @@ def control_riccati(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.
     D1, R = _row_terms(P, gamma)
     B = np.hstack([P.B1, P.B2])
     solved = np.linalg.solve(R, np.hstack([D1.T @ P.C1, B.T]))
-    K, G = solved[:, :P.n], solved[:, P.n:]
+    K, G = solved[:, : P.n], solved[:, P.n :]
     quadratic, constant = -B @ G, _difference(P.C1.T @ P.C1, P.C1.T @ D1, K)
     return _difference(P.A, B, K), (quadratic + quadratic.T) / 2, (constant + constant.T) / 2
 
@@ -331,11 +362,11 @@ def rounding(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray
     w = P.D11.shape[1]
     # |R| is bounded by the sum of its terms, because R is a difference, too.
     terms = d.T @ d
-    terms[:w, :w] += gamma ** 2 * np.eye(w)
+    terms[:w, :w] += gamma**2 * np.eye(w)
     right = np.hstack([d.T @ c, B.T])
     inverse = np.abs(np.linalg.inv(R))
     solved = inverse @ (terms @ np.abs(np.linalg.solve(R, np.hstack([D1.T @ P.C1, np.hstack([P.B1, P.B2]).T]))) + right)
-    K, G = solved[:, :P.n], solved[:, P.n:]
+    K, G = solved[:, : P.n], solved[:, P.n :]
     size = np.abs(P.A) + B @ K, B @ G, c.T @ c + c.T @ d @ K
     return tuple(ROUND_OFF * one for one in size)
 

@@ -22,22 +22,8 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import sampled_image
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
-from avis_ctrl.robust.hinf_plant import (
-    NormalForm,
-    Plant,
-    as_plant,
-    normal_form,
-    posed_plant,
-    rank_margins,
-    regularised,
-)
-from avis_ctrl.robust.hinf_riccati import (
-    GammaBracket,
-    central_controller,
-    find_gamma,
-    gamma_test,
-    natural_gamma,
-)
+from avis_ctrl.robust.hinf_plant import NormalForm, Plant, as_plant, normal_form, posed_plant, rank_margins, regularised
+from avis_ctrl.robust.hinf_riccati import GammaBracket, central_controller, find_gamma, gamma_test, natural_gamma
 from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.reduction import residualise_fast
 from avis_ctrl.robust.riccati import INACCURATE, ON_AXIS
@@ -48,12 +34,18 @@ class Status(Enum):
     """Outcome of a synthesis; the value is the diagnosis."""
 
     OPTIMAL = "the optimum is bracketed and the closed loop was measured below its target"
-    REGULARISED = ("the problem is singular: small extra channels were added; the closed loop measured is that "
-                   "of the plant without them")
-    BACKED_OFF = ("the closed loop missed its target at the requested back-off, which was raised: this usually "
-                  "means a badly scaled plant or a nearly singular D12 or D21")
-    WIDE = ("the optimum lies between the bounds, which are further apart than requested: between them the Riccati "
-            "test is undecided")
+    REGULARISED = (
+        "the problem is singular: small extra channels were added; the closed loop measured is that "
+        "of the plant without them"
+    )
+    BACKED_OFF = (
+        "the closed loop missed its target at the requested back-off, which was raised: this usually "
+        "means a badly scaled plant or a nearly singular D12 or D21"
+    )
+    WIDE = (
+        "the optimum lies between the bounds, which are further apart than requested: between them the Riccati "
+        "test is undecided"
+    )
     UNPROVED = "the optimum was found to the tolerance; no lower bound of it was computed"
     SUBOPTIMAL = "a controller at the requested gamma; the optimum was not computed"
 
@@ -88,9 +80,18 @@ class Synthesis(Shown):
         return float(np.max(np.abs(poles) - 1 if self.closed_loop.dt else poles.real, initial=-np.inf))
 
 
-def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: float = 1e-3,
-            method: Literal["riccati", "lmi"] = "riccati", sample_rate_Hz: float | None = None,
-            gamma_hint: float | None = None, far_poles: Literal["kept", "gain"] = "kept") -> Synthesis:
+def hinfsyn(
+    P: Any,
+    nmeas: int,
+    ncon: int,
+    *,
+    backoff: float = 0.01,
+    tolerance: float = 1e-3,
+    method: Literal["riccati", "lmi"] = "riccati",
+    sample_rate_Hz: float | None = None,
+    gamma_hint: float | None = None,
+    far_poles: Literal["kept", "gain"] = "kept",
+) -> Synthesis:
     """H-infinity optimal controller, `backoff` above the optimum.
 
     Parameters
@@ -134,8 +135,9 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
 
         optimum = lmi_gamma(P, nmeas, ncon)
         bounds, doubt = (optimum.lower, optimum.upper), (UNCERTIFIED,) if optimum.violation > 0 else ()
-    result, raised = problem.realise(form, bounds[1] if not notes else bracket.upper.gamma, backoff,
-                                     far_poles == "gain")
+    result, raised = problem.realise(
+        form, bounds[1] if not notes else bracket.upper.gamma, backoff, far_poles == "gain"
+    )
     if notes and method != "lmi":
         # Extra channels only make the problem harder: a gamma that fails with them may be feasible without them.
         bounds = pointwise_bound(problem.plant).gamma, result.gamma
@@ -149,20 +151,27 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, backoff: float = 0.01, tolerance: 
     else:
         notes = (*notes, *_doubt_of_gamma(P, result))
     rate = _rate_note(result, sample_rate_Hz)
-    return replace(result, gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])), status=status,
-                   limited_by=bracket.limited_by, notes=(*notes, *doubt, *result.notes, *rate))
+    return replace(
+        result,
+        gamma_optimal_bounds=(float(bounds[0]), float(bounds[1])),
+        status=status,
+        limited_by=bracket.limited_by,
+        notes=(*notes, *doubt, *result.notes, *rate),
+    )
 
 
-def hinf_controller(P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None,
-                    tolerance: float = 1e-3) -> Synthesis:
+def hinf_controller(
+    P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None, tolerance: float = 1e-3
+) -> Synthesis:
     """The controller of `hinfsyn` with the same parameters, without a lower bound of the optimum; for iterations."""
     problem = _Problem.of(as_plant(P, nmeas, ncon), nmeas, ncon)
     form, bracket, notes = problem.solve(tolerance, gamma_hint, proved=False)
     result, raised = problem.realise(form, bracket.upper.gamma, backoff, False)
     # With extra channels, or if the target was missed, only the measured gamma is known to be feasible.
     upper = result.gamma if notes or raised else min(bracket.upper.gamma, result.gamma)
-    return replace(result, gamma_optimal_bounds=(0.0, upper), status=Status.UNPROVED,
-                   notes=(*notes, raised) if raised else notes)
+    return replace(
+        result, gamma_optimal_bounds=(0.0, upper), status=Status.UNPROVED, notes=(*notes, raised) if raised else notes
+    )
 
 
 def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
@@ -181,14 +190,20 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
         form, notes = problem.form(*problem.singular, 1e-5, of_states=True)
         test = gamma_test(form.plant, gamma)
     if not test.feasible:
-        raise ComputationError(f"no controller reaches gamma = {gamma:.6g}", cause=test.reason,
-                               measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}", next_step="ask for a larger gamma")
+        raise ComputationError(
+            f"no controller reaches gamma = {gamma:.6g}",
+            cause=test.reason,
+            measured=f"rho(XY)/gamma^2 = {test.coupling:.4g}",
+            next_step="ask for a larger gamma",
+        )
     result = problem.measured(central_controller(form, test))
     if result.gamma > gamma * (1 + SETTINGS.loop_accuracy):
-        raise ComputationError(f"the controller for gamma = {gamma:.6g} was not confirmed",
-                               measured=f"closed-loop norm {result.gamma:.6g}",
-                               cause="gamma too near the optimum for double precision, or a badly scaled plant",
-                               next_step="ask for a larger gamma")
+        raise ComputationError(
+            f"the controller for gamma = {gamma:.6g} was not confirmed",
+            measured=f"closed-loop norm {result.gamma:.6g}",
+            cause="gamma too near the optimum for double precision, or a badly scaled plant",
+            next_step="ask for a larger gamma",
+        )
     return replace(result, gamma_optimal_bounds=(0.0, gamma), status=Status.SUBOPTIMAL, notes=notes)
 
 
@@ -206,26 +221,31 @@ class _Problem:
         of_u, of_y = rank_margins(plant)
         return _Problem(P, plant, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
 
-    def form(self, of_D12: bool, of_D21: bool, epsilon: float, of_states: bool = False) -> tuple[NormalForm,
-                                                                                                 tuple[str, ...]]:
+    def form(
+        self, of_D12: bool, of_D21: bool, epsilon: float, of_states: bool = False
+    ) -> tuple[NormalForm, tuple[str, ...]]:
         """Normal form, regularised as requested, with a note about the regularisation."""
         if not (of_D12 or of_D21 or of_states):
             return normal_form(self.plant), ()
         reasons = []
         if of_D12:
-            reasons.append(f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised "
-                        "at infinite frequency")
+            reasons.append(
+                f"D12 has not full column rank: not every control {list(self.plant.u)} is penalised "
+                "at infinite frequency"
+            )
         if of_D21:
-            reasons.append(f"D21 has not full row rank: not every measurement {list(self.plant.y)} is noisy "
-                        "at infinite frequency")
+            reasons.append(
+                f"D21 has not full row rank: not every measurement {list(self.plant.y)} is noisy at infinite frequency"
+            )
         if of_states:
             reasons.append("a zero of u -> z or w -> y lies on, or too near, the imaginary axis or infinity")
         extra = f"; extra channels of relative size {epsilon:.0e} were added for the synthesis alone"
         plant = regularised(self.plant, epsilon, of_D12, of_D21, of_states)
         return normal_form(plant), ("; ".join(reasons) + extra,)
 
-    def solve(self, tolerance: float, hint: float | None,
-              proved: bool = True) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
+    def solve(
+        self, tolerance: float, hint: float | None, proved: bool = True
+    ) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
         """Bracket of the optimum; extra channels are reduced until a further reduction gains less than one per cent."""
         if not any(self.singular):
             form, _ = self.form(False, False, 0.0)
@@ -252,8 +272,9 @@ class _Problem:
             raise failure or ComputationError("no controller was found")
         return best
 
-    def _regularised(self, epsilon: float, tolerance: float, hint: float | None,
-                     proved: bool) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
+    def _regularised(
+        self, epsilon: float, tolerance: float, hint: float | None, proved: bool
+    ) -> tuple[NormalForm, GammaBracket, tuple[str, ...]]:
         """Bracket with extra channels on u and y as needed, and on the states if these do not suffice."""
         for of_states in (False, True) if any(self.singular) else (True,):
             form, notes = self.form(*self.singular, epsilon, of_states)
@@ -267,7 +288,7 @@ class _Problem:
         """The first controller above the optimum whose measured norm meets its target; a note if the back-off grew."""
         best: Synthesis | None = None
         for k in range(12):
-            margin = backoff * 2.0 ** k if backoff > 0 else 1e-6 * 4.0 ** k
+            margin = backoff * 2.0**k if backoff > 0 else 1e-6 * 4.0**k
             target = (1 + (margin if k or backoff > 0 else 0.0)) * gamma
             test = gamma_test(form.plant, target)
             if not test.feasible:
@@ -282,10 +303,12 @@ class _Problem:
                 note = f"the back-off was raised from {100 * backoff:.3g} % to {100 * margin:.3g} %" if k else ""
                 return self._slower(form, result, gamma, target) if slow else result, note
         if best is None or not np.isfinite(best.gamma):
-            raise ComputationError("no controller's closed loop was measured to be stable",
-                                   measured=f"gamma from {gamma:.4g} upwards tried",
-                                   cause="the plant is too badly scaled or conditioned for double precision",
-                                   next_step="rescale signals, or raise the smallest weights")
+            raise ComputationError(
+                "no controller's closed loop was measured to be stable",
+                measured=f"gamma from {gamma:.4g} upwards tried",
+                cause="the plant is too badly scaled or conditioned for double precision",
+                next_step="rescale signals, or raise the smallest weights",
+            )
         return best, f"no back-off was confirmed; the best measured is {best.gamma:.6g} against an optimum {gamma:.6g}"
 
     def _slower(self, form: NormalForm, result: Synthesis, gamma: float, target: float) -> Synthesis:
@@ -303,9 +326,11 @@ class _Problem:
             except (ComputationError, np.linalg.LinAlgError):
                 continue
             if found.gamma <= target * (1 + SETTINGS.loop_accuracy) and found.fastest_pole < result.fastest_pole:
-                note = (f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
-                        f"{plant_fastest:.3g}: those far beyond it were replaced by their gain, the fastest left has "
-                        f"{found.fastest_pole:.3g}, and all figures are of that controller")
+                note = (
+                    f"the central controller has poles up to {result.fastest_pole:.3g} rad/s, the plant up to "
+                    f"{plant_fastest:.3g}: those far beyond it were replaced by their gain, the fastest left has "
+                    f"{found.fastest_pole:.3g}, and all figures are of that controller"
+                )
                 return replace(found, notes=(note,))
         return result
 
@@ -340,8 +365,9 @@ def _doubt_of_gamma(P: StateSpace, result: Synthesis) -> tuple[str, ...]:
     other = highest if highest > (1 + SETTINGS.same_gamma) * result.gamma else at_peak
     if abs(other - result.gamma) <= SETTINGS.same_gamma * result.gamma:
         return ()
-    return (f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K at "
-            f"one frequency",)
+    return (
+        f"round-off shows in gamma: {result.gamma:.6g} from the closed loop, {other:.6g} from P and K at one frequency",
+    )
 
 
 def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
@@ -352,8 +378,9 @@ def _widest_gap(poles: np.ndarray, plant_fastest: float) -> float:
     return float(np.sqrt(sizes[widest] * sizes[widest + 1]))
 
 
-def _consistent(bounds: tuple[float, float], reached: float, tolerance: float, zero: float, status: Status,
-                notes: tuple[str, ...]) -> tuple[tuple[float, float], Status, tuple[str, ...]]:
+def _consistent(
+    bounds: tuple[float, float], reached: float, tolerance: float, zero: float, status: Status, notes: tuple[str, ...]
+) -> tuple[tuple[float, float], Status, tuple[str, ...]]:
     """Bounds that are consistent with the measured gamma, and a status that reports if they are far apart.
 
     zero : width below which an optimum is zero to working precision.
@@ -387,7 +414,12 @@ def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ..
     if not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
         raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
     ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
-    verdict = "slow enough" if ratio < 0.5 else ("too fast; a higher sample rate, a larger backoff from the optimum or "
-                                                 "fewer states help")
-    return (f"the fastest controller pole, {result.fastest_pole / (2 * np.pi):.4g} Hz, is {ratio:.3g} times half the "
-            f"sample rate: {verdict}",)
+    verdict = (
+        "slow enough"
+        if ratio < 0.5
+        else ("too fast; a higher sample rate, a larger backoff from the optimum or fewer states help")
+    )
+    return (
+        f"the fastest controller pole, {result.fastest_pole / (2 * np.pi):.4g} Hz, is {ratio:.3g} times half the "
+        f"sample rate: {verdict}",
+    )

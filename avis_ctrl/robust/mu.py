@@ -59,8 +59,11 @@ def checked(M: Array, blocks: BlockStructure | Sequence[Block]) -> tuple[Array, 
     if M.ndim not in (2, 3):
         raise InputError("expected (n_z, n_w) or (n_omega, n_z, n_w)", field="shape of M", value=M.shape)
     if M.shape[-2:] != (structure.n_z, structure.n_w):
-        raise InputError(f"the blocks need {structure.n_z} rows (their cols) and {structure.n_w} columns (their rows)",
-                         field="shape of M", value=M.shape[-2:])
+        raise InputError(
+            f"the blocks need {structure.n_z} rows (their cols) and {structure.n_w} columns (their rows)",
+            field="shape of M",
+            value=M.shape[-2:],
+        )
     if not np.all(np.isfinite(M)):
         raise InputError("expected finite entries", field="M")
     return M.reshape(-1, *M.shape[-2:]), structure

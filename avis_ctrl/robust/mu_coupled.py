@@ -40,8 +40,8 @@ def coupled(N: StateSpace, structure: BlockStructure) -> Coupled:
     kept = np.ones(len(places), bool)
     while True:
         w, z = _places(places, kept, structure)
-        inputs = np.r_[w, structure.n_w:N.ninputs].astype(int)
-        outputs = np.r_[z, structure.n_z:N.noutputs].astype(int)
+        inputs = np.r_[w, structure.n_w : N.ninputs].astype(int)
+        outputs = np.r_[z, structure.n_z : N.noutputs].astype(int)
         reached = _spread(N.A != 0, np.any(N.B[:, inputs] != 0, axis=1))
         seen = _spread(N.A.T != 0, np.any(N.C[outputs] != 0, axis=0))
         moved = np.any(N.D[:, inputs] != 0, axis=1) | np.any(N.C[:, reached] != 0, axis=1)
@@ -53,8 +53,13 @@ def coupled(N: StateSpace, structure: BlockStructure) -> Coupled:
             break
         kept = looped
     states = reached & seen
-    rest = replace(N.select(outputs.tolist(), inputs.tolist()), A=N.A[np.ix_(states, states)],
-                   B=N.B[np.ix_(states, inputs)], C=N.C[np.ix_(outputs, states)], states=())
+    rest = replace(
+        N.select(outputs.tolist(), inputs.tolist()),
+        A=N.A[np.ix_(states, states)],
+        B=N.B[np.ix_(states, inputs)],
+        C=N.C[np.ix_(outputs, states)],
+        states=(),
+    )
     left = BlockStructure(tuple(block for (block, _, _), keep in zip(places, kept, strict=True) if keep))
     return Coupled(rest, left, structure, w, z)
 

@@ -117,9 +117,19 @@ class Cover:
     widened: int = 0
 
 
-def cover(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace, float], StateSpace],
-          bound: Callable[[Array], Array], level: float, band: Interval, samples: Array, *, slack: float,
-          rounds: int = 60, most: int = 1500) -> Cover:
+def cover(
+    N: StateSpace,
+    structure: BlockStructure,
+    scaled: Callable[[StateSpace, float], StateSpace],
+    bound: Callable[[Array], Array],
+    level: float,
+    band: Interval,
+    samples: Array,
+    *,
+    slack: float,
+    rounds: int = 60,
+    most: int = 1500,
+) -> Cover:
     """Prove a level on a whole band, and raise it if the bound of a gap requires a higher level.
 
     scaled(N, level) is the system whose mu must be at most 1 for the level to be valid; bound(M) gives the level that
@@ -138,7 +148,7 @@ def cover(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace
         if not state.gaps or total > most or not np.isfinite(state.level):
             break
         if state.looked > PATIENCE and state.widened < WIDENINGS:
-            state.level *= 1 + slack * 2.0 ** state.widened
+            state.level *= 1 + slack * 2.0**state.widened
             state.looked, state.widened = 0, state.widened + 1
         _one_round(N, structure, scaled, bound, state, slack)
     return state
@@ -149,8 +159,14 @@ def _points(low: float, high: float) -> list[float]:
     return [low, middle, midpoint(low, middle), high]
 
 
-def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[StateSpace, float], StateSpace],
-               bound: Callable[[Array], Array], state: Cover, slack: float) -> None:
+def _one_round(
+    N: StateSpace,
+    structure: BlockStructure,
+    scaled: Callable[[StateSpace, float], StateSpace],
+    bound: Callable[[Array], Array],
+    state: Cover,
+    slack: float,
+) -> None:
     unit = scaled(N, state.level)
     gaps, state.gaps = state.gaps, []
     omega = np.array([_points(*gap) for gap in gaps])
@@ -168,8 +184,15 @@ def _one_round(N: StateSpace, structure: BlockStructure, scaled: Callable[[State
         _split_or_raise(N, unit, structure, bound, state, open_gaps, slack)
 
 
-def _split_or_raise(N: StateSpace, unit: StateSpace, structure: BlockStructure, bound: Callable[[Array], Array],
-                    state: Cover, open_gaps: list[Interval], slack: float) -> None:
+def _split_or_raise(
+    N: StateSpace,
+    unit: StateSpace,
+    structure: BlockStructure,
+    bound: Callable[[Array], Array],
+    state: Cover,
+    open_gaps: list[Interval],
+    slack: float,
+) -> None:
     """Halve the gaps; raise the level if a single frequency in a gap (or a gap too narrow to halve) requires it.
 
     unit : N scaled so that the level is one.

@@ -143,6 +143,7 @@ class Task:
 
         def value(at: Array) -> Array:
             return upper_bound(closed.frequency_response(at)[:, None], self.structure, self.settings.accuracy).beta
+
         grid, beta = refine_maxima(value, grid, value(grid), tolerance=1e-3, worth=0.95)
         return Step(K, max(float(np.max(beta)), self.gain(K)) if closed.is_stable() else np.inf), grid
 
@@ -168,8 +169,13 @@ class Objective:
             return np.inf, np.zeros(x.size)
         # Narrow modes move from step to step; on a fixed grid the descent would hide their peaks between its points.
         narrow = resonances(closed.poles(), damping=self.task.settings.narrow)
-        total, omega, G = smoothed_peak(self.task, K, np.concatenate([self.omega, narrow]), np.concatenate(
-            [self.response, self.task.P.frequency_response(narrow)]), self.sharpness)
+        total, omega, G = smoothed_peak(
+            self.task,
+            K,
+            np.concatenate([self.omega, narrow]),
+            np.concatenate([self.response, self.task.P.frequency_response(narrow)]),
+            self.sharpness,
+        )
         phi = _resolvent(K, omega)
         into, out = phi @ K.B, K.C @ phi
         n = K.nstates
@@ -187,8 +193,9 @@ class Objective:
         return self.task.P.frequency_response(self.omega)
 
 
-def smoothed_peak(task: Task, K: StateSpace, omega: Array, response: Array, sharpness: float
-                  ) -> tuple[float, Array, Array]:
+def smoothed_peak(
+    task: Task, K: StateSpace, omega: Array, response: Array, sharpness: float
+) -> tuple[float, Array, Array]:
     """Smoothed maximum of log mu and of log(gain / limit), and its slope Re sum_k tr(G_k dK(j omega_k)).
 
     `response` is P at omega (n,). The slope is returned as the frequencies (m,) that count, and G (m, n_y, n_u).
@@ -204,7 +211,7 @@ def smoothed_peak(task: Task, K: StateSpace, omega: Array, response: Array, shar
     L = p[:, :z, w:] @ (np.eye(n_u) + k @ E @ p[:, z:, w:])
     near, bound = _highest(task, M, sharpness)
     omega, M, L, R = omega[near], M[near], L[near], R[near]
-    lam = bound.beta ** 2 * (1 + settings.accuracy)
+    lam = bound.beta**2 * (1 + settings.accuracy)
     dual = np.linalg.inv(residual(M[:, None], bound.scalings, lam, np.ones(w, bool))[:, 0])
     dual /= np.trace(bound.scalings.X_w @ dual, axis1=1, axis2=2).real[:, None, None]
     # d log beta = d lambda / (2 lambda) = Re tr(G dK).
@@ -229,14 +236,14 @@ def _highest(task: Task, M: Array, sharpness: float) -> tuple[Array, UpperBound]
     d_z, d_w = expand(structure, block_balance(M[:, None], structure, goal=np.inf))
     size = np.linalg.norm(M * d_z[:, :, None] / d_w[:, None, :], ord=2, axis=(1, 2))
     falling = np.argsort(-size)
-    first = upper_bound(M[falling[:settings.first]][:, None], structure, settings.accuracy)
+    first = upper_bound(M[falling[: settings.first]][:, None], structure, settings.accuracy)
     least = float(np.max(first.beta)) * settings.negligible ** (1 / sharpness)
-    further = falling[settings.first:]
+    further = falling[settings.first :]
     further = further[size[further] >= least]
     if not further.size:
-        return falling[:settings.first], first
+        return falling[: settings.first], first
     rest = upper_bound(M[further][:, None], structure, settings.accuracy)
-    return np.concatenate([falling[:settings.first], further]), UpperBound.joined([first, rest])
+    return np.concatenate([falling[: settings.first], further]), UpperBound.joined([first, rest])
 
 
 def _resolvent(K: StateSpace, omega: Array) -> Array:

@@ -71,8 +71,18 @@ def _solve_positive(H: Array, b: Array) -> Array:
 
 
 @njit(cache=True)
-def _derivatives(M: Array, p: Array, lam: float, of_z: Array, of_w: Array, copies: Array, gradient: Array,
-                 slope: Array, hessian: Array, falling: Array) -> bool:
+def _derivatives(
+    M: Array,
+    p: Array,
+    lam: float,
+    of_z: Array,
+    of_w: Array,
+    copies: Array,
+    gradient: Array,
+    slope: Array,
+    hessian: Array,
+    falling: Array,
+) -> bool:
     """Gradient, its derivative by lambda, and Hessian of the barrier at (p, lam); False outside its domain.
 
     falling (n_blocks + 1,) : tr(S P_w S dF/dp_k), and tr(S P_w S P_w), for the rate at which F decreases.
@@ -128,8 +138,16 @@ def _inside(M: Array, p: Array, lam: float, of_z: Array, of_w: Array, F: Array) 
 
 
 @njit(cache=True)
-def follow_diagonal(M: Array, of_z: Array, of_w: Array, copies: Array, lam: Array, floor: Array, tolerance: float,
-                    settings: PathSettings) -> tuple[Array, Array]:
+def follow_diagonal(
+    M: Array,
+    of_z: Array,
+    of_w: Array,
+    copies: Array,
+    lam: Array,
+    floor: Array,
+    tolerance: float,
+    settings: PathSettings,
+) -> tuple[Array, Array]:
     """Scalings (B, n_blocks) and the levels (B,) that they prove, from p = 1 at lam (B,) to the minimum or `floor`.
 
     M (B, n_shared, n_z, n_w) complex, of_z (n_z,) and of_w (n_w,) the block of each entry, copies (n_blocks,) the

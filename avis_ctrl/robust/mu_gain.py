@@ -56,8 +56,7 @@ def _gain(M: Array, delta: Array) -> Array:
         return np.linalg.norm(perturbed(M, delta), ord=2, axis=(-2, -1))
     except np.linalg.LinAlgError:
         # One singular matrix ends the computation of the whole stack.
-        return np.array([np.inf]) if len(M) == 1 else np.concatenate(
-            [_gain(M[[k]], delta[[k]]) for k in range(len(M))])
+        return np.array([np.inf]) if len(M) == 1 else np.concatenate([_gain(M[[k]], delta[[k]]) for k in range(len(M))])
 
 
 def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
@@ -71,8 +70,9 @@ def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
     return aligned(a, x, structure, lambda product, _: np.where(product >= 0, 1.0, -1.0))
 
 
-def worst_gain(M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20,
-               seed: int = 0) -> WorstGain:
+def worst_gain(
+    M: Array, structure: BlockStructure, *, count: int = 4, iterations: int = 20, seed: int = 0
+) -> WorstGain:
     """Ascent from Delta = 0 and random perturbations for M (B, n_z + n_e, n_w + n_d); monotone in every step.
 
     The gain is inf if a perturbation of norm 1 that makes the loop singular was met. Raises InputError for an M that is

@@ -207,8 +207,9 @@ def _newton(hessian: Array, right: Array, is_g: Array) -> Array:
 
 
 @njit(cache=True)
-def _to_centre(M: Array, x: Array, lam: float, form: Entries, core: Entries, trace: Array, is_g: Array,
-               settings: PathSettings) -> Array:
+def _to_centre(
+    M: Array, x: Array, lam: float, form: Entries, core: Entries, trace: Array, is_g: Array, settings: PathSettings
+) -> Array:
     """Move x (p,) to the analytic centre at lam and return d x / d lambda, the direction of the path of centres.
 
     The centre minimises trace x - log det F - log det X, with an F for every matrix of M (n_shared, n_z, n_w). NaN on
@@ -274,8 +275,18 @@ def _speed(M: Array, x: Array, lam: float, direction: Array, form: Entries, core
 
 
 @njit(cache=True)
-def follow_path(M: Array, theta: Array, lam: Array, floor: Array, form: Entries, core: Entries, trace: Array,
-                is_g: Array, tolerance: float, settings: PathSettings) -> None:
+def follow_path(
+    M: Array,
+    theta: Array,
+    lam: Array,
+    floor: Array,
+    form: Entries,
+    core: Entries,
+    trace: Array,
+    is_g: Array,
+    tolerance: float,
+    settings: PathSettings,
+) -> None:
     """Move scalings theta (B, p) and levels lam (B,) in place along the path of centres down to the minimum level or to
     `floor` (B,); each pair remains feasible.
 

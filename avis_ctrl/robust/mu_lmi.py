@@ -102,8 +102,10 @@ class ScalingSpace:
             if block.kind == "real":
                 for entries in _hermitian_basis(block.rows):
                     for a, b, value in entries:
-                        form += [(w.start + a, n_w + z.start + b, -1j * value, p),
-                                 (n_w + z.start + b, w.start + a, 1j * np.conj(value), p)]
+                        form += [
+                            (w.start + a, n_w + z.start + b, -1j * value, p),
+                            (n_w + z.start + b, w.start + a, 1j * np.conj(value), p),
+                        ]
                     p += 1
         kform, kcore = LinearForm(n_w + n_z, p, form), LinearForm(c, p, core)
         on_level = (kform.row < n_w) & (kform.col < n_w) & np.r_[level, np.zeros(n_z, bool)][kform.row]
@@ -170,8 +172,9 @@ def least_level(M: Array, scalings: LmiScalings, level: Array) -> Array:
     return np.where(feasible, lam, np.inf) if r.size else lam
 
 
-def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5
-           ) -> tuple[Array, Array]:
+def follow(
+    space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5
+) -> tuple[Array, Array]:
     """Follow the analytic centres from a feasible (theta, lam) down to the minimum lambda, or to `goal`.
 
     M (B, n_shared, n_z, n_w). Returns a feasible pair theta (B, p) and lambda (B,). Problems whose lambda reaches a
@@ -179,6 +182,16 @@ def follow(space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array 
     """
     theta, lam = theta.copy(), lam.copy()
     floor = np.broadcast_to(np.asarray(goal, float), lam.shape).copy()
-    follow_path(np.ascontiguousarray(M, complex), theta, lam, floor, space.form.entries(space.is_level),
-                space.core.entries(np.zeros(space.core.row.size, bool)), space.trace, space.is_g, tolerance, SETTINGS)
+    follow_path(
+        np.ascontiguousarray(M, complex),
+        theta,
+        lam,
+        floor,
+        space.form.entries(space.is_level),
+        space.core.entries(np.zeros(space.core.row.size, bool)),
+        space.trace,
+        space.is_g,
+        tolerance,
+        SETTINGS,
+    )
     return theta, lam

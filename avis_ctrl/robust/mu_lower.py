@@ -82,7 +82,8 @@ def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
     batch, m = g.shape
 
     def height(t: Array) -> Array:
-        return np.sum(np.abs(a[:, None] + t[..., None] * b[:, None]), axis=2) + C[:, None] * np.sqrt(1 + t ** 2)
+        return np.sum(np.abs(a[:, None] + t[..., None] * b[:, None]), axis=2) + C[:, None] * np.sqrt(1 + t**2)
+
     if t_fixed is not None:
         t, kink = t_fixed[:, None], np.full((batch, 1), -1)
     else:
@@ -95,10 +96,13 @@ def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
         low, high = edges[:, :-1], edges[:, 1:]
         below, above = np.isinf(low), np.isinf(high)
         low_end, high_end = np.where(below, 0.0, low), np.where(above, 0.0, high)
-        middle = np.where(below, high_end - 1 - np.abs(high_end),
-                          np.where(above, low_end + 1 + np.abs(low_end), (low_end + high_end) / 2))
+        middle = np.where(
+            below,
+            high_end - 1 - np.abs(high_end),
+            np.where(above, low_end + 1 + np.abs(low_end), (low_end + high_end) / 2),
+        )
         slope = np.sum(np.sign(a[:, None] + middle[..., None] * b[:, None]) * b[:, None], axis=2)
-        inner = np.maximum(C[:, None] ** 2 - slope ** 2, 0.0)
+        inner = np.maximum(C[:, None] ** 2 - slope**2, 0.0)
         flat = np.where(inner > 0, -slope / np.sqrt(np.maximum(inner, 1e-300)), 0.0)
         # Kinks come first: an interval minimum that is clipped to the end of the interval means the kink.
         t = np.concatenate([sorted_kinks, np.clip(flat, low, high), np.zeros((batch, 1))], axis=1)
@@ -107,7 +111,7 @@ def _least_norm(g: Array, C: Array, t_fixed: Array | None = None) -> _Step:
     best = np.argmin(height(t), axis=1)[:, None]
     t, kink = np.take_along_axis(t, best, axis=1), np.take_along_axis(kink, best, axis=1)[:, 0]
     k = 1.0 / np.maximum(height(t)[:, 0], 1e-12)
-    phase = ((1 + 1j * t) / np.sqrt(1 + t ** 2))[:, 0]
+    phase = ((1 + 1j * t) / np.sqrt(1 + t**2))[:, 0]
     real = k[:, None] * np.where(a + t * b >= 0, 1.0, -1.0)
     inside = np.flatnonzero(kink >= 0)
     if inside.size:
@@ -131,8 +135,10 @@ def _eigenpair(A: Array, near: Array, rng: np.random.Generator) -> tuple[Array, 
     P /= np.maximum(np.linalg.norm(P, axis=(1, 2)), 1e-300)[:, None, None]
     start = rng.standard_normal((2, batch, n)) + 1j * rng.standard_normal((2, batch, n))
     x, y = (P @ start[0][..., None])[..., 0], (dagger(P) @ start[1][..., None])[..., 0]
-    return (x / np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None],
-            y / np.maximum(np.linalg.norm(y, axis=1), 1e-300)[:, None])
+    return (
+        x / np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None],
+        y / np.maximum(np.linalg.norm(y, axis=1), 1e-300)[:, None],
+    )
 
 
 def _inverse(B: Array) -> Array:
@@ -153,16 +159,19 @@ class Linearised(NamedTuple):
     shift: Array
 
 
-def next_delta(M: Array, delta: Array, structure: BlockStructure, rng: np.random.Generator, near: Array,
-               slope: Array | None = None) -> Linearised:
+def next_delta(
+    M: Array, delta: Array, structure: BlockStructure, rng: np.random.Generator, near: Array, slope: Array | None = None
+) -> Linearised:
     """One step: M (B, n_z, n_w), delta (B, n_w, n_z). With `slope` dM/d omega the frequency is free, too."""
     x, y = _eigenpair(M @ delta, near, rng)
     e = np.sum(np.conj(y) * x, axis=1)
     e = np.where(np.abs(e) < 1e-12, 1e-12, e)
     a = (dagger(M) @ y[..., None])[..., 0]
     places = list(structure.slices())
-    g = [np.zeros_like(e) if block.kind == "full" else np.sum(np.conj(a[:, w]) * x[:, z], axis=1) / e
-         for block, w, z in places]
+    g = [
+        np.zeros_like(e) if block.kind == "full" else np.sum(np.conj(a[:, w]) * x[:, z], axis=1) / e
+        for block, w, z in places
+    ]
     size = [np.linalg.norm(a[:, w], axis=1) * np.linalg.norm(x[:, z], axis=1) for _, w, z in places]
     C = np.zeros(M.shape[0])
     for (block, _, _), gk, sk in zip(places, g, size, strict=True):
@@ -199,8 +208,17 @@ def next_delta(M: Array, delta: Array, structure: BlockStructure, rng: np.random
 
 def block_norm(delta: Array, structure: BlockStructure) -> Array:
     """Largest block norm (B,) of Delta (B, n_w, n_z)."""
-    return np.max(np.stack([np.linalg.norm(delta[:, w, z], ord=2, axis=(1, 2)) if block.kind == "full"
-                            else np.abs(delta[:, w.start, z.start]) for block, w, z in structure.slices()]), axis=0)
+    return np.max(
+        np.stack(
+            [
+                np.linalg.norm(delta[:, w, z], ord=2, axis=(1, 2))
+                if block.kind == "full"
+                else np.abs(delta[:, w.start, z.start])
+                for block, w, z in structure.slices()
+            ]
+        ),
+        axis=0,
+    )
 
 
 def is_singular(M: Array, delta: Array, structure: BlockStructure) -> Array:
@@ -257,18 +275,24 @@ def scaled_to_singular(M: Array, delta: Array, structure: BlockStructure) -> Arr
         return real + factor[:, None, None] * rest
 
 
-def starts(M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int,
-           rng: np.random.Generator) -> Array:
+def starts(
+    M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int, rng: np.random.Generator
+) -> Array:
     """Initial perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
-    return np.stack([aligned(w, (M @ w[..., None])[..., 0], structure, _least_squares) / beta[:, None, None]
-                     for w in null_vectors(M, scalings, beta, structure, count, rng)])
+    return np.stack(
+        [
+            aligned(w, (M @ w[..., None])[..., 0], structure, _least_squares) / beta[:, None, None]
+            for w in null_vectors(M, scalings, beta, structure, count, rng)
+        ]
+    )
 
 
-def null_vectors(M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int,
-                 rng: np.random.Generator) -> Array:
+def null_vectors(
+    M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int, rng: np.random.Generator
+) -> Array:
     """Approximate null vectors w (count, B, n_w) of the upper bound's LMI: the best three, then random mixtures."""
     batch = M.shape[0]
-    F = residual(M[:, None], scalings, beta ** 2, np.ones(structure.n_w, bool))[:, 0]
+    F = residual(M[:, None], scalings, beta**2, np.ones(structure.n_w, bool))[:, 0]
     values, vectors = np.linalg.eigh(scalings.X_w)
     root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
     _, null = np.linalg.eigh(dagger(root) @ F @ root)
@@ -313,8 +337,16 @@ class MuLowerBound(NamedTuple):
     delta: Array
 
 
-def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: LmiScalings, *, enough: float = 0.99,
-                stages: int = 3, seed: int = 0) -> MuLowerBound:
+def lower_bound(
+    M: Array,
+    structure: BlockStructure,
+    upper: Array,
+    scalings: LmiScalings,
+    *,
+    enough: float = 0.99,
+    stages: int = 3,
+    seed: int = 0,
+) -> MuLowerBound:
     """Best verified perturbation for each M (B, n_z, n_w), starting from the null vectors of the upper bound's LMI.
 
     If the first three starts do not reach `enough` times the upper bound, further `stages` use more starts, the last
@@ -332,8 +364,9 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Lmi
     if all(block.kind != "real" for block in structure.blocks):
         live = np.flatnonzero(above_noise)
         if live.size:
-            _search_complex(best, M, structure, upper, scalings, live, enough,
-                            SETTINGS.few if stages == 1 else SETTINGS.many, rng)
+            _search_complex(
+                best, M, structure, upper, scalings, live, enough, SETTINGS.few if stages == 1 else SETTINGS.many, rng
+            )
         # Matrices without a verified perturbation go on to the slower search.
         above_noise &= best.beta == 0.0
     for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5))[:stages]:
@@ -343,8 +376,17 @@ def lower_bound(M: Array, structure: BlockStructure, upper: Array, scalings: Lmi
     return best
 
 
-def _search_complex(best: MuLowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: LmiScalings,
-                    live: Array, enough: float, count: int, rng: np.random.Generator) -> None:
+def _search_complex(
+    best: MuLowerBound,
+    M: Array,
+    structure: BlockStructure,
+    upper: Array,
+    scalings: LmiScalings,
+    live: Array,
+    enough: float,
+    count: int,
+    rng: np.random.Generator,
+) -> None:
     """The compiled search, for structures without real blocks."""
     size = upper[live]
     unit = M[live] / size[:, None, None]
@@ -353,16 +395,28 @@ def _search_complex(best: MuLowerBound, M: Array, structure: BlockStructure, upp
     kinds = np.array([FULL if block.kind == "full" else 0 for block in structure.blocks])
     w, z = (np.cumsum([0, *sizes]) for sizes in zip(*((b.rows, b.cols) for b in structure.blocks), strict=True))
     unit = np.ascontiguousarray(unit)
-    value, found, vector = search_complex(unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough,
-                                          SETTINGS.settled)
+    value, found, vector = search_complex(
+        unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough, SETTINGS.settled
+    )
     # Continue from the best start to convergence.
-    further, settled, _ = search_complex(unit, vector[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf,
-                                         SETTINGS.settled ** 2)
+    further, settled, _ = search_complex(
+        unit, vector[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf, SETTINGS.settled**2
+    )
     _keep(best, live, size, unit, np.where((further > value)[:, None, None], settled, found), structure)
 
 
-def _search(best: MuLowerBound, M: Array, structure: BlockStructure, upper: Array, scalings: LmiScalings, live: Array,
-            count: int, iterations: int, damping: float, rng: np.random.Generator) -> None:
+def _search(
+    best: MuLowerBound,
+    M: Array,
+    structure: BlockStructure,
+    upper: Array,
+    scalings: LmiScalings,
+    live: Array,
+    count: int,
+    iterations: int,
+    damping: float,
+    rng: np.random.Generator,
+) -> None:
     size = upper[live]
     unit = M[live] / size[:, None, None]
     part = LmiScalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live] / size[:, None, None])
@@ -375,8 +429,7 @@ def _search(best: MuLowerBound, M: Array, structure: BlockStructure, upper: Arra
                 _keep(best, live, size, unit, new, structure)
 
 
-def _keep(best: MuLowerBound, live: Array, size: Array, unit: Array, delta: Array,
-          structure: BlockStructure) -> None:
+def _keep(best: MuLowerBound, live: Array, size: Array, unit: Array, delta: Array, structure: BlockStructure) -> None:
     """Update `best` with perturbations that are verified and better."""
     exact = scaled_to_singular(unit, delta, structure)
     for candidate in (exact, delta) if not np.any(_complex_part(structure)) else (exact,):
@@ -392,8 +445,17 @@ def _keep(best: MuLowerBound, live: Array, size: Array, unit: Array, delta: Arra
         best.delta[live[better]] = candidate[better] / size[better, None, None]
 
 
-def singular_frequency(N: StateSpace, structure: BlockStructure, near: Array, level: float, band: tuple[float, float],
-                       *, count: int = 6, iterations: int = 40, seed: int = 2) -> tuple[float, float, Array] | None:
+def singular_frequency(
+    N: StateSpace,
+    structure: BlockStructure,
+    near: Array,
+    level: float,
+    band: tuple[float, float],
+    *,
+    count: int = 6,
+    iterations: int = 40,
+    seed: int = 2,
+) -> tuple[float, float, Array] | None:
     """A small Delta that makes I - N Delta singular, and the frequency, also free: (beta, omega, delta); None if none.
 
     For real perturbations, whose critical frequency is in general not on a grid. `near` (n,) : initial values [rad/s].

@@ -79,15 +79,19 @@ class Stability(Protocol):
     @property
     def upper(self) -> float:
         """Upper bound of mu."""
+
     @property
     def lower(self) -> float:
         """Lower bound of mu."""
+
     @property
     def omega(self) -> float:
         """Frequency [rad/s] of the lower bound."""
+
     @property
     def guaranteed(self) -> bool:
         """Whether the upper bound holds at all frequencies."""
+
     @property
     def delta(self) -> Array | None:
         """Perturbation that attains the lower bound."""
@@ -97,8 +101,14 @@ class Stability(Protocol):
 Found = TypeVar("Found", UpperBound, WorstGain)
 
 
-def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
-            band: Interval = ALL_FREQUENCIES, known_upper: float | None = None, slack: float = SLACK) -> MuPeak:
+def mu_peak(
+    N: StateSpace,
+    blocks: BlockStructure | Sequence[Block],
+    *,
+    band: Interval = ALL_FREQUENCIES,
+    known_upper: float | None = None,
+    slack: float = SLACK,
+) -> MuPeak:
     """Supremum of mu(N(j omega)) over a band, by default all frequencies including 0 and infinity.
 
     Parameters
@@ -127,17 +137,26 @@ def mu_peak(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     """
     system, structure = _checked(N, blocks, slack)
     if (system.noutputs, system.ninputs) != (structure.n_z, structure.n_w):
-        raise InputError(f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
-                         f"{system.noutputs} and {system.ninputs}", field="blocks")
+        raise InputError(
+            f"the blocks need {structure.n_z} outputs and {structure.n_w} inputs, N has "
+            f"{system.noutputs} and {system.ninputs}",
+            field="blocks",
+        )
     with one_thread():
         part = _prepared(system, structure)
         found = _mu_peak(part.N, part.structure, _continuous_band(system, band), slack, known_upper, system.dt)
         return _in_rad_s(system, part, found)
 
 
-def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
-                    band: Interval = ALL_FREQUENCIES, slack: float = SLACK, robust: Stability | None = None,
-                    points: int = CURVES.points) -> MuPeak:
+def worst_case_gain(
+    N: StateSpace,
+    blocks: BlockStructure | Sequence[Block],
+    *,
+    band: Interval = ALL_FREQUENCIES,
+    slack: float = SLACK,
+    robust: Stability | None = None,
+    points: int = CURVES.points,
+) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
     Parameters
@@ -158,8 +177,11 @@ def worst_case_gain(N: StateSpace, blocks: BlockStructure | Sequence[Block], *,
     system, structure = _checked(N, blocks, slack)
     n_d, n_e = system.ninputs - structure.n_w, system.noutputs - structure.n_z
     if n_d < 1 or n_e < 1:
-        raise InputError(f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
-                         f"{system.noutputs} and {system.ninputs}: no performance channel is left", field="blocks")
+        raise InputError(
+            f"the blocks take {structure.n_z} outputs and {structure.n_w} inputs of N's "
+            f"{system.noutputs} and {system.ninputs}: no performance channel is left",
+            field="blocks",
+        )
     with one_thread():
         part = _prepared(system, structure)
         inside = _continuous_band(system, band)
@@ -185,8 +207,9 @@ def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> 
         done = _stable_cover(part.N, part.structure)
         if not done.gaps and done.level < 1.0:
             none = np.zeros(0)
-            return MuPeak(done.level, 0.0, 0.0, None, True, _in_words(done, ALL_FREQUENCIES, system.dt), none, none,
-                          none)
+            return MuPeak(
+                done.level, 0.0, 0.0, None, True, _in_words(done, ALL_FREQUENCIES, system.dt), none, none, none
+            )
         return _in_rad_s(system, part, _mu_peak(part.N, part.structure, ALL_FREQUENCIES, SLACK, dt=system.dt))
 
 
@@ -194,8 +217,9 @@ def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> 
 ROUND_OFF = 1e-14
 
 
-def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
-             slack: float) -> tuple[StateSpace, BlockStructure]:
+def _checked(
+    N: StateSpace, blocks: BlockStructure | Sequence[Block], slack: float
+) -> tuple[StateSpace, BlockStructure]:
     """N as a stable system of this package, and its blocks."""
     if not 1e-5 <= slack <= 0.1:
         raise InputError("expected 1e-5 to 0.1", field="slack", value=slack)
@@ -205,11 +229,13 @@ def _checked(N: StateSpace, blocks: BlockStructure | Sequence[Block],
     growth = np.abs(poles) - 1 if N.dt else poles.real / max(float(np.max(np.abs(poles), initial=0.0)), 1e-300)
     if poles.size and np.max(growth) >= -ROUND_OFF:
         raise ComputationError(
-            "the bounds of mu need a stable system", measured=f"pole {poles[np.argmax(growth)]:.6g}",
+            "the bounds of mu need a stable system",
+            measured=f"pole {poles[np.argmax(growth)]:.6g}",
             cause="the nominal closed loop is unstable, or has a mode at the limit of stability that the controller "
-                  "does not affect",
+            "does not affect",
             next_step="stabilise the loop, or leave out the states of this mode if no output depends on them "
-                      "(avis_ctrl.lti.minimal)")
+            "(avis_ctrl.lti.minimal)",
+        )
     return N, BlockStructure.of(blocks)
 
 
@@ -224,16 +250,22 @@ def _continuous_band(N: StateSpace, band: Interval) -> Interval:
     if not 0 <= low < high:
         raise InputError("expected 0 <= low < high in rad/s", field="band", value=band)
     if low * N.dt >= np.pi:
-        raise InputError(f"expected a band that begins below half the sample rate, {np.pi / N.dt:.6g} rad/s",
-                         field="band", value=band)
+        raise InputError(
+            f"expected a band that begins below half the sample rate, {np.pi / N.dt:.6g} rad/s",
+            field="band",
+            value=band,
+        )
     return float(image_frequency(low, N.dt)), float(image_frequency(high, N.dt))
 
 
 def _in_rad_s(N: StateSpace, part: Coupled, result: MuPeak) -> MuPeak:
     """The result with Delta of all blocks, and with frequencies of the bilinear image mapped to those of N."""
     result = replace(result, delta=part.restored(result.delta))
-    return replace(result, omega=float(sampled_frequency(result.omega, N.dt)),
-                   frequencies=np.asarray(sampled_frequency(result.frequencies, N.dt)))
+    return replace(
+        result,
+        omega=float(sampled_frequency(result.omega, N.dt)),
+        frequencies=np.asarray(sampled_frequency(result.frequencies, N.dt)),
+    )
 
 
 @dataclass
@@ -279,6 +311,7 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
         found = look(N.frequency_response(omega))
         seen.append((omega, found))
         return found[0]
+
     first = first_frequencies(N, band)
     refine_maxima(value, first, value(first), tolerance=accuracy_of(slack))
     return np.concatenate([omega for omega, _ in seen]), [found for _, found in seen]
@@ -287,7 +320,7 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
 def _thinned(values: Array, most: int) -> Array:
     """Indices of at most `most` evenly spaced values, and of the largest values."""
     even = np.linspace(0, values.size - 1, min(most, values.size)).round().astype(int)
-    return np.union1d(even, np.argsort(values)[-CURVES.highest:])
+    return np.union1d(even, np.argsort(values)[-CURVES.highest :])
 
 
 def _level(bounds: Array, slack: float) -> float:
@@ -296,8 +329,14 @@ def _level(bounds: Array, slack: float) -> float:
     return max(float(np.max(bounds)) * (1 + slack), 1e-9)
 
 
-def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: float,
-             known_upper: float | None = None, dt: float = 0.0) -> MuPeak:
+def _mu_peak(
+    N: StateSpace,
+    structure: BlockStructure,
+    band: Interval,
+    slack: float,
+    known_upper: float | None = None,
+    dt: float = 0.0,
+) -> MuPeak:
     """mu_peak of a continuous system, or of the image of a system sampled at dt."""
     accuracy = accuracy_of(slack)
     scan = _Scan.of(N, structure, band, slack).shown(structure)
@@ -313,19 +352,36 @@ def _mu_peak(N: StateSpace, structure: BlockStructure, band: Interval, slack: fl
         done = _cover_mu(N, structure, best * (1 + slack), band, np.array([at]), accuracy, slack)
     if best == 0.0:
         at = float(scan.peak[0])
-    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band, dt), scan.omega,
-                  scan.bound.beta, lower.beta)
+    return MuPeak(
+        done.level, best, at, delta, not done.gaps, _in_words(done, band, dt), scan.omega, scan.bound.beta, lower.beta
+    )
 
 
-def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, band: Interval, first: Array, accuracy: float,
-              slack: float) -> Cover:
+def _cover_mu(
+    N: StateSpace, structure: BlockStructure, level: float, band: Interval, first: Array, accuracy: float, slack: float
+) -> Cover:
     """Intervals on which constant scalings prove mu below a level; the band is first split at `first` (n,)."""
-    return cover(N, structure, lambda system, level: system.scaled(left=1 / level),
-                 lambda M: upper_bound(M, structure, accuracy).beta, level, band, first, slack=slack)
+    return cover(
+        N,
+        structure,
+        lambda system, level: system.scaled(left=1 / level),
+        lambda M: upper_bound(M, structure, accuracy).beta,
+        level,
+        band,
+        first,
+        slack=slack,
+    )
 
 
-def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found: UpperBound, lower: MuLowerBound,
-                   done: Cover, band: Interval) -> tuple[float, float, Array | None]:
+def _best_singular(
+    N: StateSpace,
+    structure: BlockStructure,
+    omega: Array,
+    found: UpperBound,
+    lower: MuLowerBound,
+    done: Cover,
+    band: Interval,
+) -> tuple[float, float, Array | None]:
     """Largest verified lower bound: thorough search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))
     M = N.frequency_response(omega[top])
@@ -343,8 +399,15 @@ def _best_singular(N: StateSpace, structure: BlockStructure, omega: Array, found
     return (best, at, delta) if best > noise else (0.0, at, None)
 
 
-def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float,
-                     known: Stability | None, points: int) -> MuPeak:
+def _worst_case_gain(
+    N: StateSpace,
+    structure: BlockStructure,
+    band: Interval,
+    slack: float,
+    dt: float,
+    known: Stability | None,
+    points: int,
+) -> MuPeak:
     """worst_case_gain of a continuous system, or of the image of a system sampled at dt."""
     accuracy = accuracy_of(slack)
     n_z, n_w = structure.n_z, structure.n_w
@@ -361,12 +424,29 @@ def _worst_case_gain(N: StateSpace, structure: BlockStructure, band: Interval, s
     done = None
     proved = known is not None and known.guaranteed and known.upper < 1.0
     if np.all(np.isfinite(upper)) and (proved or _robustly_stable(N.select(range(n_z), range(n_w)), structure, band)):
-        done = cover(N, whole, scaled, lambda m: skewed_upper_bound(m, whole, accuracy).beta, _level(upper, slack),
-                     band, shown.omega[[int(np.argmax(upper))]], slack=slack)
+        done = cover(
+            N,
+            whole,
+            scaled,
+            lambda m: skewed_upper_bound(m, whole, accuracy).beta,
+            _level(upper, slack),
+            band,
+            shown.omega[[int(np.argmax(upper))]],
+            slack=slack,
+        )
     if done is not None and np.isfinite(done.level):
         k = int(np.argmax(reached.gain))
-        return MuPeak(done.level, float(reached.gain[k]), float(reached.omega[k]), reached.delta[k], not done.gaps,
-                      _in_words(done, band, dt), shown.omega, upper, shown.gain)
+        return MuPeak(
+            done.level,
+            float(reached.gain[k]),
+            float(reached.omega[k]),
+            reached.delta[k],
+            not done.gaps,
+            _in_words(done, band, dt),
+            shown.omega,
+            upper,
+            shown.gain,
+        )
     robust = known or _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
     if robust.lower >= 1.0:
         return _destabilised(N, structure, robust, shown.omega)
@@ -400,8 +480,17 @@ class _Reached:
 def _destabilised(N: StateSpace, structure: BlockStructure, robust: Stability, omega: Array) -> MuPeak:
     """The result if a perturbation of norm at most 1 makes the loop unstable: the worst-case gain is infinite."""
     gain, _ = _gain_of_stable(N.frequency_response(omega), structure, robust)
-    return MuPeak(np.inf, np.inf, robust.omega, robust.delta, True,
-                  "a perturbation of norm at most 1 makes the loop unstable", omega, np.full(omega.size, np.inf), gain)
+    return MuPeak(
+        np.inf,
+        np.inf,
+        robust.omega,
+        robust.delta,
+        True,
+        "a perturbation of norm at most 1 makes the loop unstable",
+        omega,
+        np.full(omega.size, np.inf),
+        gain,
+    )
 
 
 def _gain_of_stable(M: Array, structure: BlockStructure, robust: Stability) -> tuple[Array, Array]:
@@ -434,5 +523,7 @@ def _in_words(done: Cover, band: Interval, dt: float) -> str:
     if not done.gaps:
         return f"{span}: {done.intervals} intervals with constant scalings prove the upper bound between the points"
     shown = ", ".join(f"{sampled_frequency(a, dt):.6g} to {sampled_frequency(b, dt):.6g}" for a, b in done.gaps[:3])
-    return (f"the frequencies computed within {span}; not proved in {len(done.gaps)} gaps ({shown} rad/s) at the "
-            f"level {done.level:.6g}")
+    return (
+        f"the frequencies computed within {span}; not proved in {len(done.gaps)} gaps ({shown} rad/s) at the "
+        f"level {done.level:.6g}"
+    )

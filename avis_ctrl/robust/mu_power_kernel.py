@@ -74,7 +74,7 @@ def _solve_adjoint(A: Array, pivot: Array, y: Array) -> None:
 
 @njit(cache=True)
 def _unit(x: Array) -> None:
-    size = np.sqrt(np.sum(x.real ** 2 + x.imag ** 2))
+    size = np.sqrt(np.sum(x.real**2 + x.imag**2))
     if size > 0:
         x /= size
 
@@ -85,22 +85,22 @@ def _linearised(a: Array, x: Array, e: complex, kinds: Array, w: Array, z: Array
     total = 0.0
     for b in range(kinds.size):
         if kinds[b] == FULL:
-            total += np.sqrt(np.sum(np.abs(a[w[b]:w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b]:z[b + 1]]) ** 2)) / abs(e)
+            total += np.sqrt(np.sum(np.abs(a[w[b] : w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b] : z[b + 1]]) ** 2)) / abs(e)
         else:
-            total += abs(np.sum(np.conj(a[w[b]:w[b + 1]]) * x[z[b]:z[b + 1]])) / abs(e)
+            total += abs(np.sum(np.conj(a[w[b] : w[b + 1]]) * x[z[b] : z[b + 1]])) / abs(e)
     if not total > 1e-12:
         return np.inf
     k = 1.0 / total
     new[:] = 0.0
     for b in range(kinds.size):
         if kinds[b] == FULL:
-            size = np.sqrt(np.sum(np.abs(a[w[b]:w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b]:z[b + 1]]) ** 2)) * abs(e)
+            size = np.sqrt(np.sum(np.abs(a[w[b] : w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b] : z[b + 1]]) ** 2)) * abs(e)
             turn = k * e / size if size > 0 else 0j
             for i in range(w[b], w[b + 1]):
                 for j in range(z[b], z[b + 1]):
                     new[i, j] = turn * a[i] * np.conj(x[j])
         else:
-            g = np.sum(np.conj(a[w[b]:w[b + 1]]) * x[z[b]:z[b + 1]]) / e
+            g = np.sum(np.conj(a[w[b] : w[b + 1]]) * x[z[b] : z[b + 1]]) / e
             value = k * np.conj(g) / abs(g) if abs(g) > 0 else k + 0j
             for i in range(w[b + 1] - w[b]):
                 new[w[b] + i, z[b] + i] = value
@@ -113,20 +113,29 @@ def _aligned(v: Array, u: Array, kinds: Array, w: Array, z: Array, delta: Array)
     delta[:] = 0.0
     for b in range(kinds.size):
         if kinds[b] == FULL:
-            size = np.sqrt(np.sum(np.abs(v[w[b]:w[b + 1]]) ** 2) * np.sum(np.abs(u[z[b]:z[b + 1]]) ** 2))
+            size = np.sqrt(np.sum(np.abs(v[w[b] : w[b + 1]]) ** 2) * np.sum(np.abs(u[z[b] : z[b + 1]]) ** 2))
             for i in range(w[b], w[b + 1]):
                 for j in range(z[b], z[b + 1]):
                     delta[i, j] = v[i] * np.conj(u[j]) / size if size > 0 else 0j
         else:
-            product = np.sum(np.conj(u[z[b]:z[b + 1]]) * v[w[b]:w[b + 1]])
+            product = np.sum(np.conj(u[z[b] : z[b + 1]]) * v[w[b] : w[b + 1]])
             value = product / abs(product) if abs(product) > 0 else 1.0 + 0j
             for i in range(w[b + 1] - w[b]):
                 delta[w[b] + i, z[b] + i] = value
 
 
 @njit(cache=True)
-def search_complex(M: Array, starts: Array, kinds: Array, w: Array, z: Array, iterations: int, damping: float,
-                   enough: float, settled: float) -> tuple[Array, Array, Array]:
+def search_complex(
+    M: Array,
+    starts: Array,
+    kinds: Array,
+    w: Array,
+    z: Array,
+    iterations: int,
+    damping: float,
+    enough: float,
+    settled: float,
+) -> tuple[Array, Array, Array]:
     """The largest 1/||Delta|| (B,) found, its Delta (B, n_w, n_z) and Delta x (B, n_w), from starts (count, B, n_w).
 
     M (B, n_z, n_w) in units of its upper bound; kinds (n_blocks,) FULL or not; w, z (n_blocks + 1,) first indices of

@@ -57,9 +57,11 @@ def _all_pass(value: complex, omega: float) -> StateSpace:
     if abs(value.imag) <= REAL * size:
         return gain(value.real)
     if not 0 < omega < np.inf:
-        raise ComputationError("a real system cannot be complex at frequency 0 or infinity",
-                               measured=f"delta {value:.6g}",
-                               next_step="take the perturbation of a neighbouring frequency")
+        raise ComputationError(
+            "a real system cannot be complex at frequency 0 or infinity",
+            measured=f"delta {value:.6g}",
+            next_step="take the perturbation of a neighbouring frequency",
+        )
     sign, phase = (1.0, angle) if angle > 0 else (-1.0, angle + np.pi)
     a = omega / float(np.tan((np.pi - phase) / 2))
     # (s - a)/(s + a) = 1 - 2a/(s + a)
@@ -70,9 +72,11 @@ def _all_pass(value: complex, omega: float) -> StateSpace:
 def _rank_one(value: Array, omega: float) -> StateSpace:
     U, sigma, Vh = np.linalg.svd(value)
     if sigma.size > 1 and sigma[1] > 1e-6 * sigma[0]:
-        raise ComputationError("only full blocks of rank one are realised with constant norm",
-                               measured=f"singular values {sigma[0]:.3g}, {sigma[1]:.3g}",
-                               next_step="take the perturbation returned by mu_peak or worst_case_gain")
+        raise ComputationError(
+            "only full blocks of rank one are realised with constant norm",
+            measured=f"singular values {sigma[0]:.3g}, {sigma[1]:.3g}",
+            next_step="take the perturbation returned by mu_peak or worst_case_gain",
+        )
     u, vh = U[:, 0], Vh[0]
     turn = np.exp(-1j * np.angle(u[np.argmax(np.abs(u))]))
     u, vh = u * turn, vh / turn
@@ -85,5 +89,7 @@ def _rank_one(value: Array, omega: float) -> StateSpace:
 
 def _unique(parts: list[StateSpace], into: str = "u", out: str = "y") -> list[StateSpace]:
     """The same systems with distinct signal names."""
-    return [part.renamed([f"{into}{k}_{i}" for i in range(part.ninputs)],
-                         [f"{out}{k}_{i}" for i in range(part.noutputs)]) for k, part in enumerate(parts)]
+    return [
+        part.renamed([f"{into}{k}_{i}" for i in range(part.ninputs)], [f"{out}{k}_{i}" for i in range(part.noutputs)])
+        for k, part in enumerate(parts)
+    ]

@@ -15,7 +15,7 @@ def first_frequencies(N: StateSpace, band: Interval, grid: int = 40) -> Array:
     """Initial frequencies [rad/s]: band ends, natural frequencies and resonances, and a coarse logarithmic grid."""
     poles = N.poles()
     size = np.abs(poles)
-    resonance = np.sqrt(np.maximum(size ** 2 - 2 * poles.real ** 2, 0.0))
+    resonance = np.sqrt(np.maximum(size**2 - 2 * poles.real**2, 0.0))
     named = np.concatenate([size, resonance[resonance > 0]])
     positive = named[named > 0]
     low, high = (positive.min() / 10, positive.max() * 10) if positive.size else (1.0, 1.0)
@@ -28,8 +28,16 @@ def first_frequencies(N: StateSpace, band: Interval, grid: int = 40) -> Array:
     return np.unique(np.concatenate([[band[0]], named, [band[1]]]))
 
 
-def refine_maxima(value: Callable[[Array], Array], omega: Array, values: Array, *, tolerance: float = 1e-4,
-                  worth: float = 0.9, most: int = 4, rounds: int = 12) -> tuple[Array, Array]:
+def refine_maxima(
+    value: Callable[[Array], Array],
+    omega: Array,
+    values: Array,
+    *,
+    tolerance: float = 1e-4,
+    worth: float = 0.9,
+    most: int = 4,
+    rounds: int = 12,
+) -> tuple[Array, Array]:
     """Add points around the highest local maxima until their brackets agree to `tolerance`; sorted omega, values.
 
     Only the `most` highest maxima are refined, and only those of at least `worth` times the highest.

@@ -50,9 +50,10 @@ class UpperBound(NamedTuple):
     @staticmethod
     def joined(parts: Sequence[UpperBound]) -> UpperBound:
         """Concatenate several batches."""
-        return UpperBound(np.concatenate([part.beta for part in parts]),
-                          LmiScalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts),
-                                                                        strict=True))))
+        return UpperBound(
+            np.concatenate([part.beta for part in parts]),
+            LmiScalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts), strict=True))),
+        )
 
 
 def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0, sweeps: int = 20) -> Array:
@@ -76,19 +77,28 @@ def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0
 
 def expand(structure: BlockStructure, d: Array) -> tuple[Array, Array]:
     """Per-entry scalings (d_z (B, n_z), d_w (B, n_w)) from one number per block."""
-    return (np.repeat(d, [b.cols for b in structure.blocks], axis=1),
-            np.repeat(d, [b.rows for b in structure.blocks], axis=1))
+    return (
+        np.repeat(d, [b.cols for b in structure.blocks], axis=1),
+        np.repeat(d, [b.rows for b in structure.blocks], axis=1),
+    )
 
 
 def rescaled(scalings: LmiScalings, d_z: Array, d_w: Array, size: Array) -> LmiScalings:
     """Convert scalings of diag(d_z) M / diag(d_w) / size to scalings of M."""
-    return LmiScalings(d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
-                    d_w[:, :, None] * scalings.X_w * d_w[:, None, :],
-                    size[:, None, None] * d_w[:, :, None] * scalings.G * d_z[:, None, :])
+    return LmiScalings(
+        d_z[:, :, None] * scalings.X_z * d_z[:, None, :],
+        d_w[:, :, None] * scalings.X_w * d_w[:, None, :],
+        size[:, None, None] * d_w[:, :, None] * scalings.G * d_z[:, None, :],
+    )
 
 
-def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, goal: Array | float = 0.0,
-                start: UpperBound | None = None) -> UpperBound:
+def upper_bound(
+    M: Array,
+    structure: BlockStructure,
+    tolerance: float = 1e-5,
+    goal: Array | float = 0.0,
+    start: UpperBound | None = None,
+) -> UpperBound:
     """Minimum beta with scalings that prove mu <= beta, for M (B, n_shared, n_z, n_w).
 
     Matrices along axis 1 share scalings. With `goal` > 0 the search stops when beta <= goal, at the analytic centre of
@@ -100,8 +110,12 @@ def upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1e-5, go
         return _upper_chunk(M, structure, tolerance, goals)
     n_chunk = max(1, int(SETTINGS.batch_bytes / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
     parts = [np.arange(k, min(k + n_chunk, M.shape[0])) for k in range(0, M.shape[0], n_chunk)]
-    return UpperBound.joined([_upper_chunk(M[part], structure, tolerance, goals[part],
-                                           None if start is None else start.at(part)) for part in parts])
+    return UpperBound.joined(
+        [
+            _upper_chunk(M[part], structure, tolerance, goals[part], None if start is None else start.at(part))
+            for part in parts
+        ]
+    )
 
 
 def bound_for_goal(M: Array, structure: BlockStructure, tolerance: float, goal: float) -> UpperBound:
@@ -131,8 +145,9 @@ def _replace(found: UpperBound, which: Array, better: UpperBound) -> None:
         whole[which] = part
 
 
-def _upper_chunk(M: Array, structure: BlockStructure, tolerance: float, goal: Array, start: UpperBound | None = None
-                 ) -> UpperBound:
+def _upper_chunk(
+    M: Array, structure: BlockStructure, tolerance: float, goal: Array, start: UpperBound | None = None
+) -> UpperBound:
     d_z, d_w = expand(structure, block_balance(M, structure, goal))
     balanced = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     size = np.max(np.linalg.norm(balanced, ord=2, axis=(2, 3)), axis=1)
@@ -166,12 +181,15 @@ def _is_diagonal(structure: BlockStructure) -> bool:
 
 def _diagonal(M: Array, structure: BlockStructure, live: Array, floor: Array, tolerance: float) -> LmiScalings:
     """Scalings of one number per block, by the compiled path; 1 where M is zero (not live)."""
-    of_z, of_w = (np.repeat(np.arange(len(structure.blocks)), sizes)
-                  for sizes in zip(*((b.cols, b.rows) for b in structure.blocks), strict=True))
+    of_z, of_w = (
+        np.repeat(np.arange(len(structure.blocks)), sizes)
+        for sizes in zip(*((b.cols, b.rows) for b in structure.blocks), strict=True)
+    )
     p = np.ones((M.shape[0], len(structure.blocks)))
     if np.any(live):
-        p[live], _ = follow_diagonal(np.ascontiguousarray(M[live]), of_z, of_w, p[0], np.full(live.sum(), 2.0),
-                                     floor[live], tolerance / 5, PATH)
+        p[live], _ = follow_diagonal(
+            np.ascontiguousarray(M[live]), of_z, of_w, p[0], np.full(live.sum(), 2.0), floor[live], tolerance / 5, PATH
+        )
     X_z, X_w = (p[:, of, None] * np.eye(of.size, dtype=complex) for of in (of_z, of_w))
     return LmiScalings(X_z, X_w, np.zeros((M.shape[0], of_w.size, of_z.size), complex))
 
@@ -201,8 +219,12 @@ def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, toleran
     """`skewed_upper_bound` for a normalised performance channel."""
     batch, r_w, r_z = M.shape[0], robust.n_w, robust.n_z
     beta = np.full(batch, np.inf)
-    found = LmiScalings(*(np.zeros((batch, *shape), complex) for shape in
-                       ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))))
+    found = LmiScalings(
+        *(
+            np.zeros((batch, *shape), complex)
+            for shape in ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))
+        )
+    )
     inner = upper_bound(M[:, :, :r_z, :r_w], robust, tolerance)
     safe = np.flatnonzero(inner.beta < 1.0 - 1e-9)
     if safe.size:
@@ -215,8 +237,9 @@ def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, toleran
     return UpperBound(beta, found)
 
 
-def _skewed_from(M: Array, structure: BlockStructure, start: LmiScalings, tolerance: float
-                 ) -> tuple[Array, LmiScalings]:
+def _skewed_from(
+    M: Array, structure: BlockStructure, start: LmiScalings, tolerance: float
+) -> tuple[Array, LmiScalings]:
     """Skewed bound, starting from scalings of the robust blocks that are feasible with a margin at level 1."""
     batch, r_w, r_z = M.shape[0], start.X_w.shape[1], start.X_z.shape[1]
     space = ScalingSpace.of(structure, np.arange(structure.n_w) >= r_w)
@@ -231,8 +254,10 @@ def _skewed_from(M: Array, structure: BlockStructure, start: LmiScalings, tolera
     X_w[:, r_w:, r_w:] *= X_p[:, None, None]
     X_z[:, r_z:, r_z:] *= X_p[:, None, None]
     # Coordinates in which these scalings are near the identity and the first level is 2.
-    d = np.stack([np.sqrt(np.trace(X_w[:, w, w], axis1=1, axis2=2).real / (w.stop - w.start))
-                  for _, w, _ in structure.slices()], axis=1)
+    d = np.stack(
+        [np.sqrt(np.trace(X_w[:, w, w], axis1=1, axis2=2).real / (w.stop - w.start)) for _, w, _ in structure.slices()],
+        axis=1,
+    )
     d_z, d_w = expand(structure, d)
     unit = M * d_z[:, None, :, None] / d_w[:, None, None, :]
     theta = space.theta(rescaled(LmiScalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))

@@ -76,12 +76,24 @@ class MuSynthesis(Shown):
     saved_state: dict[str, Any]
 
 
-def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: int, *,
-          callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
-          max_iterations: int = 30, backoff: float = 0.01, polish: bool = True, max_added_states: int | None = None,
-          starts: Sequence[StateSpace] = (), state: dict[str, Any] | None = None,
-          sample_rate_Hz: float | None = None, order: int | None = None,
-          structure: Literal["full", "decentralised"] = "full") -> MuSynthesis:
+def musyn(
+    P: Any,
+    blocks: BlockStructure | Sequence[Block],
+    nmeas: int,
+    ncon: int,
+    *,
+    callback: Callable[[Iteration], Any] | None = None,
+    target: float | None = None,
+    max_iterations: int = 30,
+    backoff: float = 0.01,
+    polish: bool = True,
+    max_added_states: int | None = None,
+    starts: Sequence[StateSpace] = (),
+    state: dict[str, Any] | None = None,
+    sample_rate_Hz: float | None = None,
+    order: int | None = None,
+    structure: Literal["full", "decentralised"] = "full",
+) -> MuSynthesis:
     """Controller u = K y that minimises the peak of mu, by D-K iteration.
 
     Parameters
@@ -133,20 +145,35 @@ def musyn(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: in
         raise InputError("expected 'full' or 'decentralised'", field="structure", value=structure)
     apart = structure == "decentralised"
     if apart and nmeas != ncon:
-        raise InputError("a decentralised controller has as many outputs as inputs", field="nmeas, ncon",
-                         value=(nmeas, ncon))
+        raise InputError(
+            "a decentralised controller has as many outputs as inputs", field="nmeas, ncon", value=(nmeas, ncon)
+        )
     if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
         raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
-    made = dk_iteration(P, blocks, nmeas, ncon, callback=callback, target=target, max_iterations=max_iterations,
-                        backoff=backoff, polish=polish, max_added_states=max_added_states, starts=starts, state=state)
+    made = dk_iteration(
+        P,
+        blocks,
+        nmeas,
+        ncon,
+        callback=callback,
+        target=target,
+        max_iterations=max_iterations,
+        backoff=backoff,
+        polish=polish,
+        max_added_states=max_added_states,
+        starts=starts,
+        state=state,
+    )
     with threadpool_limits(1, user_api="blas"):
         best, notes = made.best, tuple[str, ...]()
         if apart or (order is not None and best.K.nstates > order):
             task = Task(made.problem.P, made.problem.structure, decentralised=apart)
             *_, short = fixed_order(task, best.K, best.K.nstates if order is None else order)
             K, peak = short.K, short.peak
-            notes = (f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
-                     f"instead of {best.mu:.4g}",)
+            notes = (
+                f"{structure}, order {K.nstates} instead of {best.K.nstates}: complex mu on the grid {peak:.4g} "
+                f"instead of {best.mu:.4g}",
+            )
             best = Loop(K, best.scalings, np.nan, peak)
         return _result(made, best, sample_rate_Hz, notes)
 
@@ -186,11 +213,21 @@ class DKIteration:
         return float(points.omega[np.argmax(points.mu)])
 
 
-def dk_iteration(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: int, *,
-                 callback: Callable[[Iteration], Any] | None = None, target: float | None = None,
-                 max_iterations: int = 30, backoff: float = 0.01, polish: bool = True,
-                 max_added_states: int | None = None, starts: Sequence[StateSpace] = (),
-                 state: dict[str, Any] | None = None) -> DKIteration:
+def dk_iteration(
+    P: Any,
+    blocks: BlockStructure | Sequence[Block],
+    nmeas: int,
+    ncon: int,
+    *,
+    callback: Callable[[Iteration], Any] | None = None,
+    target: float | None = None,
+    max_iterations: int = 30,
+    backoff: float = 0.01,
+    polish: bool = True,
+    max_added_states: int | None = None,
+    starts: Sequence[StateSpace] = (),
+    state: dict[str, Any] | None = None,
+) -> DKIteration:
     """The iteration of `musyn` alone, with the same parameters and errors, for callers that change the controller
     before its bounds are computed."""
     P = as_plant(P, nmeas, ncon)
@@ -207,8 +244,9 @@ def dk_iteration(P: Any, blocks: BlockStructure | Sequence[Block], nmeas: int, n
         return DKIteration(P, problem, uncertainty, current, status)
 
 
-def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int,
-                ncon: int) -> tuple[BlockStructure, BlockStructure]:
+def _structures(
+    P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: int, ncon: int
+) -> tuple[BlockStructure, BlockStructure]:
     """The given blocks with performance, and the blocks used in the synthesis: complex, and with one number per
     scaling if there are many blocks."""
     uncertainty = BlockStructure.of(blocks)
@@ -217,7 +255,9 @@ def _structures(P: StateSpace, blocks: BlockStructure | Sequence[Block], nmeas: 
         raise InputError(
             f"blocks take {uncertainty.n_w} inputs and {uncertainty.n_z} outputs of a plant with "
             f"{P.ninputs - ncon} inputs (w_delta, w) and {P.noutputs - nmeas} outputs (z_delta, z); "
-            "at least one of each must be left for performance", field="blocks")
+            "at least one of each must be left for performance",
+            field="blocks",
+        )
     full = uncertainty.with_performance(n_w, n_z)
     return full, full.simplified() if full.many else full.complexified()
 
@@ -226,13 +266,20 @@ def _named(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:
     """A given controller with the signal names of the plant."""
     if not isinstance(K, StateSpace) or (K.ninputs, K.noutputs) != (nmeas, ncon) or K.dt != P.dt:
         clock = f"sampled at {P.dt:g} s" if P.dt else "continuous"
-        raise InputError(f"expected {clock} controllers with {nmeas} inputs and {ncon} outputs", field="starts",
-                         value=repr(K))
-    return K.renamed(P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:])
+        raise InputError(
+            f"expected {clock} controllers with {nmeas} inputs and {ncon} outputs", field="starts", value=repr(K)
+        )
+    return K.renamed(P.outputs[P.noutputs - nmeas :], P.inputs[P.ninputs - ncon :])
 
 
-def _options(target: float | None, max_iterations: int, backoff: float, polish: bool, cap: int,
-             callback: Callable[[Iteration], Any] | None) -> Options:
+def _options(
+    target: float | None,
+    max_iterations: int,
+    backoff: float,
+    polish: bool,
+    cap: int,
+    callback: Callable[[Iteration], Any] | None,
+) -> Options:
     if target is not None and not (np.isfinite(target) and target > 0):
         raise InputError("expected a positive number or None", field="target", value=target)
     if int(max_iterations) != max_iterations or max_iterations < 1:
@@ -249,8 +296,10 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
 
     These are the scalings of the K-step, or tightened ones if the former bound exceeds mu on the grid by over `TIGHT`.
     """
+
     def bound(scalings: Scalings) -> float:
         return hinf_norm(scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
+
     candidates = [(best.scalings, bound(best.scalings))]
     if candidates[0][1] > (1 + TIGHT) * best.mu:
         omega = frequency_grid(closed)
@@ -274,12 +323,29 @@ def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, given_n
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
     notes = [*given_notes]
     if has_real:
-        notes.append(f"the synthesis treats real blocks as complex: peak mu {complex_upper:.4g} with complex "
-                     f"blocks, {mu_upper:.4g} with real ones")
+        notes.append(
+            f"the synthesis treats real blocks as complex: peak mu {complex_upper:.4g} with complex "
+            f"blocks, {mu_upper:.4g} with real ones"
+        )
     if sample_rate_Hz is not None:
         ratio = fastest / (np.pi * sample_rate_Hz)
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma
-    return MuSynthesis(K, mu_upper, peak.lower, peak.omega, complex_upper, guaranteed, peak.delta, uncertainty,
-                       scalings, gamma, closed, fastest, state.history, made.status, tuple(notes),
-                       state.as_dict(problem.P, problem.structure, problem.nmeas, problem.ncon, P.dt))
+    return MuSynthesis(
+        K,
+        mu_upper,
+        peak.lower,
+        peak.omega,
+        complex_upper,
+        guaranteed,
+        peak.delta,
+        uncertainty,
+        scalings,
+        gamma,
+        closed,
+        fastest,
+        state.history,
+        made.status,
+        tuple(notes),
+        state.as_dict(problem.P, problem.structure, problem.nmeas, problem.ncon, P.dt),
+    )

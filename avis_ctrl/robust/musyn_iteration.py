@@ -33,8 +33,14 @@ from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 # Successor of each phase.
-FOLLOWING = {"first start": "D-K", "D-K": "descent", "other start": "descent", "descent": "growth",
-             "growth": "last start", "last start": DONE}
+FOLLOWING = {
+    "first start": "D-K",
+    "D-K": "descent",
+    "other start": "descent",
+    "descent": "growth",
+    "growth": "last start",
+    "last start": DONE,
+}
 STOPPED = "stopped by the caller, before the iteration had ended"
 
 
@@ -54,7 +60,7 @@ class IterationSettings:
     round: float = 0.002
     fast: float = 0.25
     idle: float = 0.01
-    constants: tuple[float, ...] = tuple(10.0 ** k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
+    constants: tuple[float, ...] = tuple(10.0**k for k in (-3, -2.5, -2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2, 2.5, 3))
 
 
 SETTINGS = IterationSettings()
@@ -104,8 +110,16 @@ def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], opti
         (scalings, cost, kind), synthesis = step
         points = analysed(problem.P, synthesis.K, problem.structure, _next_grid(state, synthesis.closed_loop))
         loop = Loop(synthesis.K, scalings, synthesis.gamma, points.peak)
-        row = Iteration(len(state.history), synthesis.gamma, points.peak, synthesis.K.nstates, cost,
-                        sum(scalings.orders), time.monotonic() - began, kind)
+        row = Iteration(
+            len(state.history),
+            synthesis.gamma,
+            points.peak,
+            synthesis.K.nstates,
+            cost,
+            sum(scalings.orders),
+            time.monotonic() - began,
+            kind,
+        )
         state = _recorded(problem, state, loop, row, points)
         if _stopped_by(options, row):
             return state, STOPPED
@@ -151,11 +165,14 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
     return replace(state, phase="first start" if idle else "D-K"), False
 
 
-def _candidates(problem: Problem, starts: tuple[StateSpace, ...],
-                options: Options) -> list[tuple[str, Callable[[], StateSpace]]]:
+def _candidates(
+    problem: Problem, starts: tuple[StateSpace, ...], options: Options
+) -> list[tuple[str, Callable[[], StateSpace]]]:
     """Kind and constructor of each initial controller."""
+
     def optimal(P: StateSpace) -> StateSpace:
         return hinf_controller(P, problem.nmeas, problem.ncon, options.backoff).K
+
     performance = problem.structure.blocks[-1]
     n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
     made: list[tuple[str, Callable[[], StateSpace]]] = [(HINF, lambda: optimal(problem.P))]
@@ -172,8 +189,10 @@ def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
     """Loop of an initial controller with its analysis; ComputationError if it does not stabilise the plant."""
     closed = lft_lower(problem.P, K)
     if not closed.is_stable():
-        raise ComputationError("a controller to start from does not stabilise the plant",
-                               measured=f"largest real part of a pole {np.max(closed.poles().real):.3g} rad/s")
+        raise ComputationError(
+            "a controller to start from does not stabilise the plant",
+            measured=f"largest real part of a pole {np.max(closed.poles().real):.3g} rad/s",
+        )
     points = analysed(problem.P, K, problem.structure, frequency_grid(closed))
     return Loop(K, Scalings.identity(problem.structure), hinf_norm(closed).gain, points.peak), points
 
@@ -193,8 +212,9 @@ def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal,
     return _best(problem, _proposed(problem, state, options), options, hint)
 
 
-def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hint: float, below: float = np.inf
-          ) -> tuple[Proposal, Synthesis] | None:
+def _best(
+    problem: Problem, proposals: Iterable[Proposal], options: Options, hint: float, below: float = np.inf
+) -> tuple[Proposal, Synthesis] | None:
     """The proposal with the smallest H-infinity optimum, at most `below`, and its controller. A later proposal is
     preferred if its optimum is smaller by more than `stall`. A proposal that reaches the target ends the search."""
     best: tuple[Proposal, Synthesis] | None = None
@@ -202,8 +222,13 @@ def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hin
         try:
             if np.isfinite(below) and not problem.scaled.reaches(proposal.scalings, below):
                 continue
-            made = hinf_controller(proposal.scalings.scale(problem.P), problem.nmeas, problem.ncon, options.backoff,
-                                   best[1].gamma if best else hint)
+            made = hinf_controller(
+                proposal.scalings.scale(problem.P),
+                problem.nmeas,
+                problem.ncon,
+                options.backoff,
+                best[1].gamma if best else hint,
+            )
         except ComputationError:
             continue
         if best is None or made.gamma < best[1].gamma:
@@ -216,8 +241,10 @@ def _best(problem: Problem, proposals: Iterable[Proposal], options: Options, hin
 def _no_further(state: State, options: Options) -> str:
     """Reason to end the iteration; empty if it continues."""
     if state.phase == DONE:
-        return (f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
-                f"{100 * SETTINGS.round:g} %")
+        return (
+            f"converged: a round of D-K iteration, descent on gamma and larger orders gains no more than "
+            f"{100 * SETTINGS.round:g} %"
+        )
     if state.phase in ("descent", "growth", "last start") and not options.polish:
         return f"D-K iteration stalled: a step gained less than {100 * SETTINGS.stall:g} %"
     if options.target is not None and state.best and state.best.gamma <= options.target:
@@ -256,8 +283,13 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
     if state.phase == "D-K":
         floors = (BROAD_FLOOR, DETAILED_FLOOR) if _falls_fast(state) else (DETAILED_FLOOR, BROAD_FLOOR)
         try:
-            for step in d_steps(state.points, lft_lower(problem.P, state.last.K), state.last.scalings, floors,
-                                max_states=options.max_added_states):
+            for step in d_steps(
+                state.points,
+                lft_lower(problem.P, state.last.K),
+                state.last.scalings,
+                floors,
+                max_states=options.max_added_states,
+            ):
                 yield Proposal(step.scalings, step.cost, "D-K")
         except np.linalg.LinAlgError:
             # A loop whose decompositions fail (entries of extreme magnitude) ends the D-K phase, not the synthesis.
@@ -282,8 +314,14 @@ def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
     With K = 0 the actuator uncertainty receives no signal and all D-scalings are equivalent: no D-step can improve it.
     """
     P = problem.P
-    at_rest = lft_lower(P, gain(np.zeros((problem.ncon, problem.nmeas)), P.outputs[P.noutputs - problem.nmeas:],
-                                P.inputs[P.ninputs - problem.ncon:]))
+    at_rest = lft_lower(
+        P,
+        gain(
+            np.zeros((problem.ncon, problem.nmeas)),
+            P.outputs[P.noutputs - problem.nmeas :],
+            P.inputs[P.ninputs - problem.ncon :],
+        ),
+    )
     if not at_rest.is_stable():
         return False
     open_loop = upper_bound(at_rest.frequency_response(omega)[:, None], problem.structure, 1e-3).beta
@@ -328,8 +366,13 @@ def _recorded(problem: Problem, state: State, loop: Loop, row: Iteration, points
     """The state after an iteration: best loops updated, and the next phase if too little was gained on this path."""
     path = state.path
     assert state.best is not None and path is not None
-    state = replace(state, points=points, last=loop, best=loop if loop.mu < state.best.mu else state.best,
-                    history=(*state.history, row))
+    state = replace(
+        state,
+        points=points,
+        last=loop,
+        best=loop if loop.mu < state.best.mu else state.best,
+        history=(*state.history, row),
+    )
     if row.kind == "start":
         return replace(state, phase="D-K", path=loop, round_mu=loop.mu)
     gained = 1 - loop.mu / path.mu

@@ -58,8 +58,12 @@ class Loop:
 
     def as_dict(self) -> dict[str, Any]:
         """Content for a JSON file."""
-        return {"K": {key: getattr(self.K, key).tolist() for key in "ABCD"}, "scalings": self.scalings.as_dicts(),
-                "gamma": self.gamma, "mu": self.mu}
+        return {
+            "K": {key: getattr(self.K, key).tolist() for key in "ABCD"},
+            "scalings": self.scalings.as_dicts(),
+            "gamma": self.gamma,
+            "mu": self.mu,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +85,24 @@ class State:
     def as_dict(self, P: StateSpace, structure: BlockStructure, nmeas: int, ncon: int, dt: float) -> dict[str, Any]:
         """JSON form, with a digest that identifies the problem."""
         assert self.last is not None and self.best is not None and self.path is not None and self.points is not None
-        return {"format": FORMAT, "version": VERSION, "controller": [nmeas, ncon, dt],
-                "problem": _digest(P, structure), "phase": self.phase, "round_mu": self.round_mu,
-                "omega": self.points.omega.tolist(), "last": self.last.as_dict(), "best": self.best.as_dict(),
-                "path": self.path.as_dict(), "history": [asdict(row) for row in self.history]}
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "controller": [nmeas, ncon, dt],
+            "problem": _digest(P, structure),
+            "phase": self.phase,
+            "round_mu": self.round_mu,
+            "omega": self.points.omega.tolist(),
+            "last": self.last.as_dict(),
+            "best": self.best.as_dict(),
+            "path": self.path.as_dict(),
+            "history": [asdict(row) for row in self.history],
+        }
 
     @staticmethod
-    def from_dict(saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int,
-                  dt: float) -> tuple[State, tuple[StateSpace, ...]]:
+    def from_dict(
+        saved: dict[str, Any], structure: BlockStructure, P: StateSpace, nmeas: int, ncon: int, dt: float
+    ) -> tuple[State, tuple[StateSpace, ...]]:
         """The state to continue from; for another problem (a changed weight, say) an empty state and its controllers.
 
         No measurement on another plant is reused; its controllers become candidates for the initial controller.
@@ -97,24 +111,39 @@ class State:
         if not isinstance(saved, dict) or saved.get("format") != FORMAT or saved.get("version") != VERSION:
             raise InputError(f"expected a saved state of format {FORMAT!r}, version {VERSION}", field="state")
         if saved.get("controller") != [nmeas, ncon, dt]:
-            raise InputError("the saved state belongs to another plant: its controllers have numbers of y and u, and a "
-                             f"sample time, of {saved.get('controller')}, not {[nmeas, ncon, dt]}", field="state")
-        n_y, n_u = P.outputs[P.noutputs - nmeas:], P.inputs[P.ninputs - ncon:]
+            raise InputError(
+                "the saved state belongs to another plant: its controllers have numbers of y and u, and a "
+                f"sample time, of {saved.get('controller')}, not {[nmeas, ncon, dt]}",
+                field="state",
+            )
+        n_y, n_u = P.outputs[P.noutputs - nmeas :], P.inputs[P.ninputs - ncon :]
 
         def controller(item: dict[str, Any]) -> StateSpace:
             A, B, C, D = (np.array(item["K"][key], float) for key in "ABCD")
             return StateSpace(A, B, C, D, 0.0, n_y, n_u)
 
         def loop(item: dict[str, Any]) -> Loop:
-            return Loop(controller(item), Scalings.from_dicts(structure, item["scalings"]), float(item["gamma"]),
-                        float(item["mu"]))
+            return Loop(
+                controller(item),
+                Scalings.from_dicts(structure, item["scalings"]),
+                float(item["gamma"]),
+                float(item["mu"]),
+            )
+
         if saved["problem"] != _digest(P, structure):
             different = {json.dumps(saved[name]["K"]): saved[name] for name in ("best", "path", "last")}
             return State(), tuple(controller(item) for item in different.values())
         last = loop(saved["last"])
         points = analysed(P, last.K, structure, np.array(saved["omega"], float))
-        return State(str(saved["phase"]), points, last, loop(saved["best"]), loop(saved["path"]),
-                     tuple(Iteration(**row) for row in saved["history"]), float(saved["round_mu"])), ()
+        return State(
+            str(saved["phase"]),
+            points,
+            last,
+            loop(saved["best"]),
+            loop(saved["path"]),
+            tuple(Iteration(**row) for row in saved["history"]),
+            float(saved["round_mu"]),
+        ), ()
 
 
 def _digest(P: StateSpace, structure: BlockStructure) -> str:

@@ -60,8 +60,14 @@ def closed_loop_gamma(P: StateSpace, K: StateSpace) -> float:
     return hinf_norm(lft_lower(P, K)).gain
 
 
-def reduce_controller(P: Any, K: StateSpace, measure: Callable[[StateSpace], float] | None = None,
-                      growth: float = 0.01, orders: range | None = None, limit: float | None = None) -> Reduction:
+def reduce_controller(
+    P: Any,
+    K: StateSpace,
+    measure: Callable[[StateSpace], float] | None = None,
+    growth: float = 0.01,
+    orders: range | None = None,
+    limit: float | None = None,
+) -> Reduction:
     """The controller of lowest order whose figure of merit grows by at most `growth` (relative).
 
     Parameters
@@ -124,9 +130,11 @@ def residualise_fast(K: StateSpace, limit: float, also_unstable: bool = False) -
     if not fast.nstates:
         return K
     if not fast.is_stable() and not also_unstable:
-        raise ComputationError("an unstable pole is too fast to implement",
-                               measured=f"{np.max(np.abs(fast.poles())):.4g} rad/s, limit {limit:.4g} rad/s",
-                               next_step="raise the back-off, or sample faster")
+        raise ComputationError(
+            "an unstable pole is too fast to implement",
+            measured=f"{np.max(np.abs(fast.poles())):.4g} rad/s, limit {limit:.4g} rad/s",
+            next_step="raise the back-off, or sample faster",
+        )
     return replace(slow, D=slow.D + fast.dcgain())
 
 
@@ -149,7 +157,7 @@ def replace_fast_by_lags(K: StateSpace, corner: float, order: int = 3) -> StateS
     lag = 1 / (1 + 1j * omega / corner)
     size = np.maximum(np.linalg.norm(K.frequency_response(omega), ord=2, axis=(1, 2)), np.finfo(float).tiny)
     # lag^k - lag^(k + 1) is zero at s = 0: the fit cannot change K(0).
-    basis = np.stack([(lag ** k - lag ** (k + 1)) / size for k in range(order)], axis=1)
+    basis = np.stack([(lag**k - lag ** (k + 1)) / size for k in range(order)], axis=1)
     target = ((fast.frequency_response(omega) - fast.dcgain()) / size[:, None, None]).reshape(omega.size, -1)
     gains = np.linalg.lstsq(np.r_[basis.real, basis.imag], np.r_[target.real, target.imag])[0]
     gains = np.concatenate([gains.reshape(order, n_u, n_y), np.zeros((1, n_u, n_y))])

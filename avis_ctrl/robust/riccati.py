@@ -52,8 +52,9 @@ class RiccatiSolution:
     omega: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
-def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
-                  noise: Sequence[np.ndarray] | None = None) -> RiccatiSolution:
+def solve_riccati(
+    A: np.ndarray, R: np.ndarray, Q: np.ndarray, noise: Sequence[np.ndarray] | None = None
+) -> RiccatiSolution:
     """Stabilising solution X of A'X + XA + XRX + Q = 0, with R and Q symmetric (n, n).
 
     noise : error bounds of the entries of A, R and Q, if these were computed themselves.
@@ -98,8 +99,9 @@ def solve_riccati(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
     return RiccatiSolution(X, not indefinite, doubtful=not indefinite)
 
 
-def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray,
-            noise: Sequence[np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray] | None:
+def refined(
+    A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray, noise: Sequence[np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray] | None:
     """X after one Newton step, and E >= 0 with X - E <= exact solution <= X + E to first order in round-off.
 
     None if A + R X is not stable or a linear equation is singular.
@@ -119,9 +121,9 @@ def refined(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray,
     return None if E is None else (X, E)
 
 
-def refined_balanced(A: np.ndarray, R: np.ndarray, Q: np.ndarray,
-                     X: np.ndarray, noise: Sequence[np.ndarray] | None = None
-                     ) -> tuple[np.ndarray, np.ndarray] | None:
+def refined_balanced(
+    A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray, noise: Sequence[np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray] | None:
     """`refined` after a symplectic balancing of the states, which reduces the effect of round-off."""
     d = symplectic_scale(A, R, Q)
     both = np.outer(d, d)
@@ -185,5 +187,5 @@ def _schur_eigenvalues(T: np.ndarray) -> np.ndarray:
     """Eigenvalues of a real quasi-triangular matrix in LAPACK's standard form (equal diagonals in 2 x 2 blocks)."""
     values = np.diag(T).astype(complex)
     for k in np.flatnonzero(np.diag(T, -1)):
-        values[k:k + 2] += np.array([1j, -1j]) * np.sqrt(abs(T[k, k + 1] * T[k + 1, k]))
+        values[k : k + 2] += np.array([1j, -1j]) * np.sqrt(abs(T[k, k + 1] * T[k + 1, k]))
     return values

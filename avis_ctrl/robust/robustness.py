@@ -52,8 +52,9 @@ class Robustness(Shown):
         return False if self.upper <= 1 else None
 
 
-def robust_stability(system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
-                     ) -> Robustness:
+def robust_stability(
+    system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
+) -> Robustness:
     """Size of the uncertainty, relative to the declared uncertainty, up to which a loop is stable.
 
     Parameters
@@ -79,8 +80,9 @@ def robust_stability(system: Any, blocks: BlockStructure | Sequence[Block] | Non
     return _robustness(mu_peak(inner, structure, slack=slack), structure, elements)
 
 
-def robust_performance(system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
-                       ) -> Robustness:
+def robust_performance(
+    system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
+) -> Robustness:
     """Largest a for which the gain from d to e is at most 1/a with a times the declared uncertainty.
 
     `lower` is a proved value of a: the loop is stable and its gain at most 1/a for all uncertainty of this size.
@@ -102,8 +104,13 @@ def robust_performance(system: Any, blocks: BlockStructure | Sequence[Block] | N
     return _robustness(mu_peak(P, whole, slack=slack), structure, elements)
 
 
-def worst_case_gain(system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *,
-                    band: tuple[float, float] = ALL_FREQUENCIES, slack: float = SLACK) -> MuPeak:
+def worst_case_gain(
+    system: Any,
+    blocks: BlockStructure | Sequence[Block] | None = None,
+    *,
+    band: tuple[float, float] = ALL_FREQUENCIES,
+    slack: float = SLACK,
+) -> MuPeak:
     """Largest gain from d to e over the declared uncertainty; `avis_ctrl.robust.mu_peak.worst_case_gain`.
 
     system, blocks : as for `robust_stability`. band : (low, high) in rad/s. slack : as for `mu_peak`.
@@ -124,8 +131,9 @@ def worst_case_gain(system: Any, blocks: BlockStructure | Sequence[Block] | None
     return peaks.worst_case_gain(P, structure, band=band, slack=slack)
 
 
-def _opened(system: Any, blocks: BlockStructure | Sequence[Block] | None
-            ) -> tuple[StateSpace, BlockStructure, dict[str, Any]]:
+def _opened(
+    system: Any, blocks: BlockStructure | Sequence[Block] | None
+) -> tuple[StateSpace, BlockStructure, dict[str, Any]]:
     if isinstance(system, UncertainSystem):
         if blocks is not None:
             raise InputError("expected no blocks: the system has its own", field="blocks")
@@ -138,18 +146,31 @@ def _opened(system: Any, blocks: BlockStructure | Sequence[Block] | None
     if not structure.blocks:
         raise InputError("expected something uncertain", field="system")
     if P.ninputs < structure.n_w or P.noutputs < structure.n_z:
-        raise InputError(f"the blocks need {structure.n_w} inputs and {structure.n_z} outputs", field="system",
-                         value=P.D.shape)
+        raise InputError(
+            f"the blocks need {structure.n_w} inputs and {structure.n_z} outputs", field="system", value=P.D.shape
+        )
     return P, structure, elements
 
 
 def _robustness(peak: MuPeak, structure: BlockStructure, elements: dict[str, Any]) -> Robustness:
     worst: dict[str, Any] = {}
     if peak.delta is not None:
-        part = peak.delta[:structure.n_w, :structure.n_z]
+        part = peak.delta[: structure.n_w, : structure.n_z]
         for block, value in zip(structure.blocks, structure.values(part), strict=True):
             one = elements.get(block.name)
-            worst[block.name] = (one.value(float(np.real(value))) if isinstance(one, RealParameter) else
-                                 float(np.real(value)) if block.kind == "real" else value)
-    return Robustness(1 / peak.upper if peak.upper > 0 else np.inf, 1 / peak.lower if peak.lower > 0 else np.inf,
-                      peak.omega, peak.guaranteed, worst, peak.delta, peak)
+            worst[block.name] = (
+                one.value(float(np.real(value)))
+                if isinstance(one, RealParameter)
+                else float(np.real(value))
+                if block.kind == "real"
+                else value
+            )
+    return Robustness(
+        1 / peak.upper if peak.upper > 0 else np.inf,
+        1 / peak.lower if peak.lower > 0 else np.inf,
+        peak.omega,
+        peak.guaranteed,
+        worst,
+        peak.delta,
+        peak,
+    )

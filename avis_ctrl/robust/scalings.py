@@ -49,13 +49,15 @@ class ScalarScaling:
         return ScalarScaling(np.array([np.log(d)]))
 
     @staticmethod
-    def from_roots(g: float, zeros: Sequence[complex] | np.ndarray,
-                   poles: Sequence[complex] | np.ndarray) -> ScalarScaling:
+    def from_roots(
+        g: float, zeros: Sequence[complex] | np.ndarray, poles: Sequence[complex] | np.ndarray
+    ) -> ScalarScaling:
         """From the gain at infinite frequency and equal numbers of zeros and poles, conjugates included."""
         if len(zeros) != len(poles) or g <= 0:
             raise InputError(f"expected g > 0 and as many zeros as poles, not {g}, {len(zeros)} and {len(poles)}")
-        return ScalarScaling(np.concatenate([[np.log(g)], _pair(np.asarray(zeros, complex)),
-                                             _pair(np.asarray(poles, complex))]))
+        return ScalarScaling(
+            np.concatenate([[np.log(g)], _pair(np.asarray(zeros, complex)), _pair(np.asarray(poles, complex))])
+        )
 
     @property
     def order(self) -> int:
@@ -74,17 +76,17 @@ class ScalarScaling:
     @property
     def zeros(self) -> np.ndarray:
         """Zeros [rad/s]."""
-        return _roots(self.theta[1:1 + self.order])
+        return _roots(self.theta[1 : 1 + self.order])
 
     @property
     def poles(self) -> np.ndarray:
         """Poles [rad/s]."""
-        return _roots(self.theta[1 + self.order:])
+        return _roots(self.theta[1 + self.order :])
 
     def inverse(self) -> ScalarScaling:
         """1 / d(s)."""
         n = self.order
-        return ScalarScaling(np.concatenate([[-self.theta[0]], self.theta[1 + n:], self.theta[1:1 + n]]))
+        return ScalarScaling(np.concatenate([[-self.theta[0]], self.theta[1 + n :], self.theta[1 : 1 + n]]))
 
     def within(self, band: tuple[float, float]) -> ScalarScaling:
         """Move roots beyond the band [rad/s] to its edges; the magnitude far inside the band is unchanged."""
@@ -105,27 +107,36 @@ class ScalarScaling:
 
     def with_neutral_pair(self, omega: float, split: float = 0.0) -> ScalarScaling:
         """Add a zero at -omega e^split and a pole at -omega e^-split; for split = 0 d(s) is unchanged."""
-        return ScalarScaling.from_roots(np.exp(self.theta[0]), np.append(self.zeros, -omega * np.exp(split)),
-                                        np.append(self.poles, -omega * np.exp(-split)))
+        return ScalarScaling.from_roots(
+            np.exp(self.theta[0]),
+            np.append(self.zeros, -omega * np.exp(split)),
+            np.append(self.poles, -omega * np.exp(-split)),
+        )
 
     def log_magnitude(self, omega: np.ndarray) -> np.ndarray:
         """log |d(j omega)| (n_omega,), omega in rad/s, finite."""
         n = self.order
-        return (self.theta[0] + _log_modulus(self.theta[1:1 + n], omega)[0]
-                - _log_modulus(self.theta[1 + n:], omega)[0])
+        return (
+            self.theta[0] + _log_modulus(self.theta[1 : 1 + n], omega)[0] - _log_modulus(self.theta[1 + n :], omega)[0]
+        )
 
     def jacobian(self, omega: np.ndarray) -> np.ndarray:
         """Derivative of `log_magnitude` with respect to theta (n_omega, 1 + 2 n)."""
         n = self.order
-        return np.hstack([np.ones((np.size(omega), 1)), _log_modulus(self.theta[1:1 + n], omega)[1],
-                          -_log_modulus(self.theta[1 + n:], omega)[1]])
+        return np.hstack(
+            [
+                np.ones((np.size(omega), 1)),
+                _log_modulus(self.theta[1 : 1 + n], omega)[1],
+                -_log_modulus(self.theta[1 + n :], omega)[1],
+            ]
+        )
 
     @cached_property
     def matrices(self) -> Matrices:
         """A, B, C, D of a cascade of first- and second-order sections, slow sections first."""
         n = self.order
         A, B, C, D = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n)), np.exp(self.theta[:1])[:, None]
-        zeros, poles = np.exp(self.theta[1:1 + n]), np.exp(self.theta[1 + n:])
+        zeros, poles = np.exp(self.theta[1 : 1 + n]), np.exp(self.theta[1 + n :])
         for k in range(0, n, 2):
             section = slice(k, min(k + 2, n))
             # Fast states first: A is block upper triangular like a Schur form, which is accurate over eight decades.
@@ -151,8 +162,11 @@ def _pair(roots: np.ndarray) -> np.ndarray:
     real = np.sort(-roots[np.abs(roots.imag) <= 1e-12 * np.abs(roots)].real)
     upper = roots[roots.imag > 1e-12 * np.abs(roots)]
     pairs = [(abs(s), -s.real / abs(s)) for s in upper]
-    pairs += [(np.sqrt(a * b), (a + b) / (2 * np.sqrt(a * b)))
-              for a, b in zip(real[0:-1:2], real[1::2], strict=True)] if real.size > 1 else []
+    pairs += (
+        [(np.sqrt(a * b), (a + b) / (2 * np.sqrt(a * b))) for a, b in zip(real[0:-1:2], real[1::2], strict=True)]
+        if real.size > 1
+        else []
+    )
     pairs.sort()
     lone = [np.log(real[-1])] if real.size % 2 else []
     if 2 * len(pairs) + len(lone) != roots.size:
@@ -165,10 +179,10 @@ def _roots(theta: np.ndarray) -> np.ndarray:
     for log_w, log_zeta in zip(theta[0:-1:2], theta[1::2], strict=True) if theta.size > 1 else ():
         w, zeta = np.exp(log_w), np.exp(log_zeta)
         if zeta >= 1:
-            fast = w * (zeta + np.sqrt(zeta ** 2 - 1))
+            fast = w * (zeta + np.sqrt(zeta**2 - 1))
             roots += [-fast, -w * w / fast]
         else:
-            roots += [w * complex(-zeta, sign * np.sqrt(1 - zeta ** 2)) for sign in (1, -1)]
+            roots += [w * complex(-zeta, sign * np.sqrt(1 - zeta**2)) for sign in (1, -1)]
     if theta.size % 2:
         roots.append(-np.exp(theta[-1]))
     return np.array(roots, complex)
@@ -180,14 +194,14 @@ def _log_modulus(theta: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.n
     value, slope = np.zeros(omega.size), np.zeros((omega.size, theta.size))
     for k in range(theta.size // 2):
         w2, c = np.exp(2 * theta[2 * k]), 4 * np.exp(2 * theta[2 * k + 1])
-        size = (w2 - omega ** 2) ** 2 + c * w2 * omega ** 2
+        size = (w2 - omega**2) ** 2 + c * w2 * omega**2
         value += 0.5 * np.log(size)
-        slope[:, 2 * k] = (2 * w2 * (w2 - omega ** 2) + c * w2 * omega ** 2) / size
-        slope[:, 2 * k + 1] = c * w2 * omega ** 2 / size
+        slope[:, 2 * k] = (2 * w2 * (w2 - omega**2) + c * w2 * omega**2) / size
+        slope[:, 2 * k + 1] = c * w2 * omega**2 / size
     if theta.size % 2:
         a2 = np.exp(2 * theta[-1])
-        value += 0.5 * np.log(omega ** 2 + a2)
-        slope[:, -1] = a2 / (omega ** 2 + a2)
+        value += 0.5 * np.log(omega**2 + a2)
+        slope[:, -1] = a2 / (omega**2 + a2)
     return value, slope
 
 
@@ -198,9 +212,9 @@ def _section(zeros: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarr
     else:
         (wz, zz), (wp, zp) = zeros, poles
         a, b = np.array([[0.0, wp], [-wp, -2 * zp * wp]]), np.array([[0.0], [1.0]])
-        c = np.array([[(wz ** 2 - wp ** 2) / wp, 2 * zz * wz - 2 * zp * wp]])
+        c = np.array([[(wz**2 - wp**2) / wp, 2 * zz * wz - 2 * zp * wp]])
     # b and c of similar size, as a smooth function of the roots even if they cancel
-    root = (np.sum(c ** 2) + (0.01 * poles[0]) ** 2) ** 0.25
+    root = (np.sum(c**2) + (0.01 * poles[0]) ** 2) ** 0.25
     return a, b * root, c / root
 
 
@@ -281,14 +295,21 @@ class Scalings:
     @staticmethod
     def identity(structure: BlockStructure) -> Scalings:
         """All scalings equal to one."""
-        return Scalings(structure, tuple(MatrixScaling(gain(np.eye(b.rows))) if b.repeated else
-                                         ScalarScaling.constant(1.0) for b in structure.blocks))
+        return Scalings(
+            structure,
+            tuple(
+                MatrixScaling(gain(np.eye(b.rows))) if b.repeated else ScalarScaling.constant(1.0)
+                for b in structure.blocks
+            ),
+        )
 
     @staticmethod
     def uniform(structure: BlockStructure, d: float) -> Scalings:
         """The constant d > 0 for every block except performance."""
-        parts = [MatrixScaling(gain(d * np.eye(b.rows))) if b.repeated else ScalarScaling.constant(d)
-                 for b in structure.blocks[:-1]]
+        parts = [
+            MatrixScaling(gain(d * np.eye(b.rows))) if b.repeated else ScalarScaling.constant(d)
+            for b in structure.blocks[:-1]
+        ]
         return Scalings(structure, (*parts, ScalarScaling.constant(1.0)))
 
     @property
@@ -321,12 +342,14 @@ class Scalings:
     @property
     def added_states(self) -> int:
         """Maximum number of states that the scalings add to the plant."""
-        return sum(part.order * (2 if isinstance(part, MatrixScaling) else block.rows + block.cols)
-                   for part, block in zip(self.parts, self.structure.blocks, strict=True))
+        return sum(
+            part.order * (2 if isinstance(part, MatrixScaling) else block.rows + block.cols)
+            for part, block in zip(self.parts, self.structure.blocks, strict=True)
+        )
 
     def replace(self, index: int, part: Part) -> Scalings:
         """The same scalings with that of one block replaced."""
-        return replace(self, parts=(*self.parts[:index], part, *self.parts[index + 1:]))
+        return replace(self, parts=(*self.parts[:index], part, *self.parts[index + 1 :]))
 
     def left(self) -> StateSpace:
         """D_z(s) (n_z, n_z), to the left of N."""
@@ -374,8 +397,9 @@ class Scalings:
         Bl_all[:, :w] = Bl_all[:, :w] @ Dr
         Br_all = np.hstack([Br, np.zeros((n_r, P.ninputs - w))])
         Cl_all = np.vstack([Cl, np.zeros((P.noutputs - z, n_l))])
-        return StateSpace(A, np.vstack([Bl_all, B, Br_all]), np.hstack([Cl_all, C, through]), D, 0.0,
-                          P.inputs, P.outputs)
+        return StateSpace(
+            A, np.vstack([Bl_all, B, Br_all]), np.hstack([Cl_all, C, through]), D, 0.0, P.inputs, P.outputs
+        )
 
     def as_dicts(self) -> list[dict[str, Any]]:
         """JSON form of the parts."""
@@ -385,16 +409,27 @@ class Scalings:
     @staticmethod
     def from_dicts(structure: BlockStructure, items: Sequence[dict[str, Any]]) -> Scalings:
         """Inverse of `as_dicts`."""
+
         def part(item: dict[str, Any]) -> Part:
             if "theta" in item:
                 return ScalarScaling(np.array(item["theta"]))
             D = np.array(item["D"], float)
             n = len(item["A"])
-            return MatrixScaling(StateSpace(np.reshape(item["A"], (n, n)), np.reshape(item["B"], (n, D.shape[1])),
-                                            np.reshape(item["C"], (D.shape[0], n)), D),
-                                 ScalarScaling(np.array(item["factor"])))
-        return Scalings(structure, tuple(part(item) for item in items),
-                        tuple(int(item["group"]) for item in items if "group" in item))
+            return MatrixScaling(
+                StateSpace(
+                    np.reshape(item["A"], (n, n)),
+                    np.reshape(item["B"], (n, D.shape[1])),
+                    np.reshape(item["C"], (D.shape[0], n)),
+                    D,
+                ),
+                ScalarScaling(np.array(item["factor"])),
+            )
+
+        return Scalings(
+            structure,
+            tuple(part(item) for item in items),
+            tuple(int(item["group"]) for item in items if "group" in item),
+        )
 
     def _diagonal(self, inverse: bool, through: np.ndarray | None = None) -> Matrices:
         """Block-diagonal A, B, C, D of D_z, or of the inverse of D_w.
@@ -403,8 +438,9 @@ class Scalings:
         realised once for each independent combination, which is exact for these signals only.
         """
         stack: list[tuple[np.ndarray, Matrices]] = []
-        at = [np.arange(w.start, w.stop) if inverse else np.arange(z.start, z.stop)
-              for _, w, z in self.structure.slices()]
+        at = [
+            np.arange(w.start, w.stop) if inverse else np.arange(z.start, z.stop) for _, w, z in self.structure.slices()
+        ]
         parts = [part.inverse() if inverse else part for part in self.parts]
         for blocks in (*self.members, (len(parts) - 1,)):
             first = parts[blocks[0]]
@@ -420,12 +456,17 @@ class Scalings:
                 U = U[:, sizes > RANK * sizes[0]]
                 common = ScalarScaling(np.concatenate([[0.0], first.scalar.theta[1:]])).matrices
                 a, b, c = (np.kron(one, np.eye(U.shape[1])) for one in common[:3])
-                own = (a, b @ (U.T * gains), U @ c, np.diag(gains)) if not inverse else (
-                    a, b @ U.T, gains[:, None] * (U @ c), np.diag(gains))
+                own = (
+                    (a, b @ (U.T * gains), U @ c, np.diag(gains))
+                    if not inverse
+                    else (a, b @ U.T, gains[:, None] * (U @ c), np.diag(gains))
+                )
                 stack.append((signals, own))
         states, signals_all = sum(one[0].shape[0] for _, one in stack), sum(len(to) for to, _ in stack)
-        A, B, C, D = (np.zeros(shape) for shape in ((states, states), (states, signals_all), (signals_all, states),
-                                                    (signals_all, signals_all)))
+        A, B, C, D = (
+            np.zeros(shape)
+            for shape in ((states, states), (states, signals_all), (signals_all, states), (signals_all, signals_all))
+        )
         x = 0
         for to, (a, b, c, d) in stack:
             x_to = np.arange(x, x + a.shape[0])

@@ -37,8 +37,21 @@ def hinf_norm_slicot(system: StateSpace, tolerance: float = 1e-9) -> float:
 
     n, m, p = system.nstates, system.ninputs, system.noutputs
     try:
-        gain, _ = slycot.ab13dd("D" if system.dt else "C", "I", "S", "D", n, m, p, system.A, np.eye(n), system.B,
-                                system.C, system.D, tolerance)
+        gain, _ = slycot.ab13dd(
+            "D" if system.dt else "C",
+            "I",
+            "S",
+            "D",
+            n,
+            m,
+            p,
+            system.A,
+            np.eye(n),
+            system.B,
+            system.C,
+            system.D,
+            tolerance,
+        )
     except slycot.exceptions.SlycotError as error:
         raise ComputationError("AB13DD failed", measured=str(error)) from error
     return float(gain)

@@ -10,7 +10,24 @@ from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
 from avis_ctrl.simulation.sampled_response import predict_transmissibility_6dof, sampled_response
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement, check_spectrum_agreement
 
-__all__ = ["CampaignPlan", "PlantCheck", "Rehearsal", "SampledLoop", "SensorBank", "SimulationCheck",
-           "SimulationRecord", "SpectrumAgreement", "check_designs", "check_spectrum_agreement",
-           "judge", "perturbed_truth", "predict_transmissibility_6dof", "rehearse", "rig_bank",
-           "sampled_response", "simulate", "simulate_campaign", "spectral_radius"]
+__all__ = [
+    "CampaignPlan",
+    "PlantCheck",
+    "Rehearsal",
+    "SampledLoop",
+    "SensorBank",
+    "SimulationCheck",
+    "SimulationRecord",
+    "SpectrumAgreement",
+    "check_designs",
+    "check_spectrum_agreement",
+    "judge",
+    "perturbed_truth",
+    "predict_transmissibility_6dof",
+    "rehearse",
+    "rig_bank",
+    "sampled_response",
+    "simulate",
+    "simulate_campaign",
+    "spectral_radius",
+]

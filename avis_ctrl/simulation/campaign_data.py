@@ -59,8 +59,15 @@ class _Planned:
     period_s: float | None
 
 
-def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig | None = None,
-                      change: SensorChange | None = None, progress: Progress | None = None) -> Campaign:
+def simulate_campaign(
+    rig: Rig,
+    plan: CampaignPlan,
+    seed: int = 1,
+    *,
+    truth: Rig | None = None,
+    change: SensorChange | None = None,
+    progress: Progress | None = None,
+) -> Campaign:
     """Simulate the records of the plan; the notes state levels, clipping and assumptions.
 
     Parameters
@@ -79,8 +86,9 @@ def simulate_campaign(rig: Rig, plan: CampaignPlan, seed: int = 1, *, truth: Rig
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
     if plan.effect and change is None:
-        raise InputError("expected what the effects of the plan add to the signals, as by study.hidden_effects",
-                         field="change")
+        raise InputError(
+            "expected what the effects of the plan add to the signals, as by study.hidden_effects", field="change"
+        )
     loop = open_loop(rig, plan).with_plant("truth", truth)
     if truth is not None and truth.sensors() != rig.sensors():
         loop = replace(loop, sensors=replace(loop.sensors, chains=rig_bank(truth, 1.0).chains))
@@ -109,8 +117,11 @@ def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
     bank = replace(rig_bank(rig, 1.0).white(), conditioning=None)
     if "acceleration" in bank.quantities:
         corner = corner or ACCELEROMETER_AMPLIFIER_HZ
-    bank = replace(bank, noise_rms_V=bank.noise_rms_V if plan.sensors.noise else np.zeros(len(bank.chains)),
-                   converter=bank.converter if plan.sensors.quantiser else None)
+    bank = replace(
+        bank,
+        noise_rms_V=bank.noise_rms_V if plan.sensors.noise else np.zeros(len(bank.chains)),
+        converter=bank.converter if plan.sensors.quantiser else None,
+    )
     return SampledLoop(rig, gain(np.zeros((0, 0))), (), {}, bank, {}, amplifier_corner_Hz=corner)
 
 
@@ -119,8 +130,10 @@ def _ambient(rig: Rig, plan: CampaignPlan) -> SpectrumModel | None:
     rms = plan.ambient.velocity_rms_m_per_s
     if rms is None:
         if rig.ambient is None:
-            raise InputError(f"missing; the file of the rig {rig.name} does not state its floor motion ([ambient])",
-                             field="ambient.velocity_rms_m_per_s")
+            raise InputError(
+                f"missing; the file of the rig {rig.name} does not state its floor motion ([ambient])",
+                field="ambient.velocity_rms_m_per_s",
+            )
         rms = rig.ambient.floor_velocity_rms_m_per_s
     if rms == 0:
         return None
@@ -136,9 +149,12 @@ def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Plan
         orthogonal = one.excitation == "multisine" and plan.multisine.scheme == "orthogonal"
         total += samples * one.records * (loop.n_drives if orthogonal else 1)
         if not 2 <= samples <= MOST_SAMPLES or total > MOST_SAMPLES_IN_ALL:
-            raise InputError(f"expected records of 2 to {MOST_SAMPLES} samples at {fs:g} Hz, and no more than "
-                             f"{MOST_SAMPLES_IN_ALL} in all records", field=f"record[{line + 1}].duration_s",
-                             value=one.duration_s or plan.duration_s)
+            raise InputError(
+                f"expected records of 2 to {MOST_SAMPLES} samples at {fs:g} Hz, and no more than "
+                f"{MOST_SAMPLES_IN_ALL} in all records",
+                field=f"record[{line + 1}].duration_s",
+                value=one.duration_s or plan.duration_s,
+            )
         if one.excitation == "floor":
             _check_floor_band(one.band_Hz or plan.band_Hz, samples, fs, f"record[{line + 1}].band_Hz")
         if one.excitation in ("rest", "floor"):
@@ -146,7 +162,7 @@ def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Plan
                 yield _Planned(one, np.zeros((samples, loop.n_drives)), 0.0, None)
             continue
         try:
-            signals = _drawn(loop, plan, one, samples, dealt, int(_rng(seed, line, _SIGNALS).integers(2 ** 63)))
+            signals = _drawn(loop, plan, one, samples, dealt, int(_rng(seed, line, _SIGNALS).integers(2**63)))
             largest = largest_level(loop, signals, samples)
             percent = one.level_percent or DEFAULT_LEVEL_PERCENT
             signals = signals.scaled_to(one.level_V or percent / 100 * largest)
@@ -161,12 +177,17 @@ def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Plan
 def _check_floor_band(band_Hz: list[float], samples: int, fs: float, field: str) -> None:
     low, high = band_Hz
     if high >= fs / 2 or np.floor(high * samples / fs) < max(np.ceil(low * samples / fs), 1):
-        raise InputError(f"expected a band below half the sample rate ({fs / 2:g} Hz) that contains a multiple of "
-                         f"1/duration = {fs / samples:.4g} Hz", field=field, value=band_Hz)
+        raise InputError(
+            f"expected a band below half the sample rate ({fs / 2:g} Hz) that contains a multiple of "
+            f"1/duration = {fs / samples:.4g} Hz",
+            field=field,
+            value=band_Hz,
+        )
 
 
-def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int, dealt: int,
-           seed: int) -> ExcitationSignals:
+def _drawn(
+    loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int, dealt: int, seed: int
+) -> ExcitationSignals:
     """Signals of one line of the plan, at the largest level that the drives allow."""
     fs, names = loop.sample_rate_Hz, loop.rig.equations_of_motion().actuators
     low, high = one.band_Hz or plan.band_Hz
@@ -175,11 +196,30 @@ def _drawn(loop: SampledLoop, plan: CampaignPlan, one: RecordPlan, samples: int,
         return noise(NoiseSettings(names, fs, samples / fs, (low, high), limit_V, None, one.records, seed))
     m = plan.multisine
     if samples < 2 * m.period_s * fs * (1 - 1e-9):
-        raise InputError(f"expected at least two periods of {m.period_s:g} s: the first contains the transient",
-                         field="duration_s", value=samples / fs)
-    return multisine(MultisineSettings(names, fs, m.period_s, (low, high), limit_V, None, m.lines, m.spacing,
-                                       m.group, m.scheme, one.records, dealt, m.compensate_hold, m.low_crest,
-                                       seed))
+        raise InputError(
+            f"expected at least two periods of {m.period_s:g} s: the first contains the transient",
+            field="duration_s",
+            value=samples / fs,
+        )
+    return multisine(
+        MultisineSettings(
+            names,
+            fs,
+            m.period_s,
+            (low, high),
+            limit_V,
+            None,
+            m.lines,
+            m.spacing,
+            m.group,
+            m.scheme,
+            one.records,
+            dealt,
+            m.compensate_hold,
+            m.low_crest,
+            seed,
+        )
+    )
 
 
 def _played(u: np.ndarray, samples: int) -> np.ndarray:
@@ -204,8 +244,9 @@ def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -
     return level * min(1.0, RANGE_SHARE * range_V / peak)
 
 
-def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None, seed: tuple[int, ...],
-         nonlinear: bool) -> SimulationRecord:
+def _run(
+    loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None, seed: tuple[int, ...], nonlinear: bool
+) -> SimulationRecord:
     """Simulate u (samples, n_u) after `settle` samples of zero voltage; without noise if floor is None."""
     samples, fs = settle + len(u), loop.sample_rate_Hz
     if floor is None:
@@ -215,27 +256,46 @@ def _run(loop: SampledLoop, u: np.ndarray, settle: int, floor: np.ndarray | None
     return simulate(loop, len(u) / fs, seed, settle_s=settle / fs, nonlinear=nonlinear, floor=floor, drive=drive)
 
 
-def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None,
-            seed: tuple[int, int], settle: int, start_s: float, change: SensorChange | None,
-            campaign_s: tuple[float, float]) -> tuple[Record, str]:
+def _record(
+    loop: SampledLoop,
+    plan: CampaignPlan,
+    one: _Planned,
+    ambient: SpectrumModel | None,
+    seed: tuple[int, int],
+    settle: int,
+    start_s: float,
+    change: SensorChange | None,
+    campaign_s: tuple[float, float],
+) -> tuple[Record, str]:
     """One record, and a sentence on its levels."""
     fs, samples, name = loop.sample_rate_Hz, len(one.u), f"{seed[1]:02d}"
     floor = _floor(loop, plan, one, ambient, settle, _rng(*seed, _FLOOR))
     run = _run(loop, one.u, settle, floor, (*seed, _NOISE), plan.truth.nonlinear)
     if run.diverged:
-        raise ComputationError(f"record {name}: the table moved beyond its stops",
-                               cause="the level or the floor motion is far too large",
-                               measured=f"{np.max(np.abs(run.q[-1, :3])):.3g} m from rest",
-                               next_step="lower the level of this record in the plan")
+        raise ComputationError(
+            f"record {name}: the table moved beyond its stops",
+            cause="the level or the floor motion is far too large",
+            measured=f"{np.max(np.abs(run.q[-1, :3])):.3g} m from rest",
+            next_step="lower the level of this record in the plan",
+        )
     if change is not None:
         u = np.concatenate([np.zeros((settle, one.u.shape[1])), one.u])
         added = change(u, floor[:-1, :3], start_s - settle / fs, campaign_s)
         run = replace(run, sensed=run.sensed + added[settle:])
     converter = loop.sensors.converter
     y = converter.convert(run.sensed) if converter else run.sensed
-    header = RecordHeader(name, fs, samples, loop.rig.equations_of_motion().actuators, loop.rig.sensor_rows()[0],
-                          one.plan.excitation, one.level_V, start_s, one.period_s,
-                          floor_names=FLOOR_NAMES if plan.floor_sensor.recorded else ())
+    header = RecordHeader(
+        name,
+        fs,
+        samples,
+        loop.rig.equations_of_motion().actuators,
+        loop.rig.sensor_rows()[0],
+        one.plan.excitation,
+        one.level_V,
+        start_s,
+        one.period_s,
+        floor_names=FLOOR_NAMES if plan.floor_sensor.recorded else (),
+    )
     measured = None
     if plan.floor_sensor.recorded:
         draw = _rng(*seed, _FLOOR_SENSOR).standard_normal((samples, 3))
@@ -245,8 +305,14 @@ def _record(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spect
     return Record(header, run.demanded, y, measured), _levels(header, run, y)
 
 
-def _floor(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: SpectrumModel | None, settle: int,
-           rng: np.random.Generator) -> np.ndarray:
+def _floor(
+    loop: SampledLoop,
+    plan: CampaignPlan,
+    one: _Planned,
+    ambient: SpectrumModel | None,
+    settle: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
     """(settle + samples + 1, 6) floor velocity: ambient throughout, with added shaking during the record."""
     fs, samples = loop.sample_rate_Hz, settle + len(one.u)
     velocity = np.zeros((samples + 1, 6))
@@ -261,16 +327,20 @@ def _floor(loop: SampledLoop, plan: CampaignPlan, one: _Planned, ambient: Spectr
 
 
 def _levels(header: RecordHeader, run: SimulationRecord, y: np.ndarray) -> str:
-    of_u, of_y = (np.sqrt(np.mean(one ** 2, axis=0)) for one in (run.demanded, y))
+    of_u, of_y = (np.sqrt(np.mean(one**2, axis=0)) for one in (run.demanded, y))
     converter, clipped = run.loop.sensors.converter, run.clipped_adc
-    text = (f"Record {header.name} ({header.excitation}): u {_span(of_u)} V r.m.s., peak "
-            f"{np.max(np.abs(run.demanded)):.4g} V; y {_span(of_y)} V r.m.s., peak {np.max(np.abs(run.sensed)):.4g} V")
+    text = (
+        f"Record {header.name} ({header.excitation}): u {_span(of_u)} V r.m.s., peak "
+        f"{np.max(np.abs(run.demanded)):.4g} V; y {_span(of_y)} V r.m.s., peak {np.max(np.abs(run.sensed)):.4g} V"
+    )
     if converter is not None:
         text += f" of {converter.limits_V[1]:.4g} V"
         if clipped:
             channels = np.flatnonzero(np.any(converter.clipped(run.sensed), axis=0))
-            text += (f"; WARNING: {clipped} samples of y clip, in {', '.join(header.y_names[k] for k in channels)}: "
-                     "lower the level")
+            text += (
+                f"; WARNING: {clipped} samples of y clip, in {', '.join(header.y_names[k] for k in channels)}: "
+                "lower the level"
+            )
     return text + "."
 
 
@@ -285,19 +355,29 @@ def _assumptions(loop: SampledLoop, plan: CampaignPlan, seed: int, ambient: Spec
         rms = loop.rig.ambient.floor_velocity_rms_m_per_s
     table = "nonlinear" if plan.truth.nonlinear else "linear"
     low, high = plan.ambient.band_Hz
-    floor = (f"ambient floor {rms:.4g} m/s r.m.s. from {low:g} to {high:g} Hz along each of x, y, z, shape "
-             f"{plan.ambient.spectrum}" if ambient else "floor at rest")
-    noises = (f"sensor noise {_span(bank.noise_rms_V)} V r.m.s. per sample, "
-              + (f"quantisation step {bank.converter.lsb_V:.4g} V" if bank.converter
-                 else f"no quantisation, levels chosen for a range of {ASSUMED_RANGE_V:g} V"))
-    lag = (f"amplifiers with a first-order lag of {loop.amplifier_corner_Hz:g} Hz" if loop.amplifier_corner_Hz
-           else "amplifiers without lag")
-    return [f"Simulated with the {table} table in open loop, seed {seed}: {floor}; {noises}; {lag}; delay "
-            f"{loop.loop_delay_s:g} s.",
-            f"Before each record the drives are silent for {plan.settle_s:g} s: the first period of a multisine "
-            "contains a transient."]
+    floor = (
+        f"ambient floor {rms:.4g} m/s r.m.s. from {low:g} to {high:g} Hz along each of x, y, z, shape "
+        f"{plan.ambient.spectrum}"
+        if ambient
+        else "floor at rest"
+    )
+    noises = f"sensor noise {_span(bank.noise_rms_V)} V r.m.s. per sample, " + (
+        f"quantisation step {bank.converter.lsb_V:.4g} V"
+        if bank.converter
+        else f"no quantisation, levels chosen for a range of {ASSUMED_RANGE_V:g} V"
+    )
+    lag = (
+        f"amplifiers with a first-order lag of {loop.amplifier_corner_Hz:g} Hz"
+        if loop.amplifier_corner_Hz
+        else "amplifiers without lag"
+    )
+    return [
+        f"Simulated with the {table} table in open loop, seed {seed}: {floor}; {noises}; {lag}; delay "
+        f"{loop.loop_delay_s:g} s.",
+        f"Before each record the drives are silent for {plan.settle_s:g} s: the first period of a multisine "
+        "contains a transient.",
+    ]
 
 
 def _rng(*seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
-

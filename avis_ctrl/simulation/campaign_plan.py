@@ -49,7 +49,7 @@ class RecordPlan(Section):
         if shaken and rms is None:
             raise ValueError("expected the r.m.s. velocity of the shaken floor in m/s")
         if not shaken and rms is not None:
-            raise ValueError("expected only in records with excitation = \"floor\"")
+            raise ValueError('expected only in records with excitation = "floor"')
         return rms
 
 

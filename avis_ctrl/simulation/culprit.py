@@ -41,18 +41,23 @@ class Culprit:
 
     def words(self) -> str:
         """The cause, with frequency and growth rate of the motion."""
-        at = f"(plant \"{self.plant}\", spectral radius {self.radius:.6f})"
+        at = f'(plant "{self.plant}", spectral radius {self.radius:.6f})'
         if self.kind == "nonlinear":
             return f"the nonlinear simulation diverges although the linear loop is stable {at}"
-        how = (f"a motion at {self.frequency_Hz:.3g} Hz, mainly along {_joined(self.axes)}, grows with a time constant "
-               f"of {1 / max(self.growth_per_s, 1e-12):.3g} s {at}")
+        how = (
+            f"a motion at {self.frequency_Hz:.3g} Hz, mainly along {_joined(self.axes)}, grows with a time constant "
+            f"of {1 / max(self.growth_per_s, 1e-12):.3g} s {at}"
+        )
         loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
         without = f"without {'these loops' if len(self.loops) > 1 else 'that loop'} this plant is stable"
-        who = {"table": "the table is unstable even without control",
-               "controller": "the cause is the controller; this plant is unstable even without the other axes' loops",
-               "companions": f"the cause is {loops}; {without}",
-               "together": (f"the cause is the controller together with {loops}; {without}") if self.loops else
-                           "the cause is the controller together with the other axes' loops"}[self.kind]
+        who = {
+            "table": "the table is unstable even without control",
+            "controller": "the cause is the controller; this plant is unstable even without the other axes' loops",
+            "companions": f"the cause is {loops}; {without}",
+            "together": (f"the cause is the controller together with {loops}; {without}")
+            if self.loops
+            else "the cause is the controller together with the other axes' loops",
+        }[self.kind]
         return f"{how}: {who}"
 
 
@@ -61,7 +66,7 @@ def find_culprit(loop: SampledLoop) -> Culprit:
     values, vectors = la.eig(period_map(loop))
     most = int(np.argmax(np.abs(values)))
     rate = np.log(values[most]) * loop.sample_rate_Hz
-    motion = np.abs(vectors[:len(COORDINATES), most]) * lever_arms(loop.plant)
+    motion = np.abs(vectors[: len(COORDINATES), most]) * lever_arms(loop.plant)
     order = np.argsort(motion)[::-1]
     axes = tuple(COORDINATES[k] for k in order if motion[k] >= 0.3 * motion[order[0]])
     radius = float(np.abs(values[most]))
@@ -74,13 +79,21 @@ def _who(loop: SampledLoop) -> tuple[str, tuple[str, ...]]:
 
     def stable(K: StateSpace, keep: Collection[str]) -> bool:
         return spectral_radius(replace(loop, K=K, loops={a: s for a, s in loop.loops.items() if a in keep})) < 1
+
     if not stable(idle, ()):
         return "table", ()
     if not stable(loop.K, ()):
         return "controller", ()
     names = tuple(loop.loops)
-    fewest = next((out for size in range(1, len(names) + 1) for out in combinations(names, size)
-                   if stable(loop.K, set(names) - set(out))), ())
+    fewest = next(
+        (
+            out
+            for size in range(1, len(names) + 1)
+            for out in combinations(names, size)
+            if stable(loop.K, set(names) - set(out))
+        ),
+        (),
+    )
     return ("companions" if not stable(idle, names) else "together"), fewest
 
 

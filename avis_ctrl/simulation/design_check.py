@@ -64,11 +64,22 @@ class PlantCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Values for a file."""
-        return {"name": self.name, "passed": self.passed, "stable": self.stable, "diverged": self.diverged,
-                "spectral_radius": self.spectral_radius, "spectrum_agrees": self.agrees,
-                "spectrum": self.spectrum.as_dict() if self.spectrum else None, "within_limits": self.within_limits,
-                "peak_V": self.peak_V, "rms_V": self.rms_V, "limit_V": self.limit_V,
-                "clipped_dac": self.clipped_dac, "clipped_adc": self.clipped_adc, "payload_rms": self.payload_rms}
+        return {
+            "name": self.name,
+            "passed": self.passed,
+            "stable": self.stable,
+            "diverged": self.diverged,
+            "spectral_radius": self.spectral_radius,
+            "spectrum_agrees": self.agrees,
+            "spectrum": self.spectrum.as_dict() if self.spectrum else None,
+            "within_limits": self.within_limits,
+            "peak_V": self.peak_V,
+            "rms_V": self.rms_V,
+            "limit_V": self.limit_V,
+            "clipped_dac": self.clipped_dac,
+            "clipped_adc": self.clipped_adc,
+            "payload_rms": self.payload_rms,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +99,18 @@ class SimulationCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-serialisable summary, without time series and line spectra."""
-        return {"passed": self.passed, "duration_s": self.duration_s, "seed": self.seed,
-                "false_alarm": self.false_alarm, "plants": [plant.as_dict() for plant in self.plants]}
+        return {
+            "passed": self.passed,
+            "duration_s": self.duration_s,
+            "seed": self.seed,
+            "false_alarm": self.false_alarm,
+            "plants": [plant.as_dict() for plant in self.plants],
+        }
 
 
-def check_designs(loops: Sequence[SampledLoop], duration_s: float = 60.0, seed: int = 1,
-                  false_alarm: float = 0.01) -> SimulationCheck:
+def check_designs(
+    loops: Sequence[SampledLoop], duration_s: float = 60.0, seed: int = 1, false_alarm: float = 0.01
+) -> SimulationCheck:
     """Simulate each loop with its own floor motion and noise, and judge it.
 
     Parameters
@@ -114,8 +131,9 @@ def check_designs(loops: Sequence[SampledLoop], duration_s: float = 60.0, seed: 
     return SimulationCheck(plants, duration_s, seed, false_alarm, first)
 
 
-def judge(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
-          false_alarm: float = 0.01) -> PlantCheck:
+def judge(
+    record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0), false_alarm: float = 0.01
+) -> PlantCheck:
     """Check of one simulation record."""
     loop = record.loop
     radius = spectral_radius(loop)
@@ -124,7 +142,15 @@ def judge(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
     spectrum = check_spectrum_agreement(record, band_Hz, false_alarm=false_alarm) if steady else None
     peaks = np.max(np.abs(record.demanded), axis=0)
     nearest = int(np.argmax(peaks * (loop.limits_V.max() / loop.limits_V)))
-    return PlantCheck(loop.name, record.diverged, radius, spectrum, float(peaks[nearest]),
-                      float(np.max(np.sqrt(np.mean(record.demanded ** 2, axis=0)))), float(loop.limits_V[nearest]),
-                      record.clipped_dac, record.clipped_adc,
-                      {axis: float(np.sqrt(np.mean(record.velocity(axis) ** 2))) for axis in loop.axes})
+    return PlantCheck(
+        loop.name,
+        record.diverged,
+        radius,
+        spectrum,
+        float(peaks[nearest]),
+        float(np.max(np.sqrt(np.mean(record.demanded**2, axis=0)))),
+        float(loop.limits_V[nearest]),
+        record.clipped_dac,
+        record.clipped_adc,
+        {axis: float(np.sqrt(np.mean(record.velocity(axis) ** 2))) for axis in loop.axes},
+    )

@@ -92,8 +92,10 @@ def loop_axes(rig: Rig, axes: Sequence[str], loops: Sequence[str]) -> tuple[np.n
     if not loops or (_small(together[0].leftover) and _small(together[1].leftover) and np.all(together[1].inertial)):
         return together[0].allocation, together[1].decoding
     parts = [part for part in (tuple(axes), *((one,) for one in loops)) if part]
-    return (np.hstack([actuator_axes(rig, part).allocation for part in parts]),
-            np.vstack([sensor_axes(rig, part).decoding for part in parts]))
+    return (
+        np.hstack([actuator_axes(rig, part).allocation for part in parts]),
+        np.vstack([sensor_axes(rig, part).decoding for part in parts]),
+    )
 
 
 def _small(leftover: np.ndarray) -> bool:
@@ -122,13 +124,18 @@ def linear_part(loop: SampledLoop) -> StateSpace:
         parts[f"sensor {name}"] = with_rate_input(chain, f"{name}_tilt", 1) if felt else chain
     inputs = [f"{name}_dac" for name in eom.actuators]
     inputs += [f"floor_{c}_dot" for c in COORDINATES] + [f"excess_{c}" for c in COORDINATES]
-    outputs = [*eom.actuators, *(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
-               *(f"{name}_volt" for name in sensor_names)]
+    outputs = [
+        *eom.actuators,
+        *(f"{c}_ddot" for c in COORDINATES),
+        *(f"{c}_dot" for c in COORDINATES),
+        *(f"{name}_volt" for name in sensor_names),
+    ]
     return connect(parts, inputs, outputs)
 
 
-def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tuple[str, ...],
-           quantities: tuple[str, ...]) -> StateSpace:
+def _table(
+    eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tuple[str, ...], quantities: tuple[str, ...]
+) -> StateSpace:
     """M q'' = -C q' - K q + K_f q_f + C_f q_f' + T u + M excess, with states (q, q', q_f).
 
     "NAME_motion" is the motion along each sensor's axis. The apparent acceleration due to gravity, tilt q, is included
@@ -143,8 +150,11 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tup
     A = np.vstack([velocity_x, acceleration_x, np.zeros((N_Q, 3 * N_Q))])
     B = np.vstack([np.zeros_like(excess), acceleration_e + excess, floor_e])
     none = np.zeros_like(excess)
-    felt = {"velocity": (velocity_x, none), "acceleration": (acceleration_x, acceleration_e + excess),
-            "displacement": (np.hstack([one, zero, -one]), none)}
+    felt = {
+        "velocity": (velocity_x, none),
+        "acceleration": (acceleration_x, acceleration_e + excess),
+        "displacement": (np.hstack([one, zero, -one]), none),
+    }
     seen = {kind: (H @ by_x, H @ by_e) for kind, (by_x, by_e) in felt.items()}
     tilted = tilt @ np.hstack([one, zero, zero])
     seen["acceleration"] = seen["acceleration"][0] + tilted, seen["acceleration"][1]
@@ -152,20 +162,23 @@ def _table(eom: EquationsOfMotion, H: np.ndarray, tilt: np.ndarray, sensors: tup
     C = np.vstack([acceleration_x, velocity_x, motion_x, tilted])
     D = np.vstack([acceleration_e, none, motion_e, np.zeros_like(motion_e)])
     inputs = (*eom.actuators, *(f"floor_{c}_dot" for c in COORDINATES), *(f"excess_{c}" for c in COORDINATES))
-    outputs = (*(f"{c}_ddot" for c in COORDINATES), *(f"{c}_dot" for c in COORDINATES),
-               *(f"{name}_{kind}" for kind in ("motion", "tilt") for name in sensors))
+    outputs = (
+        *(f"{c}_ddot" for c in COORDINATES),
+        *(f"{c}_dot" for c in COORDINATES),
+        *(f"{name}_{kind}" for kind in ("motion", "tilt") for name in sensors),
+    )
     return StateSpace(A, B, C, D, 0.0, inputs, outputs)
 
 
 def held_and_ramped(A: np.ndarray, B: np.ndarray, step_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Exact step of x' = A x + B e: e^(A h), and the contributions of e = 1 and e = t/h over the step (Van Loan 1978).
-    """
+    """Exact step of x' = A x + B e: e^(A h), and the contributions of e = 1 and e = t/h over the step (Van
+    Loan 1978)."""
     n, m = B.shape
     block = np.zeros((n + 2 * m, n + 2 * m))
-    block[:n, :n], block[:n, n:n + m] = A * step_s, B * step_s
-    block[n:n + m, n + m:] = np.eye(m)
+    block[:n, :n], block[:n, n : n + m] = A * step_s, B * step_s
+    block[n : n + m, n + m :] = np.eye(m)
     power = la.expm(block)
-    return power[:n, :n], power[:n, n:n + m], power[:n, n + m:]
+    return power[:n, :n], power[:n, n : n + m], power[:n, n + m :]
 
 
 def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
@@ -174,14 +187,16 @@ def step_arrays(loop: SampledLoop, extra_substeps: int = 1) -> StepArrays:
     n_u, n_s = loop.n_drives, len(loop.sensors.chains)
     volts, floor, excess = slice(0, n_u), slice(n_u, n_u + N_Q), slice(n_u + N_Q, n_u + 2 * N_Q)
     Phi, held, ramped = held_and_ramped(linear.A, linear.B, loop.period_s / (loop.substeps * extra_substeps))
-    advance = np.hstack([Phi, held[:, volts], held[:, floor] - ramped[:, floor], ramped[:, floor],
-                         held[:, excess], ramped[:, excess]])
-    observe = np.hstack([linear.C, linear.D[:, :n_u + N_Q]])[:n_u + N_Q]
+    advance = np.hstack(
+        [Phi, held[:, volts], held[:, floor] - ramped[:, floor], ramped[:, floor], held[:, excess], ramped[:, excess]]
+    )
+    observe = np.hstack([linear.C, linear.D[:, : n_u + N_Q]])[: n_u + N_Q]
     sense = np.hstack([linear.C, linear.D[:, n_u:]])[-n_s:]
     control = np.block([[controller.A, controller.B], [controller.C, controller.D]])
     packed = np.ascontiguousarray
-    return StepArrays(packed(advance), packed(observe), packed(sense), packed(control),
-                      rig_arrays(loop.plant.mounted_body()))
+    return StepArrays(
+        packed(advance), packed(observe), packed(sense), packed(control), rig_arrays(loop.plant.mounted_body())
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +215,7 @@ def rest_state(loop: SampledLoop) -> RestState:
     """Equilibrium of the loop with `loop.sensors.offset_V`, without limits and quantisation."""
     linear, K = linear_part(loop), digital_controller(loop)
     n_s, n_u = len(loop.sensors.chains), loop.n_drives
-    free = np.r_[:2 * N_Q, 3 * N_Q:linear.nstates]
+    free = np.r_[: 2 * N_Q, 3 * N_Q : linear.nstates]
     by_volts = -la.solve(linear.A[np.ix_(free, free)], linear.B[free, :n_u])
     sensed = linear.C[-n_s:][:, free] @ by_volts + linear.D[-n_s:, :n_u]
     kept = la.solve(np.eye(K.nstates) - K.A, K.B) if K.nstates else np.zeros((0, n_s))
@@ -238,15 +253,15 @@ def disturbed_period_map(loop: SampledLoop) -> tuple[np.ndarray, np.ndarray]:
     arrays = step_arrays(loop)
     n, n_u = arrays.advance.shape[0], loop.n_drives
     n_c = arrays.control.shape[0] - n_u
-    free = np.r_[:2 * N_Q, 3 * N_Q:n]  # the loop does not act on the floor
+    free = np.r_[: 2 * N_Q, 3 * N_Q : n]  # the loop does not act on the floor
     whole, late = divmod(loop.delay_substeps, loop.substeps)
     # State over a period: x, controller, voltages computed and not yet applied (newest first); then the disturbances.
     pending = whole + 1
     size = len(free) + n_c + n_u * pending
     unit = np.eye(size + n_c + n_u)
-    x, xc = unit[:len(free)], unit[len(free):len(free) + n_c]
-    queue = [unit[len(free) + n_c + n_u * k:][:n_u] for k in range(pending)]
-    Phi, Gamma = arrays.advance[np.ix_(free, free)], arrays.advance[free, n:n + n_u]
+    x, xc = unit[: len(free)], unit[len(free) : len(free) + n_c]
+    queue = [unit[len(free) + n_c + n_u * k :][:n_u] for k in range(pending)]
+    Phi, Gamma = arrays.advance[np.ix_(free, free)], arrays.advance[free, n : n + n_u]
     out = arrays.control @ np.vstack([xc, arrays.sense[:, free] @ x]) + unit[size:]
     queue = [out[n_c:], *queue]
     for j in range(loop.substeps):

@@ -66,8 +66,23 @@ def workspace(arrays: StepArrays, state: np.ndarray, delay: int) -> Work:
     w, w_end, N, N_before = np.zeros((4, 6))
     advance_in, observe_in, sense_in, control_in = (np.zeros(matrix.shape[1]) for matrix in matrices)
     observed, sensed, controlled = (np.zeros(matrix.shape[0]) for matrix in matrices[1:])
-    return Work(state, np.zeros(n_u), w, w_end, N, N_before, np.zeros((delay + 1, n_u)), np.zeros(n_u), advance_in,
-                observe_in, sense_in, control_in, observed, sensed, controlled)
+    return Work(
+        state,
+        np.zeros(n_u),
+        w,
+        w_end,
+        N,
+        N_before,
+        np.zeros((delay + 1, n_u)),
+        np.zeros(n_u),
+        advance_in,
+        observe_in,
+        sense_in,
+        control_in,
+        observed,
+        sensed,
+        controlled,
+    )
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
@@ -135,8 +150,9 @@ def _control(arrays: StepArrays, work: Work) -> None:
 
 
 @njit(cache=True)
-def _demand(work: Work, step: int, drive: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, demanded_row: np.ndarray
-            ) -> None:
+def _demand(
+    work: Work, step: int, drive: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, demanded_row: np.ndarray
+) -> None:
     """Limit the sum of the controller's voltages and `drive` (n_u,) and delay it; without delay it acts at once.
 
     The anti-windup (keep, feed) compares the controller's own voltages with the limits and subtracts what the limits
@@ -178,8 +194,17 @@ def _gone(x: np.ndarray, far: np.ndarray) -> bool:
 
 
 @njit(cache=True)
-def _sample(arrays: StepArrays, work: Work, floor: np.ndarray, noise: np.ndarray, k: int, substeps: int, first: bool,
-            adc: np.ndarray, records: Records) -> None:
+def _sample(
+    arrays: StepArrays,
+    work: Work,
+    floor: np.ndarray,
+    noise: np.ndarray,
+    k: int,
+    substeps: int,
+    first: bool,
+    adc: np.ndarray,
+    records: Records,
+) -> None:
     """Start of period k: converter readings; first : whether the sensors measure N, which is then computed before."""
     _arrive(work, floor, k, 0, substeps, k * substeps)
     if first:
@@ -188,8 +213,19 @@ def _sample(arrays: StepArrays, work: Work, floor: np.ndarray, noise: np.ndarray
 
 
 @njit(cache=True)
-def _period(arrays: StepArrays, work: Work, floor: np.ndarray, drive: np.ndarray, k: int, substeps: int,
-            nonlinear: bool, acceleration: bool, limit_V: np.ndarray, windup: AntiWindup, records: Records) -> None:
+def _period(
+    arrays: StepArrays,
+    work: Work,
+    floor: np.ndarray,
+    drive: np.ndarray,
+    k: int,
+    substeps: int,
+    nonlinear: bool,
+    acceleration: bool,
+    limit_V: np.ndarray,
+    windup: AntiWindup,
+    records: Records,
+) -> None:
     """The remainder of period k, with the controller's voltages for its sample."""
     _demand(work, k * substeps, drive[k], limit_V, windup, records.demanded[k])
     _put(records.volts[k], 0, work.u)
@@ -206,9 +242,21 @@ def _period(arrays: StepArrays, work: Work, floor: np.ndarray, drive: np.ndarray
 
 
 @njit(cache=True)
-def run(arrays: StepArrays, work: Work, floor: np.ndarray, noise: np.ndarray, drive: np.ndarray, substeps: int,
-        nonlinear: bool, acceleration: bool, adc: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, far: np.ndarray,
-        records: Records) -> int:
+def run(
+    arrays: StepArrays,
+    work: Work,
+    floor: np.ndarray,
+    noise: np.ndarray,
+    drive: np.ndarray,
+    substeps: int,
+    nonlinear: bool,
+    acceleration: bool,
+    adc: np.ndarray,
+    limit_V: np.ndarray,
+    windup: AntiWindup,
+    far: np.ndarray,
+    records: Records,
+) -> int:
     """Step through the control periods; return how many were completed before the table left its range, or all.
 
     floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V added to the controller's.
@@ -226,14 +274,27 @@ def run(arrays: StepArrays, work: Work, floor: np.ndarray, noise: np.ndarray, dr
     return floor.shape[0] - 1
 
 
-def run_stepwise(code: Callable[[np.ndarray], np.ndarray], arrays: StepArrays, work: Work, floor: np.ndarray,
-                 noise: np.ndarray, drive: np.ndarray, substeps: int, nonlinear: bool, acceleration: bool,
-                 adc: np.ndarray, limit_V: np.ndarray, windup: AntiWindup, far: np.ndarray, records: Records) -> int:
+def run_stepwise(
+    code: Callable[[np.ndarray], np.ndarray],
+    arrays: StepArrays,
+    work: Work,
+    floor: np.ndarray,
+    noise: np.ndarray,
+    drive: np.ndarray,
+    substeps: int,
+    nonlinear: bool,
+    acceleration: bool,
+    adc: np.ndarray,
+    limit_V: np.ndarray,
+    windup: AntiWindup,
+    far: np.ndarray,
+    records: Records,
+) -> int:
     """`run` with a controller called once per sample, which does its own anti-windup: code (n_s,) -> (n_u,) volts."""
     n_s, n_u = work.sensed.shape[0], work.u.shape[0]
     for k in range(floor.shape[0] - 1):
         _sample(arrays, work, floor, noise, k, substeps, nonlinear and acceleration, adc, records)
-        work.controlled[work.controlled.shape[0] - n_u:] = code(work.control_in[-n_s:])
+        work.controlled[work.controlled.shape[0] - n_u :] = code(work.control_in[-n_s:])
         _period(arrays, work, floor, drive, k, substeps, nonlinear, acceleration, limit_V, windup, records)
         if _gone(work.x, far):
             return k + 1

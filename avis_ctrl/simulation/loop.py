@@ -64,8 +64,8 @@ class SimulationRecord:
 
 
 def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """(samples + 1, 6) floor velocity [m/s, rad/s], one period of a realisation; zero in coordinates without spectrum.
-    """
+    """(samples + 1, 6) floor velocity [m/s, rad/s], one period of a realisation; zero in coordinates without
+    spectrum."""
     velocity = np.zeros((samples + 1, 6))
     for name, spectrum in loop.floor.items():
         if name not in COORDINATES:
@@ -91,10 +91,19 @@ def flicker(samples: int, period_s: float, rng: np.random.Generator, channels: i
     return np.fft.irfft(0.5 * samples * rms[:, None] * (draw[0] + 1j * draw[1]), samples, axis=0)
 
 
-def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int, ...] = 1, *, settle_s: float = 10.0,
-             nonlinear: bool = True, extra_substeps: int = 1, floor: np.ndarray | None = None,
-             initial: np.ndarray | None = None, drive: np.ndarray | None = None, code: Code | None = None
-             ) -> SimulationRecord:
+def simulate(
+    loop: SampledLoop,
+    duration_s: float = 60.0,
+    seed: int | tuple[int, ...] = 1,
+    *,
+    settle_s: float = 10.0,
+    nonlinear: bool = True,
+    extra_substeps: int = 1,
+    floor: np.ndarray | None = None,
+    initial: np.ndarray | None = None,
+    drive: np.ndarray | None = None,
+    code: Code | None = None,
+) -> SimulationRecord:
     """Simulate the loop and keep the last `duration_s`.
 
     Parameters
@@ -141,12 +150,25 @@ def simulate(loop: SampledLoop, duration_s: float = 60.0, seed: int | tuple[int,
     work = kernel.workspace(arrays, state, loop.delay_substeps * extra_substeps)
     if rest is not None:
         work.u[:] = np.clip(rest.volts, -loop.limits_V, loop.limits_V)
-        work.control_in[:rest.controller.size] = rest.controller
+        work.control_in[: rest.controller.size] = rest.controller
     run = kernel.run if code is None else partial(kernel.run_stepwise, code)
     # `code` does its own anti-windup.
     windup = loop.anti_windup if code is None else NO_ANTI_WINDUP
-    done = run(arrays, work, floor, noise, drive, loop.substeps * extra_substeps, nonlinear,
-               "acceleration" in loop.sensors.quantities, adc, loop.limits_V, windup, STOPS, records)
+    done = run(
+        arrays,
+        work,
+        floor,
+        noise,
+        drive,
+        loop.substeps * extra_substeps,
+        nonlinear,
+        "acceleration" in loop.sensors.quantities,
+        adc,
+        loop.limits_V,
+        windup,
+        STOPS,
+        records,
+    )
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
     time = (np.arange(samples)[kept] - settle) * loop.period_s

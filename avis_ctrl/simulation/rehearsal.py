@@ -53,8 +53,13 @@ class Rehearsal:
         return rig_toml(self.truth, values, "\n".join(header))
 
 
-def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None,
-             hidden: Callable[[Rig], SensorChange] | None = None) -> Rehearsal:
+def rehearse(
+    rig: Rig,
+    plan: CampaignPlan,
+    seed: int = 1,
+    progress: Progress | None = None,
+    hidden: Callable[[Rig], SensorChange] | None = None,
+) -> Rehearsal:
     """Perturb the rig as specified in `plan.truth` and simulate the campaign on it; raises the errors of
     `simulate_campaign`.
 
@@ -64,10 +69,16 @@ def rehearse(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | N
     truth = perturbed_truth(rig, plan.truth.perturb_percent, plan.truth.perturb_damping_percent, seed)
     old, new = rig.parameters(), truth.parameters()
     changed = {name: new[name].value for name in old if new[name].value != old[name].value}
-    campaign = simulate_campaign(rig, plan, seed, truth=truth, progress=progress,
-                                 change=None if hidden is None else hidden(truth))
-    return Rehearsal(campaign, truth, changed, {name: value / old[name].value for name, value in changed.items()
-                                            if old[name].value}, tuple(plan.effect))
+    campaign = simulate_campaign(
+        rig, plan, seed, truth=truth, progress=progress, change=None if hidden is None else hidden(truth)
+    )
+    return Rehearsal(
+        campaign,
+        truth,
+        changed,
+        {name: value / old[name].value for name, value in changed.items() if old[name].value},
+        tuple(plan.effect),
+    )
 
 
 def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.0, seed: int = 1) -> Rig:
@@ -86,16 +97,22 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
         if not (np.isfinite(value) and 0 <= value < 100):
             raise InputError("expected 0 or more, and less than 100", field=name, value=value)
     rng, known = np.random.default_rng((seed, 5)), rig.parameters()
-    spread = {name: (damping_percent if DAMPING.fullmatch(name) else percent) / 100 for name in known
-              if DAMPING.fullmatch(name) or STIFF_OR_HEAVY.fullmatch(name)}
+    spread = {
+        name: (damping_percent if DAMPING.fullmatch(name) else percent) / 100
+        for name in known
+        if DAMPING.fullmatch(name) or STIFF_OR_HEAVY.fullmatch(name)
+    }
     if isinstance(rig, Halcyonics):
         # With a load, the plate was identified before: only the sum of its inertia and the load's can be observed.
         known_before = ("mass", "load.mass", *(("Ixx", "Iyy", "Izz") if rig.load else ()))
         spread = {name: width for name, width in spread.items() if name not in known_before}
     for _ in range(ATTEMPTS):
         draws = rng.uniform(-1, 1, len(spread))
-        changes = {name: known[name].value * (1 + width * draw)
-                   for (name, width), draw in zip(spread.items(), draws, strict=True) if width}
+        changes = {
+            name: known[name].value * (1 + width * draw)
+            for (name, width), draw in zip(spread.items(), draws, strict=True)
+            if width
+        }
         try:
             truth = rig.with_parameters(changes)
             if isinstance(truth, AvisTable) and rig.tolerances is not None and changes:
@@ -105,8 +122,11 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
             refused = error
         else:
             return truth
-    raise InputError(f"none of {ATTEMPTS} random draws gives a physically possible table; the last error: {refused}",
-                     field="perturb_percent", value=percent)
+    raise InputError(
+        f"none of {ATTEMPTS} random draws gives a physically possible table; the last error: {refused}",
+        field="perturb_percent",
+        value=percent,
+    )
 
 
 def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
@@ -130,8 +150,10 @@ def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
     def moved_along(one: Any) -> Any:
         return replace(one, **placed(one.position, one.direction))
 
-    isolators = tuple(replace(one, position=_triple(np.add(one.position, t.place_m * rng.standard_normal(3))))
-                      for one in rig.isolators)
+    isolators = tuple(
+        replace(one, position=_triple(np.add(one.position, t.place_m * rng.standard_normal(3))))
+        for one in rig.isolators
+    )
     drives, instruments = (tuple(moved_along(one) for one in some) for some in (rig.drives, rig.instruments))
     moved = replace(rig, isolators=isolators, drives=drives, instruments=instruments)
     known, changes = moved.parameters(), dict[str, float]()

@@ -64,8 +64,9 @@ class SensorBank:
     def __post_init__(self) -> None:
         n = len(self.chains)
         if len(self.quantities) != n or not set(self.quantities) <= set(DERIVATIVES):
-            raise InputError(f"velocity, acceleration or displacement for each of {n} sensors", field="quantity",
-                             value=self.quantity)
+            raise InputError(
+                f"velocity, acceleration or displacement for each of {n} sensors", field="quantity", value=self.quantity
+            )
         if len(self.filters) != n:
             raise InputError(f"one filter, or {n}", field="conditioning", value=len(self.filters))
         for name in ("gain_V", "noise_rms_V", "flicker_rms_V", "offset_V"):
@@ -89,11 +90,11 @@ class SensorBank:
     def white_variance_V2(self) -> np.ndarray:
         """(n_s,) variance of one sample: noise, and rounding as white noise, valid if signal or noise moves by whole
         codes."""
-        return self.noise_rms_V ** 2 + (self.converter.noise_rms_V ** 2 if self.converter else 0.0)
+        return self.noise_rms_V**2 + (self.converter.noise_rms_V**2 if self.converter else 0.0)
 
     def noise_psd(self, frequency_Hz: np.ndarray, period_s: float) -> np.ndarray:
         """(n, n_s) one-sided density of all noise at the converters [V^2/Hz]; frequency_Hz (n,) positive."""
-        return 2 * period_s * (self.white_variance_V2 + self.flicker_rms_V ** 2 / np.asarray(frequency_Hz)[:, None])
+        return 2 * period_s * (self.white_variance_V2 + self.flicker_rms_V**2 / np.asarray(frequency_Hz)[:, None])
 
     def white(self) -> SensorBank:
         """Without 1/f noise."""
@@ -110,14 +111,21 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
     made = tuple(systems[one] for one in filters)
     kinds = tuple(one.quantity for one in sensors)
     # Identical sensors share one chain object.
-    chains = {one: one.chain() for one in dict.fromkeys(replace(each, name="", position=(0.0, 0.0, 0.0),
-                                                                direction=(0.0, 0.0, 1.0)) for each in sensors)}
-    return SensorBank(kinds[0] if len(set(kinds)) == 1 else kinds,
-                      tuple(chains[replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))]
-                            for one in sensors),
-                      np.array([one.gain for one in sensors]), np.array([one.noise_rms_V for one in sensors]),
-                      rig.converter, made[0] if len(set(filters)) == 1 else made,
-                      np.array([one.flicker_rms_V for one in sensors]))
+    chains = {
+        one: one.chain()
+        for one in dict.fromkeys(
+            replace(each, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0)) for each in sensors
+        )
+    }
+    return SensorBank(
+        kinds[0] if len(set(kinds)) == 1 else kinds,
+        tuple(chains[replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))] for one in sensors),
+        np.array([one.gain for one in sensors]),
+        np.array([one.noise_rms_V for one in sensors]),
+        rig.converter,
+        made[0] if len(set(filters)) == 1 else made,
+        np.array([one.flicker_rms_V for one in sensors]),
+    )
 
 
 class AntiWindup(NamedTuple):
@@ -195,8 +203,12 @@ class SampledLoop:
 
     def __post_init__(self) -> None:
         rig = self.rig
-        of_rig = {"plant": rig, "sample_rate_Hz": rig.sample_rate_Hz, "loop_delay_s": rig.loop_delay_s,
-                  "limit_V": rig.drive_limit_V}
+        of_rig = {
+            "plant": rig,
+            "sample_rate_Hz": rig.sample_rate_Hz,
+            "loop_delay_s": rig.loop_delay_s,
+            "limit_V": rig.drive_limit_V,
+        }
         for name, value in of_rig.items():
             if getattr(self, name) is _AS_RIG:
                 object.__setattr__(self, name, value)
@@ -204,9 +216,12 @@ class SampledLoop:
         self._check()
         periods = Fraction(self.loop_delay_s * self.sample_rate_Hz).limit_denominator(MAX_SUBSTEPS)
         if abs(float(periods) - self.loop_delay_s * self.sample_rate_Hz) > 1e-6:
-            raise InputError(f"expected n/m sample periods with whole n and m, m up to {MAX_SUBSTEPS}; the nearest is "
-                             f"{float(periods) / self.sample_rate_Hz:.6g} s", field="loop_delay_s of the rig",
-                             value=self.loop_delay_s)
+            raise InputError(
+                f"expected n/m sample periods with whole n and m, m up to {MAX_SUBSTEPS}; the nearest is "
+                f"{float(periods) / self.sample_rate_Hz:.6g} s",
+                field="loop_delay_s of the rig",
+                value=self.loop_delay_s,
+            )
         object.__setattr__(self, "substeps", periods.denominator)
 
     def _check(self) -> None:
@@ -219,24 +234,38 @@ class SampledLoop:
         if self.K.D.shape != (len(self.axes),) * 2:
             raise InputError(f"a {len(self.axes)} x {len(self.axes)} controller", field="K", value=self.K.D.shape)
         n_s = len(self.rig.sensor_rows()[0])
-        for name, things, count in (("sensors", self.sensors.chains, n_s),
-                                    ("drive_errors", self.drive_errors, self.n_drives)):
+        for name, things, count in (
+            ("sensors", self.sensors.chains, n_s),
+            ("drive_errors", self.drive_errors, self.n_drives),
+        ):
             if len(things) != count:
                 raise InputError(f"{count} systems", field=name, value=len(things))
-        for name, system in (*self.loops.items(), *((f"drive {k}", s) for k, s in enumerate(self.drive_errors) if s),
-                             *((f"sensor {k}", s) for k, s in enumerate(self.sensors.chains))):
+        for name, system in (
+            *self.loops.items(),
+            *((f"drive {k}", s) for k, s in enumerate(self.drive_errors) if s),
+            *((f"sensor {k}", s) for k, s in enumerate(self.sensors.chains)),
+        ):
             if system.D.shape != (1, 1):
                 raise InputError("one input and one output", field=name, value=system.D.shape)
         if self.digital is not None and (self.digital.D.shape != (self.n_drives, n_s) or not self.digital.dt):
-            raise InputError(f"a sampled system of {n_s} inputs and {self.n_drives} outputs", field="digital",
-                             value=self.digital.D.shape)
+            raise InputError(
+                f"a sampled system of {n_s} inputs and {self.n_drives} outputs",
+                field="digital",
+                value=self.digital.D.shape,
+            )
         if self.drive_coupling is not None and self.drive_coupling.D.shape != (self.n_drives,) * 2:
-            raise InputError(f"a system of {self.n_drives} inputs and outputs", field="drive_coupling",
-                             value=self.drive_coupling.D.shape)
+            raise InputError(
+                f"a system of {self.n_drives} inputs and outputs",
+                field="drive_coupling",
+                value=self.drive_coupling.D.shape,
+            )
         if "acceleration" in self.sensors.quantities and any(drive.D[0, 0] for drive in self.drives()):
             # Otherwise the acceleration would jump with the voltage, exactly at a sampling instant.
-            raise InputError("a corner for the amplifiers: accelerometers need drives without direct feedthrough",
-                             field="amplifier_corner_Hz", value=self.amplifier_corner_Hz)
+            raise InputError(
+                "a corner for the amplifiers: accelerometers need drives without direct feedthrough",
+                field="amplifier_corner_Hz",
+                value=self.amplifier_corner_Hz,
+            )
 
     @property
     def n_drives(self) -> int:
@@ -266,19 +295,30 @@ class SampledLoop:
         amplifier = cascade([], [-corner], corner) if corner else gain(1.0)
         return [amplifier if error is None else error @ amplifier for error in self.drive_errors]
 
-    def with_plant(self, name: str, plant: Rig | None = None,
-                   drive_errors: Sequence[StateSpace | None] | None = None,
-                   sensor_errors: Sequence[StateSpace | None] | None = None,
-                   drive_coupling: StateSpace | None = None) -> SampledLoop:
+    def with_plant(
+        self,
+        name: str,
+        plant: Rig | None = None,
+        drive_errors: Sequence[StateSpace | None] | None = None,
+        sensor_errors: Sequence[StateSpace | None] | None = None,
+        drive_coupling: StateSpace | None = None,
+    ) -> SampledLoop:
         """The same controller with another table; errors are systems from volts to volts, None where nominal."""
         sensors = self.sensors
         if sensor_errors is not None:
-            chains = tuple(chain if error is None else error @ chain
-                           for chain, error in zip(sensors.chains, sensor_errors, strict=True))
+            chains = tuple(
+                chain if error is None else error @ chain
+                for chain, error in zip(sensors.chains, sensor_errors, strict=True)
+            )
             sensors = replace(sensors, chains=chains)
-        return replace(self, name=name, plant=plant or self.rig, sensors=sensors,
-                       drive_errors=self.drive_errors if drive_errors is None else tuple(drive_errors),
-                       drive_coupling=self.drive_coupling if drive_coupling is None else drive_coupling)
+        return replace(
+            self,
+            name=name,
+            plant=plant or self.rig,
+            sensors=sensors,
+            drive_errors=self.drive_errors if drive_errors is None else tuple(drive_errors),
+            drive_coupling=self.drive_coupling if drive_coupling is None else drive_coupling,
+        )
 
 
 def lever_arms(rig: Rig) -> np.ndarray:

@@ -59,8 +59,9 @@ class SampledResponse:
         floor = np.zeros((frequency.size, len(COORDINATES)))
         for name, spectrum in self.loop.floor.items():
             # A realisation has no lines below the band of its model.
-            floor[:, COORDINATES.index(name)] = np.where(frequency >= spectrum.low_Hz * (1 - 1e-9),
-                                                         spectrum.asd(frequency, "velocity") ** 2, 0.0)
+            floor[:, COORDINATES.index(name)] = np.where(
+                frequency >= spectrum.low_Hz * (1 - 1e-9), spectrum.asd(frequency, "velocity") ** 2, 0.0
+            )
         noise = self.loop.sensors.noise_psd(frequency, self.loop.period_s)
         return sum((np.abs(of) ** 2 @ psd[:, :, None])[..., 0] for of, psd in ((of_floor, floor), (of_noise, noise)))
 
@@ -88,20 +89,27 @@ def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES)
     C = digital_controller(loop).frequency_response(omega)
     # u = C (S_w w + S_u u + n)
     volts = np.linalg.solve(np.eye(C.shape[1]) - C @ G.sensed_volts, np.concatenate([C @ G.sensed_floor, C], axis=2))
-    volts_floor, volts_noise = volts[:, :, :len(COORDINATES)], volts[:, :, len(COORDINATES):]
-    return SampledResponse(loop, omega, G.velocity_floor + G.velocity_volts @ volts_floor,
-                           G.velocity_volts @ volts_noise, volts_floor, volts_noise)
+    volts_floor, volts_noise = volts[:, :, : len(COORDINATES)], volts[:, :, len(COORDINATES) :]
+    return SampledResponse(
+        loop,
+        omega,
+        G.velocity_floor + G.velocity_volts @ volts_floor,
+        G.velocity_volts @ volts_noise,
+        volts_floor,
+        volts_noise,
+    )
 
 
 def open_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> OpenResponse:
     """Responses of table, drives and sensors without the controller, at omega (n,) [rad/s]."""
-    return OpenResponse(*(centre + folded for centre, folded in zip(_image(loop, omega), _folded(loop, omega, images),
-                                                                    strict=True)))
+    return OpenResponse(
+        *(centre + folded for centre, folded in zip(_image(loop, omega), _folded(loop, omega, images), strict=True))
+    )
 
 
 def _folded(loop: SampledLoop, omega: np.ndarray, images: int) -> list[np.ndarray]:
-    """Sum of all images except the centre: far above every resonance, hence smooth and interpolated from a few points.
-    """
+    """Sum of all images except the centre: far above every resonance, hence smooth and interpolated from a few
+    points."""
     points = omega if omega.size <= SMOOTH_POINTS else np.linspace(omega.min(), omega.max(), SMOOTH_POINTS)
     shifts = 2 * np.pi / loop.period_s * np.array([k for k in range(-images, images + 1) if k])
     parts = _image(loop, (shifts[:, None] + points).ravel())
@@ -118,8 +126,9 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     # s^2 M q + s C q + K q = (C_f + K_f / s) w + T u, and v = s q
     dynamic = s * eom.M + eom.C + eom.K / s
     acting = eom.T if loop.drive_coupling is None else eom.T @ loop.drive_coupling.frequency_response(image)
-    pushed = np.concatenate([(eom.C_floor + eom.K_floor / s) * (sinc ** 2)[:, None, None],
-                             acting * drive[:, None, :]], axis=2)
+    pushed = np.concatenate(
+        [(eom.C_floor + eom.K_floor / s) * (sinc**2)[:, None, None], acting * drive[:, None, :]], axis=2
+    )
     velocity = np.linalg.solve(dynamic, pushed)
     _, H = loop.plant.sensor_rows()
     n = len(COORDINATES)
@@ -127,9 +136,9 @@ def _image(loop: SampledLoop, image: np.ndarray) -> list[np.ndarray]:
     moved = H @ velocity
     if loop.gravity:
         # The apparent acceleration due to tilt, integrated to a velocity.
-        moved = moved + loop.plant.tilt_rows() @ velocity / s ** 2
+        moved = moved + loop.plant.tilt_rows() @ velocity / s**2
     against = np.array([kind == "displacement" for kind in loop.sensors.quantities])
-    moved[:, against, :n] -= H[against] * (sinc ** 2)[:, None, None]
+    moved[:, against, :n] -= H[against] * (sinc**2)[:, None, None]
     power = np.array([DERIVATIVES[kind] - 1 for kind in loop.sensors.quantities])
     sensed = moved * s ** power[:, None] * _diagonal(loop.sensors.chains, image)[:, :, None]
     return [velocity[:, :, :n], velocity[:, :, n:], sensed[:, :, :n], sensed[:, :, n:]]

@@ -75,10 +75,18 @@ class SpectrumAgreement:
 
     def as_dict(self) -> dict[str, Any]:
         """Values for a file."""
-        return {"axes": list(self.axes), "midband_Hz": self.midband_Hz.tolist(), "ratio": self.ratio.tolist(),
-                "lower": self.lower.tolist(), "upper": self.upper.tolist(), "dof": self.dof.tolist(),
-                "outside": int(np.count_nonzero(self.outside)), "bands": int(self.ratio.size),
-                "false_alarm": self.false_alarm, "agrees": self.agrees}
+        return {
+            "axes": list(self.axes),
+            "midband_Hz": self.midband_Hz.tolist(),
+            "ratio": self.ratio.tolist(),
+            "lower": self.lower.tolist(),
+            "upper": self.upper.tolist(),
+            "dof": self.dof.tolist(),
+            "outside": int(np.count_nonzero(self.outside)),
+            "bands": int(self.ratio.size),
+            "false_alarm": self.false_alarm,
+            "agrees": self.agrees,
+        }
 
 
 def welch_moments(psd: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +106,7 @@ def welch_moments(psd: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarra
     pairs = W[:, None] * _hann_transform(x[:, None] - apart) / POINTS_PER_LINE
     covariance = np.zeros((around.shape[0], apart.size))
     for lag in range(min(REACH_SEGMENTS, segments)):
-        share = (segments - lag) * (1 if lag == 0 else 2) / segments ** 2
+        share = (segments - lag) * (1 if lag == 0 else 2) / segments**2
         turned = np.exp(1j * np.pi * x * lag)[:, None] * pairs
         covariance += share * ((around @ turned.real) ** 2 + (around @ turned.imag) ** 2)
     return around @ pairs[:, 0], covariance
@@ -110,9 +118,13 @@ def _hann_transform(x: np.ndarray) -> np.ndarray:
     return np.sqrt(2 / 3) * (np.sinc(x) + 0.5 * (np.sinc(x - 1) + np.sinc(x + 1)))
 
 
-def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, float] = (1.0, 80.0),
-                             axes: tuple[str, ...] | None = None, false_alarm: float = 0.01,
-                             segment_s: float = 8.0) -> SpectrumAgreement:
+def check_spectrum_agreement(
+    record: SimulationRecord,
+    band_Hz: tuple[float, float] = (1.0, 80.0),
+    axes: tuple[str, ...] | None = None,
+    false_alarm: float = 0.01,
+    segment_s: float = 8.0,
+) -> SpectrumAgreement:
     """Compare the record's payload velocity with the linear prediction of its own loop.
 
     Parameters
@@ -139,39 +151,65 @@ def check_spectrum_agreement(record: SimulationRecord, band_Hz: tuple[float, flo
     lines = int(last[-1]) + 1
     fine = np.arange(1, (lines + REACH_LINES) * POINTS_PER_LINE + 1) * line_Hz / POINTS_PER_LINE
     # The density at zero frequency is set to zero because the estimate removes each segment's mean.
-    predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept] * arms ** 2
+    predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept] * arms**2
     psd = np.pad(predicted.T, ((0, 0), (1, 0)))
-    estimated = np.array([signal.welch(record.velocity(axis), fs, "hann", segment, segment // 2,
-                                       detrend="constant")[1][:lines] for axis in axes])
+    estimated = np.array(
+        [
+            signal.welch(record.velocity(axis), fs, "hann", segment, segment // 2, detrend="constant")[1][:lines]
+            for axis in axes
+        ]
+    )
     moments = [welch_moments(one, segments) for one in psd]
     expected = np.array([mean[:lines] for mean, _ in moments])
     power, mean = (np.add.reduceat(one, first, axis=1) for one in (estimated, expected))
-    variance = np.array([[_variance_of_sum(covariance, lo, hi) for lo, hi in zip(first, last, strict=True)]
-                         for _, covariance in moments])
-    dof = 2 * mean ** 2 / variance
+    variance = np.array(
+        [
+            [_variance_of_sum(covariance, lo, hi) for lo, hi in zip(first, last, strict=True)]
+            for _, covariance in moments
+        ]
+    )
+    dof = 2 * mean**2 / variance
     tail = false_alarm / mean.size / 2
     shown = slice(int(first[0]), lines)
-    return SpectrumAgreement(axes, mid, np.sqrt(power * line_Hz), np.sqrt(mean * line_Hz), dof,
-                             stats.chi2.ppf(tail, dof) / dof, stats.chi2.isf(tail, dof) / dof, false_alarm,
-                             np.arange(shown.start, shown.stop) * line_Hz, estimated[:, shown], expected[:, shown])
+    return SpectrumAgreement(
+        axes,
+        mid,
+        np.sqrt(power * line_Hz),
+        np.sqrt(mean * line_Hz),
+        dof,
+        stats.chi2.ppf(tail, dof) / dof,
+        stats.chi2.isf(tail, dof) / dof,
+        false_alarm,
+        np.arange(shown.start, shown.stop) * line_Hz,
+        estimated[:, shown],
+        expected[:, shown],
+    )
 
 
 def _variance_of_sum(covariance: np.ndarray, first: int, last: int) -> float:
     """Variance of the sum over lines first..last; each pair of different lines counts twice."""
-    return float(sum((1 if d == 0 else 2) * np.sum(covariance[first:last + 1 - d, d])
-                     for d in range(min(REACH_LINES, last - first) + 1)))
+    return float(
+        sum(
+            (1 if d == 0 else 2) * np.sum(covariance[first : last + 1 - d, d])
+            for d in range(min(REACH_LINES, last - first) + 1)
+        )
+    )
 
 
-def _bands(band_Hz: tuple[float, float], line_Hz: float,
-           sample_rate_Hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bands(
+    band_Hz: tuple[float, float], line_Hz: float, sample_rate_Hz: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Midbands and the first and last line of each band; no line belongs to two bands."""
     mid = third_octave_midbands(*band_Hz)
     lower, upper = third_octave_edges(mid)
     edges = np.ceil(np.append(lower, upper[-1]) / line_Hz).astype(int)
     first, last = edges[:-1], edges[1:] - 1
     if np.any(last < first):
-        raise InputError(f"segments long enough for a line in every third octave from {band_Hz[0]:g} Hz",
-                         field="segment_s", value=1 / line_Hz)
+        raise InputError(
+            f"segments long enough for a line in every third octave from {band_Hz[0]:g} Hz",
+            field="segment_s",
+            value=1 / line_Hz,
+        )
     if (last[-1] + REACH_LINES) * line_Hz >= sample_rate_Hz / 2:
         raise InputError(f"bands below half the sample rate of {sample_rate_Hz:g} Hz", field="band_Hz", value=band_Hz)
     return mid, first, last

@@ -54,8 +54,16 @@ PEAK_SECONDS, PEAK_BANDWIDTH_HZ = 600.0, 10.0
 PEAK_FACTOR = float(np.sqrt(2 * np.log(PEAK_SECONDS * PEAK_BANDWIDTH_HZ)))
 
 
-def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str, title: str, kind: ControllerKind,
-            samples: np.ndarray, notes: tuple[str, ...] = ()) -> ControllerResult:
+def analyse(
+    design: Design,
+    plant: DesignPlant,
+    K: StateSpace | None,
+    name: str,
+    title: str,
+    kind: ControllerKind,
+    samples: np.ndarray,
+    notes: tuple[str, ...] = (),
+) -> ControllerResult:
     """Analyse one controller (None: no control) on the design's plant.
 
     Parameters
@@ -72,7 +80,8 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
         raise ComputationError(
             "the closed loop is unstable with the nominal plant, so its mu has no bounds",
             measured=f"a closed-loop pole at {abs(fastest_growing.imag) / (2 * np.pi):.3g} Hz that grows with a time "
-                     f"constant of {1 / max(fastest_growing.real, 1e-12):.3g} s")
+            f"constant of {1 / max(fastest_growing.real, 1e-12):.3g} s",
+        )
     performance = plant.synthesis.closed(K)
     motion = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(K)
     blocks, all_blocks = plant.synthesis.blocks, plant.synthesis.all_blocks
@@ -81,25 +90,48 @@ def analyse(design: Design, plant: DesignPlant, K: StateSpace | None, name: str,
     nominal = performance.select(slice(n_z, None), slice(n_w, None))
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
     loose = K is None and blocks.many
-    robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks,
-                     slack=SETTINGS.passive_stability_slack if loose else SLACK)
+    robust = mu_peak(
+        performance.select(slice(n_z), slice(n_w)), blocks, slack=SETTINGS.passive_stability_slack if loose else SLACK
+    )
     slack = SETTINGS.passive_slack if loose else SLACK
     worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
-    worst_band = bound(plant, blocks, worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high),
-                                                      slack=slack, robust=robust, points=SETTINGS.few_points))
+    worst_band = bound(
+        plant,
+        blocks,
+        worst_case_gain(
+            motion,
+            blocks,
+            band=(2 * np.pi * low, 2 * np.pi * high),
+            slack=slack,
+            robust=robust,
+            points=SETTINGS.few_points,
+        ),
+    )
     omega = 2 * np.pi * PLOT_HZ
     return ControllerResult(
-        name, title, kind, K, full.is_stable(), hinf_norm(nominal).gain,
+        name,
+        title,
+        kind,
+        K,
+        full.is_stable(),
+        hinf_norm(nominal).gain,
         bound(plant, blocks, mu_peak(performance, all_blocks, slack=SLACK)),
         bound(plant, blocks, robust),
-        worst_peak, worst_band, transmissibility(motion, blocks, samples, omega),
-        _compliance(plant, full, omega), site_response(plant, full, K is not None, design.floor.band_Hz),
-        hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain, fastest, notes,
-        _by_slicot(nominal))
+        worst_peak,
+        worst_band,
+        transmissibility(motion, blocks, samples, omega),
+        _compliance(plant, full, omega),
+        site_response(plant, full, K is not None, design.floor.band_Hz),
+        hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain,
+        fastest,
+        notes,
+        _by_slicot(nominal),
+    )
 
 
-def worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
-                  ) -> float:
+def worst_of_axis(
+    design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
+) -> float:
     """Bound on the worst-case velocity of an axis in the band, for unit floor velocity in any direction.
 
     axis : index among the axes of the design.
@@ -111,8 +143,9 @@ def worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace |
     motion = part.closed(K).select([*range(blocks.n_z), blocks.n_z + axis], None)
     band = design.transmissibility.band_Hz[0] * 2 * np.pi, design.transmissibility.band_Hz[1] * 2 * np.pi
     if stability is not None:
-        return worst_case_gain(motion, blocks, band=band, slack=SLACK, robust=stability,
-                               points=SETTINGS.few_points).upper
+        return worst_case_gain(
+            motion, blocks, band=band, slack=SLACK, robust=stability, points=SETTINGS.few_points
+        ).upper
     omega = np.geomspace(*band, SETTINGS.axis_points)
     return float(np.max(worst_gain(motion.frequency_response(omega), blocks).gain))
 
@@ -128,13 +161,22 @@ def _by_slicot(system: StateSpace) -> float | None:
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
     """A mu or worst-case result, with its perturbation in words."""
     words = describe(plant, blocks, found.delta) if found.delta is not None else ()
-    return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, found.frequencies,
-                 found.upper_curve, found.lower_curve)
+    return Bound(
+        found.upper,
+        found.lower,
+        found.omega,
+        found.guaranteed,
+        found.delta,
+        words,
+        found.frequencies,
+        found.upper_curve,
+        found.lower_curve,
+    )
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:
     """A perturbation in words: parameters by value, channels ("chains") by size and phase; equal ones are grouped."""
-    part = delta[:blocks.n_w, :blocks.n_z]
+    part = delta[: blocks.n_w, : blocks.n_z]
     real = {p.name: p for p in plant.rig.parameters}
     told: list[tuple[str, str]] = []
     for value, block in zip(blocks.values(part), blocks.blocks, strict=True):
@@ -162,8 +204,9 @@ def _by_family(told: list[tuple[str, str]]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def transmissibility(motion: StateSpace, blocks: BlockStructure, samples: np.ndarray,
-                     omega: np.ndarray) -> Transmissibility:
+def transmissibility(
+    motion: StateSpace, blocks: BlockStructure, samples: np.ndarray, omega: np.ndarray
+) -> Transmissibility:
     """Nominal and sampled transmissibility of a closed loop with inputs (w_delta, floor)."""
     response = motion.frequency_response(omega)
     n_w, n_z = blocks.n_w, blocks.n_z
@@ -198,11 +241,12 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
     by_noise = np.linalg.norm(from_noise * real[:, None, :], axis=2) * plant.floor_density
     if not controlled:
         # No voltages, and no sensor noise in the motion: exactly zero, without round-off.
-        by_floor[:, len(plant.axes):], by_noise[:] = 0.0, 0.0
+        by_floor[:, len(plant.axes) :], by_noise[:] = 0.0, 0.0
     density = np.hypot(by_floor, by_noise)
 
     def rms(asd: np.ndarray, low: float = frequency[0], high: float = frequency[-1]) -> float:
         return band_rms(frequency, asd, low, high) if np.any(asd) else 0.0
+
     n = len(plant.axes)
     bands = third_octave_midbands(1.0, 80.0)
     payload = np.stack([third_octave_rms(frequency, density[:, k], bands)[1] for k in range(n)], axis=1)
@@ -211,5 +255,11 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
     return SiteResponse(
         {axis: rms(density[:, k], *band_Hz) for k, axis in enumerate(plant.axes)},
         {axis: rms(by_noise[:, k], *band_Hz) for k, axis in enumerate(plant.axes)},
-        bands, on_floor, payload, rating(bands, payload.max(axis=1)).criterion, rating(bands, on_floor).criterion,
-        volts, {name: PEAK_FACTOR * value for name, value in volts.items()})
+        bands,
+        on_floor,
+        payload,
+        rating(bands, payload.max(axis=1)).criterion,
+        rating(bands, on_floor).criterion,
+        volts,
+        {name: PEAK_FACTOR * value for name, value in volts.items()},
+    )

@@ -52,20 +52,32 @@ class AtRest:
 
     def words(self) -> str:
         """The effect of the offsets as a sentence without a full stop."""
-        return (f"offsets of up to {1e3 * np.max(self.offset_V, initial=0.0):.3g} mV per channel cost up to "
-                f"{self.drive_V[self.worst]:.3g} V of {self.limits_V[self.worst]:g} V (drive "
-                f"{self.drives[self.worst]}; gain at rest {np.max(np.abs(self.gain_V_per_V)):.3g} V/V, "
-                f"{self.gain_Ns_per_m:.3g} N s/m)")
+        return (
+            f"offsets of up to {1e3 * np.max(self.offset_V, initial=0.0):.3g} mV per channel cost up to "
+            f"{self.drive_V[self.worst]:.3g} V of {self.limits_V[self.worst]:g} V (drive "
+            f"{self.drives[self.worst]}; gain at rest {np.max(np.abs(self.gain_V_per_V)):.3g} V/V, "
+            f"{self.gain_Ns_per_m:.3g} N s/m)"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """For result.json and certificate.json."""
-        return {"gain_V_per_V": float(np.max(np.abs(self.gain_V_per_V))), "gain_Ns_per_m": self.gain_Ns_per_m,
-                "offset_V": float(np.max(self.offset_V, initial=0.0)), "drive_V": float(self.drive_V[self.worst]),
-                "drive": self.drives[self.worst], "percent_of_limit": self.percent}
+        return {
+            "gain_V_per_V": float(np.max(np.abs(self.gain_V_per_V))),
+            "gain_Ns_per_m": self.gain_Ns_per_m,
+            "offset_V": float(np.max(self.offset_V, initial=0.0)),
+            "drive_V": float(self.drive_V[self.worst]),
+            "drive": self.drives[self.worst],
+            "percent_of_limit": self.percent,
+        }
 
 
 def at_rest(loop: SampledLoop) -> AtRest:
     """DC behaviour of a loop's controller with the offsets of its rig's channels; inf if the controller integrates."""
     rig = loop.rig
-    return AtRest(gain_at_rest(digital_controller(loop)), np.array([one.offset_V for one in rig.sensors()]),
-                  loop.limits_V, rig.equations_of_motion().actuators, float(np.linalg.norm(gain_at_rest(loop.K), 2)))
+    return AtRest(
+        gain_at_rest(digital_controller(loop)),
+        np.array([one.offset_V for one in rig.sensors()]),
+        loop.limits_V,
+        rig.equations_of_motion().actuators,
+        float(np.linalg.norm(gain_at_rest(loop.K), 2)),
+    )

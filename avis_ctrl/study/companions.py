@@ -108,8 +108,10 @@ class Companions:
     def remarks(self) -> tuple[str, ...]:
         """The notes, and the loops that miss the required modulus margin."""
         low = ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in self.below_margin())
-        missed = (f"Loops of the other axes with a modulus margin below the required {self.settings.modulus_margin:g}, "
-                  f"with all loops closed: {low}.")
+        missed = (
+            f"Loops of the other axes with a modulus margin below the required {self.settings.modulus_margin:g}, "
+            f"with all loops closed: {low}."
+        )
         return (*self.notes, missed) if low else self.notes
 
 
@@ -126,11 +128,15 @@ def free_axes(rig: Rig, keep: Sequence[str]) -> tuple[list[str], list[tuple[str,
             passive.append((axis, error.expected))
         else:
             chosen.append(axis)
-    return chosen[len(keep):], passive
+    return chosen[len(keep) :], passive
 
 
-def design_companions(bare: SampledLoop, chain_error: Weight | None = None, band_Hz: Sequence[float] = (0.5, 60.0),
-                      settings: CompanionSettings = CompanionSettings()) -> Companions:
+def design_companions(
+    bare: SampledLoop,
+    chain_error: Weight | None = None,
+    band_Hz: Sequence[float] = (0.5, 60.0),
+    settings: CompanionSettings = CompanionSettings(),
+) -> Companions:
     """Loops for the axes that `bare` does not control.
 
     Parameters
@@ -163,10 +169,13 @@ def _with_margins(companions: Companions, bare: SampledLoop) -> Companions:
         """(n,) det(I - G C); closing one more loop multiplies it by the 1 + L of that loop."""
         C = digital_controller(replace(bare, loops=loops)).frequency_response(omega)
         return np.asarray(np.linalg.det(np.eye(G.shape[1]) - G @ C))
+
     closed = characteristic(loops)
     margins = [float(np.min(np.abs(closed / characteristic(loops | {axis: gain(0.0)})))) for axis in loops]
-    return replace(companions, loops=tuple(replace(one, modulus_margin=margin)
-                                           for one, margin in zip(companions.loops, margins, strict=True)))
+    return replace(
+        companions,
+        loops=tuple(replace(one, modulus_margin=margin) for one, margin in zip(companions.loops, margins, strict=True)),
+    )
 
 
 def _grid(bare: SampledLoop, settings: CompanionSettings) -> np.ndarray:
@@ -186,28 +195,39 @@ def until_stable(companions: Companions, plants: Sequence[SampledLoop]) -> Compa
         return companions
     settings, bare = companions.settings, replace(plants[0], loops={})
     for step in range(settings.shrinks + 1):
-        factor = settings.shrink ** step
+        factor = settings.shrink**step
         tried = companions.scaled(factor)
         if all(spectral_radius(replace(plant, loops=tried.systems())) < 1 for plant in plants):
-            lowered = (f"The gains of the other axes' loops were lowered by {-20 * np.log10(factor):.0f} dB: with "
-                       "higher gains a plant of the uncertainty set was unstable.")
+            lowered = (
+                f"The gains of the other axes' loops were lowered by {-20 * np.log10(factor):.0f} dB: with "
+                "higher gains a plant of the uncertainty set was unstable."
+            )
             return _with_margins(replace(tried, notes=(*tried.notes, lowered)) if step else tried, bare)
     # If the plants are unstable even without the loops, the loops are not the cause and remain as designed.
     without = [spectral_radius(replace(plant, loops={})) for plant in plants]
     if max(without) < 1:
         lowest = -20 * settings.shrinks * np.log10(settings.shrink)
-        reason = (f"even with the gains of the other axes' loops lowered by {lowest:.0f} dB, a plant of the "
-                  "uncertainty set is unstable")
-        return replace(companions, loops=(),
-                       passive=(*companions.passive, *((one.axis, reason) for one in companions.loops)))
+        reason = (
+            f"even with the gains of the other axes' loops lowered by {lowest:.0f} dB, a plant of the "
+            "uncertainty set is unstable"
+        )
+        return replace(
+            companions, loops=(), passive=(*companions.passive, *((one.axis, reason) for one in companions.loops))
+        )
     return _with_margins(companions, bare)
 
 
 class _Search:
     """Search for the loop of one axis at a time; a candidate is a rank-one change of a closed sampled loop."""
 
-    def __init__(self, bare: SampledLoop, omega: np.ndarray, chain_error: Weight | None, band_Hz: Sequence[float],
-                 settings: CompanionSettings):
+    def __init__(
+        self,
+        bare: SampledLoop,
+        omega: np.ndarray,
+        chain_error: Weight | None,
+        band_Hz: Sequence[float],
+        settings: CompanionSettings,
+    ):
         self.bare, self.omega, self.settings = bare, omega, settings
         self.open: OpenResponse = open_response(bare, omega)
         self.judged = (omega >= 2 * np.pi * band_Hz[0]) & (omega <= 2 * np.pi * band_Hz[1])
@@ -222,7 +242,7 @@ class _Search:
         self._units: dict[str, np.ndarray] = {}
         self._filters: dict[tuple[float, float], np.ndarray] = {}
         equations = bare.rig.equations_of_motion()
-        M, C, stiffness = (np.diag(X) / self.arms ** 2 for X in (equations.M, equations.C, equations.K))
+        M, C, stiffness = (np.diag(X) / self.arms**2 for X in (equations.M, equations.C, equations.K))
         self.critical = dict(zip(COORDINATES, np.maximum(2 * np.sqrt(M * stiffness) - C, 0.0), strict=True))
 
     def best(self, axis: str, others: dict[str, Companion]) -> Companion | None:
@@ -278,8 +298,10 @@ class _Search:
         Returns g (n,), motion (n, 6, sources), the two factors of the change of motion, and the sum of the magnitudes
         of the drives' contributions to g (n,).
         """
-        C = self.K + sum((one.gain * self._filter(one)[:, None, None] * self._unit(name)
-                          for name, one in others.items()), np.zeros(1))
+        C = self.K + sum(
+            (one.gain * self._filter(one)[:, None, None] * self._unit(name) for name, one in others.items()),
+            np.zeros(1),
+        )
         G, n_s = self.open, self.K.shape[2]
         closed = np.linalg.inv(np.eye(n_s) - G.sensed_volts @ C)  # from volts added at the sensors to sensor volts
         added = np.concatenate([G.sensed_floor, np.broadcast_to(np.eye(n_s), (self.omega.size, n_s, n_s))], axis=2)

@@ -55,30 +55,51 @@ def nominal_hinf(design: Design, plant: DesignPlant, rig: Rig) -> Candidate:
     nominal = plant.synthesis.nominal()
     # Near the optimum some controller poles tend to infinity and act as a gain. They are replaced by this gain, because
     # a processor cannot realise them.
-    made = hinfsyn(nominal.P, nominal.nmeas, nominal.ncon, backoff=design.synthesis.backoff_percent / 100,
-                   sample_rate_Hz=rig.sample_rate_Hz, far_poles="gain")
+    made = hinfsyn(
+        nominal.P,
+        nominal.nmeas,
+        nominal.ncon,
+        backoff=design.synthesis.backoff_percent / 100,
+        sample_rate_Hz=rig.sample_rate_Hz,
+        far_poles="gain",
+    )
     return Candidate("hinf", "H-infinity, nominal", "hinf", made.K, made.notes)
 
 
-def mu_optimal(design: Design, plant: DesignPlant, rig: Rig, callback: Callable[[Any], Any] | None = None,
-               rivals: Sequence[Candidate] = ()) -> tuple[Candidate, DKIteration]:
+def mu_optimal(
+    design: Design,
+    plant: DesignPlant,
+    rig: Rig,
+    callback: Callable[[Any], Any] | None = None,
+    rivals: Sequence[Candidate] = (),
+) -> tuple[Candidate, DKIteration]:
     """D-K iteration over the whole uncertainty set, then reduction to the lowest order with nearly the same mu.
 
     rivals : controllers that the study already has. The iteration starts from the best of them, and its complex mu is
         never larger than theirs; that of the reduced controller is within reduction_cost_percent of it.
     """
     P, asked = plant.synthesis, design.synthesis
-    made = dk_iteration(P.P, P.blocks, P.nmeas, P.ncon, callback=callback, target=asked.target_mu,
-                        polish=asked.polish is not False, max_iterations=asked.max_iterations,
-                        backoff=asked.backoff_percent / 100, starts=[one.K for one in rivals if one.K is not None])
+    made = dk_iteration(
+        P.P,
+        P.blocks,
+        P.nmeas,
+        P.ncon,
+        callback=callback,
+        target=asked.target_mu,
+        polish=asked.polish is not False,
+        max_iterations=asked.max_iterations,
+        backoff=asked.backoff_percent / 100,
+        starts=[one.K for one in rivals if one.K is not None],
+    )
     K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100, design.control_effort.offset_corner_Hz)
     old = ("synthesis.time_limit_s is ignored: max_iterations and target_mu end the iteration",)
     notes = (made.status, *(old if asked.time_limit_s is not None else ()), note)
     return Candidate("mu", "mu synthesis", "mu", K, notes), made
 
 
-def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offset_corner_Hz: float
-             ) -> tuple[StateSpace, str]:
+def _reduced(
+    plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offset_corner_Hz: float
+) -> tuple[StateSpace, str]:
     """The controller of lowest order whose complex mu grows by no more than the cost, and a note on the reduction."""
     P = plant.synthesis
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
@@ -88,6 +109,7 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
         """Complex mu of a closed loop; only an upper bound of it if below the goal."""
         M = closed.frequency_response(omega)[:, None]
         return float(np.max(upper_bound(M, blocks, SETTINGS.accuracy, goal).beta))
+
     K = made.best.K
     full = peak_on_grid(P.closed(K))
     limit = (1 + cost) * full
@@ -101,17 +123,21 @@ def _reduced(plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offse
         lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
         return reduce_controller(P.P, start, lambda one: peak_on_grid(P.closed(one), limit), limit=limit).K
+
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
     # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.
     nyquist = np.pi * rig.sample_rate_Hz
     residual = residualise_fast(K, nyquist, also_unstable=True)
     first = lowest_order(residual if harmless(residual) else K)
-    lags = (replace_fast_by_lags(K, part * nyquist, order)
-            for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners)
+    lags = (
+        replace_fast_by_lags(K, part * nyquist, order) for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners
+    )
     candidates = chain([first], map(lowest_order, filter(harmless, lags)))
     reduced = next((one for one in candidates if np.max(np.abs(one.poles()), initial=0.0) <= nyquist), first)
-    return reduced, (f"reduced from {K.nstates} to {reduced.nstates} states: complex mu on a grid of {omega.size} "
-                     f"frequencies changes from {full:.4f} to {peak_on_grid(P.closed(reduced)):.4f}")
+    return reduced, (
+        f"reduced from {K.nstates} to {reduced.nstates} states: complex mu on a grid of {omega.size} "
+        f"frequencies changes from {full:.4f} to {peak_on_grid(P.closed(reduced)):.4f}"
+    )
 
 
 def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:
@@ -124,8 +150,10 @@ def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> Control
     best = min((mu, *stable), key=lambda one: one.mu.upper if np.isfinite(one.mu.upper) else np.inf)
     if best is mu:
         return mu
-    note = (f"this is the controller {best.title!r}: its mu of {best.mu.upper:.4g} is below the {mu.mu.upper:.4g} "
-            "reached by D-K iteration and order reduction")
+    note = (
+        f"this is the controller {best.title!r}: its mu of {best.mu.upper:.4g} is below the {mu.mu.upper:.4g} "
+        "reached by D-K iteration and order reduction"
+    )
     return replace(best, name=mu.name, title=mu.title, kind=mu.kind, notes=(note, *mu.notes, *best.notes))
 
 

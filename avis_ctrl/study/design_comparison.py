@@ -15,9 +15,13 @@ from avis_ctrl.summary import html_table, in_short
 RESULT = "result.json"
 # Sections that define the mu problem; if they differ, the values of mu cannot be compared.
 WEIGHTS = ("rig", "loaded", "keep", "loop", "uncertainty", "transmissibility", "control_effort", "compliance", "floor")
-FIGURES = (("order", "states of the controller", ""), ("mu_upper", "mu, upper bound", ""),
-           ("mu_lower", "mu, lower bound", ""), ("peak_transmissibility_dB", "peak transmissibility, nominal", "dB"),
-           ("worst_case_peak_transmissibility_dB", "peak transmissibility, worst case", "dB"))
+FIGURES = (
+    ("order", "states of the controller", ""),
+    ("mu_upper", "mu, upper bound", ""),
+    ("mu_lower", "mu, lower bound", ""),
+    ("peak_transmissibility_dB", "peak transmissibility, nominal", "dB"),
+    ("worst_case_peak_transmissibility_dB", "peak transmissibility, worst case", "dB"),
+)
 
 
 @dataclass(frozen=True)
@@ -51,18 +55,26 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
     results = [read_json(folder / RESULT, "avis-design") for folder in folders]
     asked = [dict(_leaves(study.get("design"), "")) for study in studies]
     keys = list(dict.fromkeys([*asked[0], *asked[1]]))
-    requested = [(key, _as_text(asked[0].get(key)), _as_text(asked[1].get(key))) for key in keys
-                 if key != "title" and asked[0].get(key) != asked[1].get(key)]
+    requested = [
+        (key, _as_text(asked[0].get(key)), _as_text(asked[1].get(key)))
+        for key in keys
+        if key != "title" and asked[0].get(key) != asked[1].get(key)
+    ]
     if studies[0].get("rig") != studies[1].get("rig"):
         requested.insert(0, ("rig file", _first_line(studies[0].get("rig")), _first_line(studies[1].get("rig"))))
     rows = [_figures(result, folder) for result, folder in zip(results, folders, strict=True)]
-    found = [(name, _as_text(rows[0].get(name)), _as_text(rows[1].get(name)))
-             for name in dict.fromkeys([*rows[0], *rows[1]])]
+    found = [
+        (name, _as_text(rows[0].get(name)), _as_text(rows[1].get(name))) for name in dict.fromkeys([*rows[0], *rows[1]])
+    ]
     other = sorted({key.partition(".")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
-    note = (f"mu of the two cannot be compared: it refers to different {', '.join(other)}; transmissibilities can"
-            if other else "")
-    titles = tuple(str(study.get("design", {}).get("title", folder)) for study, folder in zip(studies, folders,
-                                                                                             strict=True))
+    note = (
+        f"mu of the two cannot be compared: it refers to different {', '.join(other)}; transmissibilities can"
+        if other
+        else ""
+    )
+    titles = tuple(
+        str(study.get("design", {}).get("title", folder)) for study, folder in zip(studies, folders, strict=True)
+    )
     if titles[0] == titles[1]:
         titles = str(folders[0]), str(folders[1])
     return DesignComparison((titles[0], titles[1]), tuple(requested), tuple(found), note)
@@ -93,8 +105,9 @@ def _figures(result: dict[str, Any], folder: Path) -> dict[str, Any]:
         for row in result["requirements"]:
             unit = f" [{row['unit']}]" if row["unit"] else ""
             figures[f"{row['name']}{unit}"] = row["value"]
-        figures["requirements met"] = f"{sum(row['met'] for row in result['requirements'])} of " \
-                                      f"{len(result['requirements'])}"
+        figures["requirements met"] = (
+            f"{sum(row['met'] for row in result['requirements'])} of {len(result['requirements'])}"
+        )
     except (KeyError, TypeError, StopIteration) as error:
         raise InputError(f"expected a result as avis design writes it; {error!r}", file=folder / RESULT) from None
     return figures

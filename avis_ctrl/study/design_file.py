@@ -12,13 +12,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    ValidationInfo,
-    field_serializer,
-    field_validator,
-)
+from pydantic import AfterValidator, Field, ValidationInfo, field_serializer, field_validator
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import Section, read_toml, validated
@@ -85,8 +79,11 @@ class UncertaintySection(Section):
     def identification(self) -> UncertaintyFile | None:
         """The content of the uncertainty file. Raises InputError if it has not been read yet."""
         if isinstance(self.identified, str):
-            raise InputError("expected the file's content: read_uncertainty(...), or a design that read_study read",
-                             field="uncertainty.identified", value=self.identified)
+            raise InputError(
+                "expected the file's content: read_uncertainty(...), or a design that read_study read",
+                field="uncertainty.identified",
+                value=self.identified,
+            )
         return self.identified
 
     def of(self, rig: Rig) -> list[UncertainParameter]:
@@ -100,8 +97,9 @@ class UncertaintySection(Section):
                 if not names:
                     near = difflib.get_close_matches(pattern, known, n=1)
                     hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(known)}"
-                    raise InputError(f"the rig {rig.name} has no parameter that matches; {hint}", field=field,
-                                     value=pattern)
+                    raise InputError(
+                        f"the rig {rig.name} has no parameter that matches; {hint}", field=field, value=pattern
+                    )
                 for name in names:
                     if name in found:
                         raise InputError(f"{name} is listed twice", field=field, value=pattern)
@@ -194,9 +192,16 @@ class SimulationSection(Section):
     seed: Annotated[int, Field(ge=0)] = 1
 
 
-Quantity = Literal["mu_upper", "mu_gap_percent", "worst_case_peak_transmissibility_dB",
-                   "worst_case_band_transmissibility_dB", "passive_peak_transmissibility_dB",
-                   "advantage_over_skyhook_dB", "advantage_on_each_axis_dB", "fastest_controller_pole_Hz"]
+Quantity = Literal[
+    "mu_upper",
+    "mu_gap_percent",
+    "worst_case_peak_transmissibility_dB",
+    "worst_case_band_transmissibility_dB",
+    "passive_peak_transmissibility_dB",
+    "advantage_over_skyhook_dB",
+    "advantage_on_each_axis_dB",
+    "fastest_controller_pole_Hz",
+]
 UNITS: dict[str, str] = {"mu_upper": "", "mu_gap_percent": "%", "fastest_controller_pole_Hz": "Hz"}
 
 
@@ -285,8 +290,11 @@ def _require_rival(design: Design) -> None:
     """A requirement on the advantage over a skyhook needs this skyhook in compare_with."""
     wanted = [one.quantity for one in design.requirement if one.quantity.startswith("advantage")]
     if wanted and "skyhook" not in design.compare_with:
-        raise InputError(f'expected "skyhook" among them: the requirement {wanted[0]} compares with it',
-                         field="compare_with", value=design.compare_with)
+        raise InputError(
+            f'expected "skyhook" among them: the requirement {wanted[0]} compares with it',
+            field="compare_with",
+            value=design.compare_with,
+        )
 
 
 def _require_band_below_crossovers(design: Design) -> None:
@@ -295,9 +303,12 @@ def _require_band_below_crossovers(design: Design) -> None:
     for name in ("actuator_chains", "sensor_chains"):
         chains: ChainUncertainty | None = getattr(design.uncertainty, name)
         if chains is not None and chains.crossover_Hz <= low:
-            raise InputError(f"expected a crossover above {low:g} Hz, the lower end of transmissibility.band_Hz: above "
-                             "the crossover the chains are more than 100 % uncertain",
-                             field=f"uncertainty.{name}.crossover_Hz", value=chains.crossover_Hz)
+            raise InputError(
+                f"expected a crossover above {low:g} Hz, the lower end of transmissibility.band_Hz: above "
+                "the crossover the chains are more than 100 % uncertain",
+                field=f"uncertainty.{name}.crossover_Hz",
+                value=chains.crossover_Hz,
+            )
 
 
 def read_study(path: str | Path) -> tuple[Design, Rig]:
@@ -317,14 +328,19 @@ def study_of(design: Design, path: Path) -> tuple[Design, Rig]:
     """
     beside = path.parent / design.rig
     if design.rig not in SHIPPED and not beside.is_file():
-        raise InputError(f"expected one of {', '.join(SHIPPED)}, or the path of a rig file relative to the design file",
-                         file=path, field="rig", value=design.rig)
+        raise InputError(
+            f"expected one of {', '.join(SHIPPED)}, or the path of a rig file relative to the design file",
+            file=path,
+            field="rig",
+            value=design.rig,
+        )
     named = design.uncertainty.identified
     rig = design.equipped(load_rig(design.rig if design.rig in SHIPPED else beside, design.loaded, check=named is None))
     if isinstance(named, str):
         content = read_uncertainty(path.parent / named)
-        design = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
-            update={"identified": content})})
+        design = design.model_copy(
+            update={"uncertainty": design.uncertainty.model_copy(update={"identified": content})}
+        )
     try:
         if (known := design.uncertainty.identification) is not None:
             known.check_rig(rig)

@@ -32,11 +32,16 @@ def examine() -> list[Check]:
     """Run all checks; a failure is a row, never an exception."""
     checks = [Check("python", platform.python_version(), True)]
     checks += [_attempt(name, partial(metadata.version, name)) for name in LIBRARIES]
-    checks += [_attempt("processors and BLAS threads", _threads), _attempt("SLICOT H-infinity norm", _slicot),
-               _attempt("clarabel solves an LMI", _clarabel), _attempt("mu bounds (compiled)", _mu),
-               _attempt("nonlinear simulation (compiled)", _simulation),
-               _attempt("gcc, for avis export", _gcc), _attempt("typst compiles a PDF", _typst),
-               _attempt("own H-infinity synthesis", _synthesis)]
+    checks += [
+        _attempt("processors and BLAS threads", _threads),
+        _attempt("SLICOT H-infinity norm", _slicot),
+        _attempt("clarabel solves an LMI", _clarabel),
+        _attempt("mu bounds (compiled)", _mu),
+        _attempt("nonlinear simulation (compiled)", _simulation),
+        _attempt("gcc, for avis export", _gcc),
+        _attempt("typst compiles a PDF", _typst),
+        _attempt("own H-infinity synthesis", _synthesis),
+    ]
     return checks
 
 
@@ -66,7 +71,7 @@ def _slicot() -> str:
     from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 
     zeta = 0.1
-    return _near(hinf_norm_slicot(tf([1.0], [1.0, 2 * zeta, 1.0])), 1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), 1e-6)
+    return _near(hinf_norm_slicot(tf([1.0], [1.0, 2 * zeta, 1.0])), 1 / (2 * zeta * np.sqrt(1 - zeta**2)), 1e-6)
 
 
 def _clarabel() -> str:
@@ -132,7 +137,11 @@ def _synthesis() -> str:
     from avis_ctrl.robust.hinfsyn import hinfsyn
 
     weight, z = tf([1.0, 2.0], [2.0, 0.02]), 1.0
-    parts = [tf([-1.0, z], [1.0, 3.0, 2.0], ["u"], ["g"]), summing_junction("e", ["w", "-g"]),
-             weight.renamed(["e"], ["z"]), gain(1e-4, ["u"], ["z_u"])]
+    parts = [
+        tf([-1.0, z], [1.0, 3.0, 2.0], ["u"], ["g"]),
+        summing_junction("e", ["w", "-g"]),
+        weight.renamed(["e"], ["z"]),
+        gain(1e-4, ["u"], ["z_u"]),
+    ]
     made = hinfsyn(connect(parts, ["w", "u"], ["z", "z_u", "e"]), 1, 1, backoff=1e-3)
     return _near(made.gamma, abs(weight(z)[0, 0]), 1e-2)

@@ -29,12 +29,16 @@ def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence
     except OSError as error:
         if error.errno in FULL:
             raise not_written(path, error) from None
-        raise InputError(f"expected a writable folder ({error.strerror or error})", field="--out",
-                         value=str(path)) from None
+        raise InputError(
+            f"expected a writable folder ({error.strerror or error})", field="--out", value=str(path)
+        ) from None
     for name, is_folder in (*((name, True) for name in folders), *((name, False) for name in files)):
         if (path / name).exists() and (path / name).is_dir() != is_folder:
-            raise InputError(f"expected a {'folder' if is_folder else 'file'} at {path / name}, or nothing",
-                             field="--out", value=str(path))
+            raise InputError(
+                f"expected a {'folder' if is_folder else 'file'} at {path / name}, or nothing",
+                field="--out",
+                value=str(path),
+            )
     return path
 
 

@@ -37,8 +37,17 @@ from avis_ctrl.study.workers import each
 
 Progress = Callable[[str], None]
 # Gates whose stops are ignored: `gap` itself recognises and names these faults, or corrects them.
-NAMED_HERE = ("clipping", "hum", "signal to noise", "coherence", "repeatability", "level dependence", "periodicity",
-              "spikes", "missing samples")
+NAMED_HERE = (
+    "clipping",
+    "hum",
+    "signal to noise",
+    "coherence",
+    "repeatability",
+    "level dependence",
+    "periodicity",
+    "spikes",
+    "missing samples",
+)
 # Minimum number of samples of a record; with fewer, neither the gates nor a held-out third give any information.
 MIN_SAMPLES = 300
 
@@ -85,13 +94,22 @@ class GapFinding:
 
     def to_json(self) -> dict[str, Any]:
         """Content of gap.json: the contract's keys, error by noise alone, sentences of the report, mu, provenance."""
-        return {**self.gap.to_json(), "noise_nrmse": self.gap.noise_nrmse, "sentences": list(self.gap.sentences),
-                "design": self.design.to_json() if self.design else None, "design_note": self.design_note or None,
-                "provenance": dict(self.provenance)}
+        return {
+            **self.gap.to_json(),
+            "noise_nrmse": self.gap.noise_nrmse,
+            "sentences": list(self.gap.sentences),
+            "design": self.design.to_json() if self.design else None,
+            "design_note": self.design_note or None,
+            "provenance": dict(self.provenance),
+        }
 
 
-def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptions | None = None,
-             progress: Progress = lambda text: None) -> GapFinding:
+def find_gap(
+    measured: Campaign | FrequencyResponse,
+    rig: Rig,
+    options: GapOptions | None = None,
+    progress: Progress = lambda text: None,
+) -> GapFinding:
     """Find where a rig and a campaign disagree, and name the missing effects.
 
     Raises
@@ -102,8 +120,11 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     """
     options, began = options or GapOptions(), time.monotonic()
     if not isinstance(measured, Campaign):
-        raise InputError("expected records in time: frequency responses do not distinguish faults of a signal from "
-                         "those of the table", field="measurement")
+        raise InputError(
+            "expected records in time: frequency responses do not distinguish faults of a signal from "
+            "those of the table",
+            field="measurement",
+        )
     named = with_rig_names(rig, measured)
     assert isinstance(named, Campaign)  # with_rig_names keeps the type
     measured = named
@@ -111,8 +132,10 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
     if options.band_Hz is not None:
         check_band(measured, options.band_Hz, SETTINGS)
     if options.own_effects is not None:
-        try_out(options.own_effects, TableModel(ResponseModel.of(rig, (), measured.y_unit, measured.y_names,
-                                                                 measured.u_names)))
+        try_out(
+            options.own_effects,
+            TableModel(ResponseModel.of(rig, (), measured.y_unit, measured.y_names, measured.u_names)),
+        )
     with threadpool_limits(1):
         findings = _gates(measured, rig, options, progress) if options.gates else ()
         corner = amplifier_corner(rig, options.amplifier_corner_Hz)
@@ -124,8 +147,9 @@ def find_gap(measured: Campaign | FrequencyResponse, rig: Rig, options: GapOptio
         stops = tuple(f"gate {one.gate}: {one.sentence}" for one in findings if one.severity == "stop")
         gap = replace(gap, seconds=seconds, sentences=(*gap.sentences, *known, *stops))
         design, note, design_sha256 = _design(gap, options, progress)
-    return GapFinding(gap, measured, findings, gap_provenance(measured, rig, options, seconds, design_sha256), design,
-                      note)
+    return GapFinding(
+        gap, measured, findings, gap_provenance(measured, rig, options, seconds, design_sha256), design, note
+    )
 
 
 def _require_records(measured: Campaign, rig: Rig) -> None:
@@ -133,12 +157,16 @@ def _require_records(measured: Campaign, rig: Rig) -> None:
     if measured.records[0].header.u_unit != "V":
         raise InputError("expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit)
     if abs(measured.sample_rate_Hz / rig.sample_rate_Hz - 1) > 1e-6:
-        raise InputError(f"expected the rig's own {rig.sample_rate_Hz:g} Hz", field="sample_rate_Hz",
-                         value=measured.sample_rate_Hz)
+        raise InputError(
+            f"expected the rig's own {rig.sample_rate_Hz:g} Hz", field="sample_rate_Hz", value=measured.sample_rate_Hz
+        )
     for record in measured.records:
         if record.header.samples < MIN_SAMPLES:
-            raise InputError(f"expected at least {MIN_SAMPLES} samples", field=f"record {record.header.name}: samples",
-                             value=record.header.samples)
+            raise InputError(
+                f"expected at least {MIN_SAMPLES} samples",
+                field=f"record {record.header.name}: samples",
+                value=record.header.samples,
+            )
 
 
 def _gates(measured: Campaign, rig: Rig, options: GapOptions, progress: Progress) -> tuple[Finding, ...]:
@@ -177,13 +205,26 @@ def predict(found: GapFinding, campaign: Campaign) -> list[tuple[np.ndarray, np.
     return [(both[0][record.header.name], both[1][record.header.name]) for record in campaign.records]
 
 
-def gap_provenance(measured: Campaign, rig: Rig, options: GapOptions, seconds: float,
-                   design_sha256: str | None = None) -> dict[str, Any]:
+def gap_provenance(
+    measured: Campaign, rig: Rig, options: GapOptions, seconds: float, design_sha256: str | None = None
+) -> dict[str, Any]:
     """Provenance of a gap search; design_sha256 : of the design file, None if none was used."""
     data, own = digest(measured), options.own_effects
-    further = {} if own is None else {"own_effects": f"{own.path.name}: {', '.join(own.names)}",
-                                      "own_effects_sha256": own.sha256}
+    further = (
+        {}
+        if own is None
+        else {"own_effects": f"{own.path.name}: {', '.join(own.names)}", "own_effects_sha256": own.sha256}
+    )
     if design_sha256 is not None:
         further["design_sha256"] = design_sha256
-    return provenance(rig, repr(options) + data, options.seed, seconds, ("numpy", "scipy", "numba", "h5py"),
-                      measurement=measured.source, **further, measurement_sha256=data, settings=tuning_values())
+    return provenance(
+        rig,
+        repr(options) + data,
+        options.seed,
+        seconds,
+        ("numpy", "scipy", "numba", "h5py"),
+        measurement=measured.source,
+        **further,
+        measurement_sha256=data,
+        settings=tuning_values(),
+    )

@@ -25,18 +25,29 @@ MODEL_FILE = "axis_model.json"
 FILES = "gap.json", "gap.html", "gap.pdf", MODEL_FILE
 
 
-def write_axis_gap(folder: Path, gap: AxisGap, source: str, options: dict[str, Any],
-                   reports: Callable[[AxisGap, str, dict[str, Any]], Sequence[bytes]]) -> list[str]:
+def write_axis_gap(
+    folder: Path,
+    gap: AxisGap,
+    source: str,
+    options: dict[str, Any],
+    reports: Callable[[AxisGap, str, dict[str, Any]], Sequence[bytes]],
+) -> list[str]:
     """Write gap.json, gap.html, gap.pdf and, for a drive or an oscillator, axis_model.json; returns their names.
 
     reports : makes the two reports from gap, source and provenance.
     """
-    made = {"avis_ctrl": avis_ctrl.__version__, "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "measurement": source, "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str
-                                                                              ).encode()).hexdigest(),
-            "options": options, "settings": asdict(SETTINGS)}
-    files = {"gap.json": _json({**gap.to_json(), "provenance": made}),
-             **dict(zip(FILES[1:3], reports(gap, source, made), strict=True))}
+    made = {
+        "avis_ctrl": avis_ctrl.__version__,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "measurement": source,
+        "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest(),
+        "options": options,
+        "settings": asdict(SETTINGS),
+    }
+    files = {
+        "gap.json": _json({**gap.to_json(), "provenance": made}),
+        **dict(zip(FILES[1:3], reports(gap, source, made), strict=True)),
+    }
     if "reading" in gap.model:
         files[MODEL_FILE] = _json({"format": "avis-axis-model", "version": 1, **gap.model})
     # A model of an earlier run of another kind is removed: `avis predict` would use it.
@@ -72,16 +83,20 @@ def write_axis_predictions(folder: Path, paths: Sequence[Path], out: Path) -> li
             raise ValueError("another format")
         reading = Reading(**{**model["reading"], "range_s": None})
     except FileNotFoundError:
-        raise InputError("expected the model of a drive or an oscillator: other kinds are responses, which predict no "
-                         "record", file=folder / MODEL_FILE) from None
+        raise InputError(
+            "expected the model of a drive or an oscillator: other kinds are responses, which predict no record",
+            file=folder / MODEL_FILE,
+        ) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"expected a model as avis gap-axis writes it: {error}".splitlines()[0],
-                         file=folder / MODEL_FILE) from None
+        raise InputError(
+            f"expected a model as avis gap-axis writes it: {error}".splitlines()[0], file=folder / MODEL_FILE
+        ) from None
     kind = model["kind"]
     records, rate = signals_in(kind, paths, reading)
     if abs(rate / model["rate_Hz"] - 1) > 1e-3:
-        raise InputError(f"expected records of {model['rate_Hz']:g} Hz, as the model's", field="sample_rate_Hz",
-                         value=rate)
+        raise InputError(
+            f"expected records of {model['rate_Hz']:g} Hz, as the model's", field="sample_rate_Hz", value=rate
+        )
     errors = []
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "kind": kind})

@@ -101,14 +101,20 @@ class DesignEffect:
     def to_json(self) -> dict[str, Any]:
         """Figures of the three loops, infinite for an unstable loop, and the sentences."""
         loops = {"before": self.before, "after": self.after, "new": self.new}
-        return {**{name: asdict(loop) if loop else None for name, loop in loops.items()},
-                "in_files": list(self.in_files), "not_in_files": list(self.not_in_files),
-                "uncertainty": self.uncertainty.to_json() if self.uncertainty else None,
-                "not_checked": dict(self.not_checked), "sentences": list(self.sentences), "seconds": self.seconds}
+        return {
+            **{name: asdict(loop) if loop else None for name, loop in loops.items()},
+            "in_files": list(self.in_files),
+            "not_in_files": list(self.not_in_files),
+            "uncertainty": self.uncertainty.to_json() if self.uncertainty else None,
+            "not_checked": dict(self.not_checked),
+            "sentences": list(self.sentences),
+            "seconds": self.seconds,
+        }
 
 
-def design_effect(gap: Gap, design: Path | Design | None = None,
-                  progress: Progress = lambda text: None) -> DesignEffect:
+def design_effect(
+    gap: Gap, design: Path | Design | None = None, progress: Progress = lambda text: None
+) -> DesignEffect:
     """Design on the baseline, evaluate on the updated model, design again.
 
     Parameters
@@ -140,13 +146,21 @@ def design_effect(gap: Gap, design: Path | Design | None = None,
 
 def without_ranges(design: Design) -> Design:
     """A copy of the design without parameter ranges."""
-    return design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
-        update={"parameters_percent": {}, "parameters_absolute": {}})})
+    return design.model_copy(
+        update={
+            "uncertainty": design.uncertainty.model_copy(update={"parameters_percent": {}, "parameters_absolute": {}})
+        }
+    )
 
 
-def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
-                    progress: Progress = lambda text: None, signals: Sequence[str] = (),
-                    uncertainty: FitUncertainty | None = None) -> DesignEffect:
+def compare_designs(
+    baseline: TableModel,
+    updated: TableModel,
+    design: Design,
+    progress: Progress = lambda text: None,
+    signals: Sequence[str] = (),
+    uncertainty: FitUncertainty | None = None,
+) -> DesignEffect:
     """`design_effect` for two given models.
 
     signals : named effects that act on the signals and are in no model.
@@ -184,11 +198,29 @@ def compare_designs(baseline: TableModel, updated: TableModel, design: Design,
     left_out = not_realised(updated)
     not_checked = left_out | dict.fromkeys(signals, "it acts on the measured signals and is not part of the loop")
     held = "all" if not left_out else "none" if len(left_out) == len(updated.effects) else "some"
-    words = (*_outcome(before, after, new, design.synthesis.target_mu, held), *_unchecked(not_checked), *notes,
-             *(uncertainty.sentences() if uncertainty else ()), *_other_ranges(in_files_design, uncertainty),
-             *_remarks(realised, design, new_rig, updated, when, in_files, not_in_files))
-    return DesignEffect(before, after, new, K, K_new, realised, in_files, not_in_files, files, words,
-                        time.monotonic() - began, not_checked, uncertainty)
+    words = (
+        *_outcome(before, after, new, design.synthesis.target_mu, held),
+        *_unchecked(not_checked),
+        *notes,
+        *(uncertainty.sentences() if uncertainty else ()),
+        *_other_ranges(in_files_design, uncertainty),
+        *_remarks(realised, design, new_rig, updated, when, in_files, not_in_files),
+    )
+    return DesignEffect(
+        before,
+        after,
+        new,
+        K,
+        K_new,
+        realised,
+        in_files,
+        not_in_files,
+        files,
+        words,
+        time.monotonic() - began,
+        not_checked,
+        uncertainty,
+    )
 
 
 def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
@@ -197,18 +229,23 @@ def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
         if not isinstance(rig, AvisTable):
             raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")
         keep = " and ".join(default_keep(rig))
-        return default_design(rig, f"{rig.name}: {keep} under one controller, weights chosen for the AVIS",
-                              PARAMETERS_PERCENT)
+        return default_design(
+            rig, f"{rig.name}: {keep} under one controller, weights chosen for the AVIS", PARAMETERS_PERCENT
+        )
     asked = design if isinstance(design, Design) else read_study(design)[0]
     if asked.uncertainty.identified is not None:
-        complaint = InputError("it belongs to the parameters of one identification; expected a design whose ranges are "
-                               "set by hand (parameters_percent)", field="uncertainty.identified")
+        complaint = InputError(
+            "it belongs to the parameters of one identification; expected a design whose ranges are "
+            "set by hand (parameters_percent)",
+            field="uncertainty.identified",
+        )
         raise complaint.in_file(design) if isinstance(design, Path) else complaint
     return asked
 
 
-def _worst_moment(design: Design, model: TableModel, wiring: Wiring, K: StateSpace,
-                  fit: Sequence[Uncertain] = ()) -> tuple[LoopFigures, float]:
+def _worst_moment(
+    design: Design, model: TableModel, wiring: Wiring, K: StateSpace, fit: Sequence[Uncertain] = ()
+) -> tuple[LoopFigures, float]:
     """Figures of the controller on the model. If the model drifts: at the end of the campaign with the larger mu."""
     drifts = any(one.effect.name == "stiffness_drift" for one in model.effects)
     found = []
@@ -233,13 +270,22 @@ def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace
     in_band = nominal.frequency_response(2 * np.pi * np.geomspace(low, high, 400))
     worst = worst_case_gain(motion, blocks, slack=SLACK)
     worst_band = worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK)
-    return LoopFigures(True, in_six, mu.upper, mu.lower, decibels(hinf_norm(nominal).gain),
-                       decibels(float(np.max(np.linalg.norm(in_band, ord=2, axis=(1, 2))))), decibels(worst.upper),
-                       decibels(worst_band.upper), fastest)
+    return LoopFigures(
+        True,
+        in_six,
+        mu.upper,
+        mu.lower,
+        decibels(hinf_norm(nominal).gain),
+        decibels(float(np.max(np.linalg.norm(in_band, ord=2, axis=(1, 2))))),
+        decibels(worst.upper),
+        decibels(worst_band.upper),
+        fastest,
+    )
 
 
-def start_files(design: Design, model: TableModel, when: float = 0.0
-                ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
+def start_files(
+    design: Design, model: TableModel, when: float = 0.0
+) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
     """rig.toml and design.toml of a model by name, labels of the effects that they contain, and of the others."""
     found = design_files(design, model, when)
     held = ", ".join(found.inside) or "none"
@@ -247,8 +293,11 @@ def start_files(design: Design, model: TableModel, when: float = 0.0
     if found.outside:
         header += f"\neffects that no rig or design file holds: {', '.join(found.outside)}"
     asked = found.design.model_copy(update={"rig": RIG_FILE})
-    return ({RIG_FILE: rig_toml(found.rig, header=header), DESIGN_FILE: design_toml(asked)}, found.inside,
-            found.outside)
+    return (
+        {RIG_FILE: rig_toml(found.rig, header=header), DESIGN_FILE: design_toml(asked)},
+        found.inside,
+        found.outside,
+    )
 
 
 def _unchecked(not_checked: dict[str, str]) -> list[str]:
@@ -256,23 +305,30 @@ def _unchecked(not_checked: dict[str, str]) -> list[str]:
     if not not_checked:
         return []
     each = "; ".join(f"{label}: {why}" for label, why in not_checked.items())
-    return [f"NOT checked: no controller was designed or evaluated with {', '.join(not_checked)} ({each}). Their "
-            "influence on the closed loop is not known from these figures; simulate or measure the closed loop."]
+    return [
+        f"NOT checked: no controller was designed or evaluated with {', '.join(not_checked)} ({each}). Their "
+        "influence on the closed loop is not known from these figures; simulate or measure the closed loop."
+    ]
 
 
-def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None,
-             held: str = "all") -> list[str]:
+def _outcome(
+    before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None, held: str = "all"
+) -> list[str]:
     """mu of the three loops in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
     if after is None:
-        return [f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
-                "changes the model, so nothing else was computed."]
+        return [
+            f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
+            "changes the model, so nothing else was computed."
+        ]
     said = "Yesterday's controller"
     start = f"mu {before.mu_upper:.3g} on the baseline"
     if not after.stable:
         first = f"{said} has {start} and makes the updated model unstable."
     else:
-        first = (f"{said} has {start} and {after.mu_upper:.3g} on the updated model: "
-                 f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}.")
+        first = (
+            f"{said} has {start} and {after.mu_upper:.3g} on the updated model: "
+            f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}."
+        )
     if after.stable and before.stable_in_six and not after.stable_in_six:
         first += " On all six coordinates it makes the updated model unstable, which the locked ones hide."
     if new is None:
@@ -284,10 +340,16 @@ def _outcome(before: LoopFigures, after: LoopFigures | None, new: LoopFigures | 
     bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
     if not np.isfinite(new.worst_peak_dB):
         bounds = "stability is not proved for every table within the design's uncertainty"
-    stop = f" Synthesis stops near its target of {target:g}: it does not look for the lowest mu." \
-        if target and after.mu_upper < new.mu_upper < 1 else ""
-    return [first, f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} "
-                   f"({bounds}).{stop}{hidden}"]
+    stop = (
+        f" Synthesis stops near its target of {target:g}: it does not look for the lowest mu."
+        if target and after.mu_upper < new.mu_upper < 1
+        else ""
+    )
+    return [
+        first,
+        f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} "
+        f"({bounds}).{stop}{hidden}",
+    ]
 
 
 def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
@@ -295,8 +357,10 @@ def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
         return "stability is no longer proved for every table within the design's uncertainty"
     if not np.isfinite(before.worst_peak_dB):
         return "stability was not proved on the baseline for every table within the design's uncertainty"
-    return (f"worst-case transmissibility goes from {before.worst_peak_dB:.1f} to {after.worst_peak_dB:.1f} dB at its "
-            f"peak and from {before.worst_band_dB:.1f} to {after.worst_band_dB:.1f} dB in the band")
+    return (
+        f"worst-case transmissibility goes from {before.worst_peak_dB:.1f} to {after.worst_peak_dB:.1f} dB at its "
+        f"peak and from {before.worst_band_dB:.1f} to {after.worst_band_dB:.1f} dB in the band"
+    )
 
 
 def _verdict(before: float, after: float, held: str) -> str:
@@ -305,9 +369,11 @@ def _verdict(before: float, after: float, held: str) -> str:
     if after < 1 <= before:
         return "robust performance is reached"
     if abs(after - before) <= 0.02 * before:
-        return {"all": "the effect does not matter to it",
-                "some": "the named effects that this loop contains do not matter to it",
-                "none": "mu stays because this loop contains none of the named effects"}[held]
+        return {
+            "all": "the effect does not matter to it",
+            "some": "the named effects that this loop contains do not matter to it",
+            "none": "mu stays because this loop contains none of the named effects",
+        }[held]
     kept = "robust performance is kept" if after < 1 else "robust performance is missed on both"
     return f"it is {'worse' if after > before else 'better'}, {kept}"
 
@@ -317,25 +383,39 @@ def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[st
     if uncertainty is None or (not uncertainty.blocks and uncertainty.design is design):
         return []
     ranges = ", ".join(f"{name} {size:g} %" for name, size in design.uncertainty.parameters_percent.items())
-    return [f"design.toml has no place for the blocks of a fit; the parameters' ranges in it are "
-            f"{ranges or 'none'}, so that `avis design` finds another mu."]
+    return [
+        f"design.toml has no place for the blocks of a fit; the parameters' ranges in it are "
+        f"{ranges or 'none'}, so that `avis design` finds another mu."
+    ]
 
 
-def _remarks(realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, inside: Sequence[str],
-             outside: Sequence[str]) -> list[str]:
+def _remarks(
+    realised: Realised,
+    design: Design,
+    plant_rig: Rig,
+    model: TableModel,
+    when: float,
+    inside: Sequence[str],
+    outside: Sequence[str],
+) -> list[str]:
     """Sentences on the accuracy of the figures and on where the effects are described."""
     if not model.effects:
         return []
     error = f"at most {100 * realised.error:.2g} %" if realised.error > 1e-6 else "rounding only"
-    said = [f"In state space the updated model differs from its own response by {error} "
-            f"from {realised.omega[0] / 2 / np.pi:.3g} to {realised.omega[-1] / 2 / np.pi:.3g} Hz; aliases of "
-            f"sampling, up to {100 * realised.aliases:.2g} %, are left out.", *realised.notes,
-            "mu and transmissibility are of the design's coordinates, the others locked; stability was looked at on "
-            "all six too."]
+    said = [
+        f"In state space the updated model differs from its own response by {error} "
+        f"from {realised.omega[0] / 2 / np.pi:.3g} to {realised.omega[-1] / 2 / np.pi:.3g} Hz; aliases of "
+        f"sampling, up to {100 * realised.aliases:.2g} %, are left out.",
+        *realised.notes,
+        "mu and transmissibility are of the design's coordinates, the others locked; stability was looked at on "
+        "all six too.",
+    ]
     left = delay_order(design, plant_rig)[1]
     if left > 0.1:
-        said.append(f"The delay of {1e3 * plant_rig.loop_delay_s:.3g} ms is beyond the order that a design's delay may "
-                    f"have: error {left:.2g} at the bandwidth of the drives, so do not rely on the new controller.")
+        said.append(
+            f"The delay of {1e3 * plant_rig.loop_delay_s:.3g} ms is beyond the order that a design's delay may "
+            f"have: error {left:.2g} at the bandwidth of the drives, so do not rely on the new controller."
+        )
     if any(one.effect.name == "stiffness_drift" for one in model.effects):
         said.append(f"Stiffness is taken at the {'begin' if when < 0 else 'end'} of the campaign, where mu is larger.")
     by_label = {one.label: one.effect.name for one in model.effects}
@@ -344,6 +424,8 @@ def _remarks(realised: Realised, design: Design, plant_rig: Rig, model: TableMod
         where = [f"{label} ({place})" if place else label for label, place in places.items()]
         said.append(f"rig.toml and design.toml hold {', '.join(where)}: `avis design` runs on the updated model.")
     if outside:
-        said.append(f"No rig or design file holds {', '.join(outside)}: only the figures here have it in them, and "
-                    "`avis design` on these files does not.")
+        said.append(
+            f"No rig or design file holds {', '.join(outside)}: only the figures here have it in them, and "
+            "`avis design` on these files does not."
+        )
     return said

@@ -42,12 +42,20 @@ from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification_output import identified_rig
 
 # Named effects that act on the signals only and cannot be predicted from u and floor.
-UNPREDICTABLE = {"mains_hum": "the hum's phase in another campaign is not known",
-                 "ground_motion": "floor motion that is not measured cannot be predicted"}
+UNPREDICTABLE = {
+    "mains_hum": "the hum's phase in another campaign is not known",
+    "ground_motion": "floor motion that is not measured cannot be predicted",
+}
 
 
-def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | None = None,
-              content: Mapping[str, Any] | None = None, design: Mapping[str, str] | None = None) -> list[Path]:
+def write_gap(
+    folder: Path,
+    gap: Gap,
+    html: bytes | None = None,
+    pdf: bytes | None = None,
+    content: Mapping[str, Any] | None = None,
+    design: Mapping[str, str] | None = None,
+) -> list[Path]:
     """Write all files or none; gap.json is last, so its presence shows that the others are complete.
 
     content : of gap.json; by default the gap's own without provenance.
@@ -61,9 +69,13 @@ def write_gap(folder: Path, gap: Gap, html: bytes | None = None, pdf: bytes | No
         BASELINE_FILE: json.dumps(model_to_dict(gap.baseline), indent=1, allow_nan=False),
         UPDATED_FILE: json.dumps(model_to_dict(gap.updated), indent=1, allow_nan=False),
         **{f"{DESIGN_FOLDER}/{name}": text for name, text in (design or {}).items()},
-        GAP_REPORTS[0]: html, GAP_REPORTS[1]: pdf, GAP_FILE: as_json(dict(content or gap.to_json()))}
-    contents = {name: text.encode() if isinstance(text, str) else text for name, text in texts.items()
-                if text is not None}
+        GAP_REPORTS[0]: html,
+        GAP_REPORTS[1]: pdf,
+        GAP_FILE: as_json(dict(content or gap.to_json())),
+    }
+    contents = {
+        name: text.encode() if isinstance(text, str) else text for name, text in texts.items() if text is not None
+    }
     return write_together(folder, contents, [*(folder / name for name in GAP_FILES), *_earlier_design(folder)])
 
 
@@ -89,14 +101,28 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
             elif name in known:
                 sigma = float(np.sqrt(max(covariance[k, k], 0.0)))
                 comments[name] = f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
-    header = [f"{rig.name}, {what} by avis gap", *(["standard deviations (1 sigma) beside the values: of the fit, "
-                                                     "with all values that are not fitted taken as "
-                                                     "exact"] if comments else [])]
-    header += [f"not in this file, because a rig file cannot describe it: {one.effect.title} ({one.effect.name}, "
-               f"{one.place}: " + ", ".join(_as_reported(model, one)) + ")" for one in left]
+    header = [
+        f"{rig.name}, {what} by avis gap",
+        *(
+            [
+                "standard deviations (1 sigma) beside the values: of the fit, "
+                "with all values that are not fitted taken as "
+                "exact"
+            ]
+            if comments
+            else []
+        ),
+    ]
+    header += [
+        f"not in this file, because a rig file cannot describe it: {one.effect.title} ({one.effect.name}, "
+        f"{one.place}: " + ", ".join(_as_reported(model, one)) + ")"
+        for one in left
+    ]
     if any(one.effect.name == "stiffness_drift" for one in left):
-        header.append("the stiffness in this file is that in the middle of its drift; the change is relative to "
-                      "that at the beginning")
+        header.append(
+            "the stiffness in this file is that in the middle of its drift; the change is relative to "
+            "that at the beginning"
+        )
     return rig_toml(rig, comments, "\n".join(header))
 
 
@@ -110,8 +136,10 @@ def _as_reported(model: TableModel, one: ActiveEffect) -> list[str]:
     """Parameters of an effect as in gap.json and in the report."""
     n = len(one.names)
     found = one.effect.reported(model, one.place, one.by_name, np.zeros((n, n)))
-    return [f"{name} = {value.value:.6g}{'' if value.unit in ('', '1') else ' ' + value.unit}"
-            for name, value in found.items()]
+    return [
+        f"{name} = {value.value:.6g}{'' if value.unit in ('', '1') else ' ' + value.unit}"
+        for name, value in found.items()
+    ]
 
 
 def rig_with_effects(model: TableModel) -> tuple[Rig, list[ActiveEffect]]:
@@ -139,8 +167,10 @@ def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
         gain = next(sensor.gain for sensor in rig.sensors() if sensor.name == one.place)
         return rig.with_sensor_gains({one.place: gain * values["gain"]})
     if one.effect.name == "loop_delay":
-        return replace(rig, acquisition=replace(rig.acquisition, loop_delay_s=rig.acquisition.loop_delay_s
-                                                + values["extra_delay_s"]))
+        return replace(
+            rig,
+            acquisition=replace(rig.acquisition, loop_delay_s=rig.acquisition.loop_delay_s + values["extra_delay_s"]),
+        )
     return None
 
 
@@ -153,8 +183,9 @@ def read_gap(folder: Path) -> dict[str, Any]:
     found = read_json(path, "avis-gap", "the folder of avis gap")
     for key in ("effects", "traces"):
         effects = found.setdefault(key, []) if key == "traces" else found.get(key)
-        if not isinstance(effects, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str)
-                                                    for one in effects):
+        if not isinstance(effects, list) or not all(
+            isinstance(one, dict) and isinstance(one.get("name"), str) for one in effects
+        ):
             raise InputError("expected a list of named effects", file=path, field=key)
     return found
 
@@ -164,8 +195,9 @@ def gap_rig(folder: Path) -> Rig:
     return read_model(folder / BASELINE_FILE)[0].rig
 
 
-def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
-                          progress: Callable[[str], None] = lambda text: None) -> None:
+def write_gap_predictions(
+    folder: Path, campaign: Campaign, out: Path, progress: Callable[[str], None] = lambda text: None
+) -> None:
     """Write /records/NN/y_baseline and y_updated, simulated from the u and floor of a campaign, in the unit of its y.
 
     Records start at rest. y is clipped at the converter's range and not rounded; y_updated is also clipped where a
@@ -182,8 +214,14 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
     for model, _ in models.values():
         _require_fit(model, campaign)
     with replacing(out) as file:
-        file.attrs.update({"format": "avis-prediction", "version": 1, "rig": models["y_baseline"][0].rig.name,
-                           "not_predicted": "; ".join(_not_predicted(effects, campaign))})
+        file.attrs.update(
+            {
+                "format": "avis-prediction",
+                "version": 1,
+                "rig": models["y_baseline"][0].rig.name,
+                "not_predicted": "; ".join(_not_predicted(effects, campaign)),
+            }
+        )
         # Model by model: records of equal length use the same response of the model.
         for name, (model, clock) in models.items():
             low, high = converter_limits(model, campaign, effects if name == "y_updated" else [])
@@ -193,8 +231,9 @@ def write_gap_predictions(folder: Path, campaign: Campaign, out: Path,
                 try:
                     y = _predicted(model, source.load(), clock)
                 except InputError as error:
-                    raise InputError(error.expected, field=f"record {h.name}: {error.field}",
-                                     value=error.value) from None
+                    raise InputError(
+                        error.expected, field=f"record {h.name}: {error.field}", value=error.value
+                    ) from None
                 y = y[:, [model.sensors.names.index(channel) for channel in h.y_names]]
                 group = file.require_group(f"records/{h.name}")
                 data = group.create_dataset(name, data=np.clip(y, low, high))
@@ -214,8 +253,11 @@ def _predicted(model: TableModel, record: Record, clock: tuple[float, float]) ->
 
 def _require_fit(model: TableModel, campaign: Campaign) -> None:
     if campaign.y_unit != model.sensors.unit:
-        raise InputError(f"expected {model.sensors.unit}, as in the campaign that the model was found from",
-                         field="unit of y", value=campaign.y_unit)
+        raise InputError(
+            f"expected {model.sensors.unit}, as in the campaign that the model was found from",
+            field="unit of y",
+            value=campaign.y_unit,
+        )
     places(campaign.y_names, model.sensors.names, "the model's sensors are", "y names")
 
 
@@ -227,8 +269,9 @@ def _not_predicted(effects: Sequence[Mapping[str, Any]], campaign: Campaign) -> 
     return said
 
 
-def converter_limits(model: TableModel, campaign: Campaign, effects: Sequence[Mapping[str, Any]]
-                     ) -> tuple[np.ndarray, np.ndarray]:
+def converter_limits(
+    model: TableModel, campaign: Campaign, effects: Sequence[Mapping[str, Any]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper limits (n_y,), in the campaign's order: range of the converter, or where it was found to clip.
 
     effects : named effects and traces (very small effects), as in gap.json.

@@ -69,11 +69,20 @@ def selections(campaign: Campaign) -> list[Campaign]:
     driven = sorted((r for r in campaign.records if driven_inputs(r)), key=lambda r: -r.header.level_V)
     if not driven:
         return []
-    groups = [[r for r in driven if top.header.level_V / SAME_LEVEL <= r.header.level_V <= top.header.level_V
-               and r.header.excitation == top.header.excitation] for top in driven]
+    groups = [
+        [
+            r
+            for r in driven
+            if top.header.level_V / SAME_LEVEL <= r.header.level_V <= top.header.level_V
+            and r.header.excitation == top.header.excitation
+        ]
+        for top in driven
+    ]
     most = max(groups, key=len)
-    names = [tuple(sorted(r.header.name for r in group)) for group in ([most, driven] if len(most) < len(driven)
-                                                                       else [driven])]
+    names = [
+        tuple(sorted(r.header.name for r in group))
+        for group in ([most, driven] if len(most) < len(driven) else [driven])
+    ]
     return [campaign.only(one) for one in names]
 
 
@@ -88,20 +97,37 @@ def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock
     rows = [measured.outputs.index(name) for name in baseline.sensors.names]
     before, after = (_response(model, measured) for model in (baseline, linear))
     value = measured.value[:, rows] + (after if measured.method.startswith(BESIDE) else 0.0)
-    named = tuple(one.effect.name for one in updated.effects if one.effect.nonlinear
-                  and not isinstance(one.effect, LargeMotion))
+    named = tuple(
+        one.effect.name for one in updated.effects if one.effect.nonlinear and not isinstance(one.effect, LargeMotion)
+    )
     left_out = named
     if named:
         with suppress(AvisError):
             after, left_out = _with_nonlinear(loaded, beside, updated, measured, after, clock), ()
-    return GapOverlay(measured.frequency_Hz, tuple(measured.inputs), baseline.sensors.names,
-                      f"{measured.output_unit} per {measured.input_unit}", value,
-                      measured.standard_deviation[:, rows] / np.sqrt(2), measured.method, before, after,
-                      tuple(r.header.name for r in records.records), left_out, () if left_out else named)
+    return GapOverlay(
+        measured.frequency_Hz,
+        tuple(measured.inputs),
+        baseline.sensors.names,
+        f"{measured.output_unit} per {measured.input_unit}",
+        value,
+        measured.standard_deviation[:, rows] / np.sqrt(2),
+        measured.method,
+        before,
+        after,
+        tuple(r.header.name for r in records.records),
+        left_out,
+        () if left_out else named,
+    )
 
 
-def _with_nonlinear(records: Campaign, beside: Campaign | None, updated: TableModel, measured: FrequencyResponse,
-                    linear: np.ndarray, clock: tuple[float, float]) -> np.ndarray:
+def _with_nonlinear(
+    records: Campaign,
+    beside: Campaign | None,
+    updated: TableModel,
+    measured: FrequencyResponse,
+    linear: np.ndarray,
+    clock: tuple[float, float],
+) -> np.ndarray:
     """(n, n_y, n_u) response estimated by the method of `measured` from records that the complete model simulates."""
     made = _simulated(records, updated, clock)
     rows = [measured.outputs.index(name) for name in updated.sensors.names]
@@ -117,8 +143,9 @@ def _with_nonlinear(records: Campaign, beside: Campaign | None, updated: TableMo
 def _response(model: TableModel, like: FrequencyResponse) -> np.ndarray:
     """(n, n_y, n_u) response of a model to the inputs of a measured response."""
     columns = [model.inputs.index(name) for name in like.inputs]
-    U = np.broadcast_to(np.eye(len(model.inputs), dtype=complex)[:, columns],
-                        (len(like.omega), len(model.inputs), len(columns)))
+    U = np.broadcast_to(
+        np.eye(len(model.inputs), dtype=complex)[:, columns], (len(like.omega), len(model.inputs), len(columns))
+    )
     return model.driven(like.omega, U, False).Y
 
 

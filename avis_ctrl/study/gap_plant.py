@@ -33,12 +33,16 @@ from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 # Effects whose linear part a rig or design file can describe, and where.
 DESCRIBED_IN: Mapping[str, str] = {
-    "com_offset": "the rig's centre of mass", "product_of_inertia": "the rig's inertia",
+    "com_offset": "the rig's centre of mass",
+    "product_of_inertia": "the rig's inertia",
     "actuator_gain": "the motor's force constant in the rig file",
-    "sensor_gain": "the sensor's sensitivity in the rig file", "loop_delay": "the rig's loop delay",
-    "actuator_lag": "loop.amplifier_corner_Hz of the design", "actuator_saturation": "the rig's drive limit",
+    "sensor_gain": "the sensor's sensitivity in the rig file",
+    "loop_delay": "the rig's loop delay",
+    "actuator_lag": "loop.amplifier_corner_Hz of the design",
+    "actuator_saturation": "the rig's drive limit",
     "stiffness_drift": "the rig's stiffness at that moment",
-    "contact_friction": "the rig's stiffness far below the slip, and the range of that stiffness covers it too"}
+    "contact_friction": "the rig's stiffness far below the slip, and the range of that stiffness covers it too",
+}
 
 
 # Error of the approximated delay, at the bandwidth of the drives, above which its order is raised (to 6 at most).
@@ -62,8 +66,9 @@ def wiring_of(plant: DesignPlant, model: TableModel) -> Wiring:
     return Wiring(plant.actuators, plant.allocation, tuple(sensors.names), decoding)
 
 
-def plant_of(design: Design, model: TableModel, wiring: Wiring | None = None, when: float = 0.0,
-             fit: Sequence[Uncertain] = ()) -> tuple[DesignPlant, Design, Rig]:
+def plant_of(
+    design: Design, model: TableModel, wiring: Wiring | None = None, when: float = 0.0, fit: Sequence[Uncertain] = ()
+) -> tuple[DesignPlant, Design, Rig]:
     """Plant of a design on a model with its effects, and the design and rig that correspond to its loop.
 
     Parameters
@@ -99,8 +104,9 @@ def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
     """
     delay, corner = loop_lag(model)
     # The lowest limit is used: the design has one limit for all drives.
-    limits = [float(np.min(voltage_limits(one.by_name))) for one in model.effects
-              if one.effect.name == "actuator_saturation"]
+    limits = [
+        float(np.min(voltage_limits(one.by_name))) for one in model.effects if one.effect.name == "actuator_saturation"
+    ]
     rig = rig.with_loop_delay(delay).with_drives_limited(min(limits, default=np.inf))
     order, _ = delay_order(design, rig)
     changes = {"pade_order": order} | ({} if corner is None else {"amplifier_corner_Hz": corner})
@@ -118,8 +124,12 @@ def _rebuilt(plant: DesignPlant, parts: tuple[Part, ...], rig: StateSpace) -> De
     old = plant.full
     P = connect({part.name: part.system for part in parts}, list(old.P.inputs), list(old.P.outputs))
     full = replace(old, P=P, parts=parts)
-    return replace(plant, full=full, synthesis=full.restricted(plant.synthesis.w, plant.synthesis.z),
-                   rig=replace(plant.rig, system=rig))
+    return replace(
+        plant,
+        full=full,
+        synthesis=full.restricted(plant.synthesis.w, plant.synthesis.z),
+        rig=replace(plant.rig, system=rig),
+    )
 
 
 def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> StateSpace:
@@ -131,12 +141,13 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     decoding = plant.decoding[:, known]
     names = [plant.sensors[k] for k in known]
     plain = wrapped.select(list(old.outputs), list(old.inputs))
-    dot = wrapped.select([f"{a}_dot" for a in plant.axes] + [f"{kind}_{k}" for kind in ("deviation", "tilt")
-                                                             for k in names], list(old.inputs))
+    dot = wrapped.select(
+        [f"{a}_dot" for a in plant.axes] + [f"{kind}_{k}" for kind in ("deviation", "tilt") for k in names],
+        list(old.inputs),
+    )
     _, rows = model.effective.rig.sensor_rows()
     own = plant.decoding @ (rows[:, [COORDINATES.index(name) for name in keep]] * (1 / edge_levers(model.rig, keep)))
-    left = np.block([[own, decoding, np.zeros_like(decoding)],
-                     [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
+    left = np.block([[own, decoding, np.zeros_like(decoding)], [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
     C, D = np.vstack([plain.C, left @ dot.C]), np.vstack([plain.D, left @ dot.D])
     outputs = (*old.outputs, *(f"sensed_{a}_dot" for a in plant.axes), *(f"tilt_{a}" for a in plant.axes))
     return StateSpace(wrapped.A, plain.B, C, D, 0.0, old.inputs, outputs)
@@ -151,8 +162,15 @@ def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
     poles = sorted(plant.sensor_chain.poles(), key=abs)
     _, a, b = np.real(np.poly(poles[:2]))
     A, B = np.array([[-a, 1.0], [-b, 0.0]]), np.array([[-a, 0.0], [-b, 1.0]])
-    high_pass = StateSpace(A, B, np.array([[1.0, 0.0]]), np.array([[1.0, 0.0]]), 0.0,
-                           (f"sensed_{axis}_dot", f"tilt_{axis}"), (f"clean_{axis}_dot",))
+    high_pass = StateSpace(
+        A,
+        B,
+        np.array([[1.0, 0.0]]),
+        np.array([[1.0, 0.0]]),
+        0.0,
+        (f"sensed_{axis}_dot", f"tilt_{axis}"),
+        (f"clean_{axis}_dot",),
+    )
     lags = np.real_if_close(np.array(poles[2:], complex))
     low_pass = cascade([], lags, float(np.prod(np.abs(lags))), f"clean_{axis}_dot", f"clean_{axis}_dot")
     return low_pass @ high_pass if lags.size else high_pass
@@ -165,7 +183,7 @@ def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: 
     It includes what the locked coordinates of a design hide (an offset centre of mass, gravity, a tilted sensor).
     """
     table = realise(model, when=when).system
-    volts = table.inputs[:len(model.actuators)]
+    volts = table.inputs[: len(model.actuators)]
     A = np.zeros((len(volts), len(plant.axes)))
     for row, name in zip(plant.allocation, plant.actuators, strict=True):
         A[volts.index(name)] = row
@@ -176,8 +194,12 @@ def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: 
     lags = append(*(lag.renamed([f"c{k}"], [f"d{k}"]) for k in range(len(plant.axes))))
     G = table.select(sensors, list(volts)).scaled(seen, A) @ lags
     n = len(plant.axes)
-    open_loop = StateSpace(G.A, np.hstack([np.zeros((G.nstates, n)), G.B]), np.vstack([G.C, G.C]),
-                           np.block([[np.zeros((n, n)), G.D], [np.zeros((n, n)), G.D]]))
+    open_loop = StateSpace(
+        G.A,
+        np.hstack([np.zeros((G.nstates, n)), G.B]),
+        np.vstack([G.C, G.C]),
+        np.block([[np.zeros((n, n)), G.D], [np.zeros((n, n)), G.D]]),
+    )
     return lft_lower(open_loop, K).is_stable()
 
 
@@ -192,6 +214,7 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
 
     def add(name: str, value: float) -> None:
         changes[name] = changes.get(name, known[name].value) + value
+
     inside: list[str] = []
     outside: list[str] = []
     lag_known = model.amplifier_corner_Hz is not None
@@ -199,8 +222,11 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
     for one in model.effects:
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
-        fits = name in DESCRIBED_IN and not (name == "actuator_lag" and lag_known) and not (
-            name == "sensor_gain" and isinstance(rig, Halcyonics))
+        fits = (
+            name in DESCRIBED_IN
+            and not (name == "actuator_lag" and lag_known)
+            and not (name == "sensor_gain" and isinstance(rig, Halcyonics))
+        )
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_lag":
             lag_known = True
@@ -219,13 +245,18 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
             for name, stiffness in each.items():
                 mount, axis = model.rig.mount_of(name)[0].split(".")  # type: ignore[attr-defined]
                 add(f"{mount}.k_{axis}", float(stiffness))
-    return DesignFiles(_with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside),
-                       tuple(outside))
+    return DesignFiles(
+        _with_sensitivity(rig.with_parameters(changes), model, factors), asked, tuple(inside), tuple(outside)
+    )
 
 
 def _with_sensitivity(rig: Any, model: TableModel, factors: Mapping[str, float]) -> Any:
     """The rig with the sensitivities of the model's sensors, including effects."""
     if isinstance(rig, Halcyonics) or model.sensors.unit != "V":
         return rig
-    return rig.with_sensor_gains({name: float(value) * factors[name] for name, value
-                                  in zip(model.sensors.names, model.sensors.sensitivity, strict=True)})
+    return rig.with_sensor_gains(
+        {
+            name: float(value) * factors[name]
+            for name, value in zip(model.sensors.names, model.sensors.sensitivity, strict=True)
+        }
+    )

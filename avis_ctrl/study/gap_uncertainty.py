@@ -24,13 +24,7 @@ import numpy as np
 from scipy.stats import norm
 
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.directions import (
-    NEGLIGIBLE,
-    KeptMatrices,
-    kept_matrices,
-    matrix_slopes,
-    relative_changes,
-)
+from avis_ctrl.identification.directions import NEGLIGIBLE, KeptMatrices, kept_matrices, matrix_slopes, relative_changes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import Wiring, neglected_dynamics
@@ -98,35 +92,50 @@ class FitUncertainty:
 
     def to_json(self) -> dict[str, Any]:
         """Figures, as fractions of the response."""
-        return {"confidence": self.confidence, "parameters": self.n_parameters,
-                "blocks": {one.name: float(size) for one, size in zip(self.blocks, self.effect, strict=True)},
-                "left_out_drives": float(np.max(self.rest)), "left_out_floor": float(np.max(self.rest_floor)),
-                "left_out_over_neglected_dynamics": float(np.max(self.rest / self.dynamics)),
-                "products": self.products, "not_in_equations": float(np.max(self.elsewhere))}
+        return {
+            "confidence": self.confidence,
+            "parameters": self.n_parameters,
+            "blocks": {one.name: float(size) for one, size in zip(self.blocks, self.effect, strict=True)},
+            "left_out_drives": float(np.max(self.rest)),
+            "left_out_floor": float(np.max(self.rest_floor)),
+            "left_out_over_neglected_dynamics": float(np.max(self.rest / self.dynamics)),
+            "products": self.products,
+            "not_in_equations": float(np.max(self.elsewhere)),
+        }
 
     def sentences(self) -> tuple[str, str]:
         """What is uncertain, and which part of it has no block."""
         own = self.to_json()
         sizes = ", ".join(f"{name} {_percent(size)}" for name, size in own["blocks"].items())
-        blocks = f"{len(self.blocks)} real blocks that change the response by at most {sizes}" if sizes else \
-            "too little for a block of its own"
+        blocks = (
+            f"{len(self.blocks)} real blocks that change the response by at most {sizes}"
+            if sizes
+            else "too little for a block of its own"
+        )
         share = f" ({_percent(own['left_out_over_neglected_dynamics'])} of the drives' neglected dynamics)"
-        return (f"Uncertain in every loop: the {self.n_parameters} parameters of the fit at "
-                f"{_percent(self.confidence)}, {blocks}. "
-                "What changes after the measurement is not in it: for that, give a design with ranges.",
-                f"Left out of the loops: combinations of parameters that change the response to the drives by at most "
-                f"{_percent(own['left_out_drives'])}{share} and that to the floor by at most "
-                f"{_percent(own['left_out_floor'])}; products of changes, {_percent(own['products'])} in tables drawn; "
-                f"what sensors, effects and locked coordinates add, at most {_percent(own['not_in_equations'])}. "
-                "Parameters of effects that depend on amplitude are in none of these figures.")
+        return (
+            f"Uncertain in every loop: the {self.n_parameters} parameters of the fit at "
+            f"{_percent(self.confidence)}, {blocks}. "
+            "What changes after the measurement is not in it: for that, give a design with ranges.",
+            f"Left out of the loops: combinations of parameters that change the response to the drives by at most "
+            f"{_percent(own['left_out_drives'])}{share} and that to the floor by at most "
+            f"{_percent(own['left_out_floor'])}; products of changes, {_percent(own['products'])} in tables drawn; "
+            f"what sensors, effects and locked coordinates add, at most {_percent(own['not_in_equations'])}. "
+            "Parameters of effects that depend on amplitude are in none of these figures.",
+        )
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %"
 
 
-def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, wiring: Wiring,
-                    settings: FitUncertaintySettings = SETTINGS) -> FitUncertainty:
+def fit_uncertainty(
+    design: Design,
+    model: TableModel,
+    covariance: np.ndarray,
+    wiring: Wiring,
+    settings: FitUncertaintySettings = SETTINGS,
+) -> FitUncertainty:
     """The uncertainty of a fit, in addition to the ranges of a design.
 
     Parameters
@@ -151,25 +160,33 @@ def fit_uncertainty(design: Design, model: TableModel, covariance: np.ndarray, w
     # The records determine only the product of force constant and sensitivity, and the loop depends only on this
     # product.
     drives = [k for k in held if names[k] in {f"actuator.{name}" for name in wiring.actuators}]
-    alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None],
-                     settings.rcond)
+    alike = _nearest(inside[drives] / allowed[:, None, None], seen[others] / allowed[:, None, None], settings.rcond)
     inside[others] = np.tensordot(alike, inside[drives], 1)
     elsewhere = _box(_turned(np.tensordot(S.T, seen - inside, 1)), confidence)
     root = S.copy()
     root[drives] += alike.T @ S[others]
     k, n_u = len(base[0]), len(A)
     Q = np.reshape([np.hstack([*slope[:3], -slope[3]]) for _, slope in felt], (len(held), k, 3 * k + n_u))
-    blocks, effect, rest, rest_floor = _by_equation(base, np.tensordot(root[held].T, Q, 1), design.keep, A, omega,
-                                                    allowed, confidence)
-    products = _products(rig, [names[k] for k in held], S[held], [slope for _, slope in felt], base, design.keep,
-                         A, omega, settings)
-    return FitUncertainty(design, blocks, effect, len(free), confidence, omega, rest, rest_floor, elsewhere, products,
-                          dynamics)
+    blocks, effect, rest, rest_floor = _by_equation(
+        base, np.tensordot(root[held].T, Q, 1), design.keep, A, omega, allowed, confidence
+    )
+    products = _products(
+        rig, [names[k] for k in held], S[held], [slope for _, slope in felt], base, design.keep, A, omega, settings
+    )
+    return FitUncertainty(
+        design, blocks, effect, len(free), confidence, omega, rest, rest_floor, elsewhere, products, dynamics
+    )
 
 
-def _by_equation(base: KeptMatrices, Q: np.ndarray, keep: Sequence[str], A: np.ndarray, omega: np.ndarray,
-                 allowed: np.ndarray, confidence: float
-                 ) -> tuple[tuple[UncertainEquation, ...], np.ndarray, np.ndarray, np.ndarray]:
+def _by_equation(
+    base: KeptMatrices,
+    Q: np.ndarray,
+    keep: Sequence[str],
+    A: np.ndarray,
+    omega: np.ndarray,
+    allowed: np.ndarray,
+    confidence: float,
+) -> tuple[tuple[UncertainEquation, ...], np.ndarray, np.ndarray, np.ndarray]:
     """Blocks, their effects, and bounds (n,) on the residual; Q (r, k, 3 k + n_u) changes of N by each z."""
     n, k, found = len(Q), len(keep), []
     for a, name in enumerate(keep):
@@ -182,8 +199,10 @@ def _by_equation(base: KeptMatrices, Q: np.ndarray, keep: Sequence[str], A: np.n
         found += [(name, row[j], driven[j], floor[j]) for j in range(n)]
     # Each component of each equation separately.
     box = _quantile(n * k, confidence)
-    sizes = [box * np.stack([np.linalg.norm(one, 2, axis=(1, 2)) for one in (driven, floor)])
-             for _, _, driven, floor in found]
+    sizes = [
+        box * np.stack([np.linalg.norm(one, 2, axis=(1, 2)) for one in (driven, floor)])
+        for _, _, driven, floor in found
+    ]
     order = sorted(range(len(sizes)), key=lambda j: -float(np.max(sizes[j] / allowed)))
     left = np.reshape([sizes[j] for j in order[::-1]], (len(order), 2, len(omega)))
     rests = np.concatenate([np.zeros((1, 2, len(omega))), np.cumsum(left, axis=0)])[::-1]
@@ -200,7 +219,7 @@ def _by_equation(base: KeptMatrices, Q: np.ndarray, keep: Sequence[str], A: np.n
 def _split(N: np.ndarray) -> KeptMatrices:
     """M, C, K, T of N (k, 3 k + n_u)."""
     k = len(N)
-    return N[:, :k], N[:, k:2 * k], N[:, 2 * k:3 * k], -N[:, 3 * k:]
+    return N[:, :k], N[:, k : 2 * k], N[:, 2 * k : 3 * k], -N[:, 3 * k :]
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
@@ -274,8 +293,17 @@ def _seen(model: TableModel, names: Sequence[str], wiring: Wiring, omega: np.nda
     return found
 
 
-def _products(rig: Rig, names: Sequence[str], S: np.ndarray, slopes: Sequence[KeptMatrices], base: KeptMatrices,
-              keep: Sequence[str], A: np.ndarray, omega: np.ndarray, settings: FitUncertaintySettings) -> float:
+def _products(
+    rig: Rig,
+    names: Sequence[str],
+    S: np.ndarray,
+    slopes: Sequence[KeptMatrices],
+    base: KeptMatrices,
+    keep: Sequence[str],
+    A: np.ndarray,
+    omega: np.ndarray,
+    settings: FitUncertaintySettings,
+) -> float:
     """Largest relative change that is not linear in the parameters, over tables drawn from the covariance."""
     known, beyond = rig.parameters(), []
     if not names:
@@ -283,8 +311,11 @@ def _products(rig: Rig, names: Sequence[str], S: np.ndarray, slopes: Sequence[Ke
     for z in np.random.default_rng(0).standard_normal((settings.draws, S.shape[1])):
         change = S @ z
         moved = rig.with_parameters({name: known[name].value + float(d) for name, d in zip(names, change, strict=True)})
-        M, C, K, T = (one - old - np.tensordot(change, np.array(slope), 1) for one, old, slope in
-                      zip(kept_matrices(moved, keep, rig.edge_m), base, zip(*slopes, strict=True), strict=True))
+        M, C, K, T = (
+            one - old - np.tensordot(change, np.array(slope), 1)
+            for one, old, slope in zip(
+                kept_matrices(moved, keep, rig.edge_m), base, zip(*slopes, strict=True), strict=True
+            )
+        )
         beyond.append((M, C, K, T))
-    return max(float(np.max(np.linalg.norm(one, 2, axis=(2, 3)))) for one in
-               relative_changes(base, beyond, omega, A))
+    return max(float(np.max(np.linalg.norm(one, 2, axis=(2, 3)))) for one in relative_changes(base, beyond, omega, A))

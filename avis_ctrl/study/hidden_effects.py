@@ -43,9 +43,12 @@ def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz:
     with_all = reduce(TableModel.with_effect, effects, without)
 
     def change(u: np.ndarray, floor: np.ndarray, start_s: float, campaign_s: tuple[float, float]) -> np.ndarray:
-        y, before = (simulate(model, u, floor, truth.sample_rate_Hz, start_s=start_s, campaign_s=campaign_s).y
-                     for model in (with_all, without))
+        y, before = (
+            simulate(model, u, floor, truth.sample_rate_Hz, start_s=start_s, campaign_s=campaign_s).y
+            for model in (with_all, without)
+        )
         return y - before
+
     return change
 
 
@@ -56,15 +59,20 @@ def _active(model: TableModel, plan: EffectPlan, field: str) -> ActiveEffect:
     known = {one.name: one for one in begun.parameters}
     for name, value in plan.values.items():
         if name not in known:
-            listed = ", ".join(f"{one.name} ({one.description}; {one.low:g} to {one.high:g} {one.unit})"
-                               for one in begun.parameters)
+            listed = ", ".join(
+                f"{one.name} ({one.description}; {one.low:g} to {one.high:g} {one.unit})" for one in begun.parameters
+            )
             raise InputError(f"expected parameters of this effect: {listed}", field=f"{field}.values", value=name)
         one = known[name]
         if not one.low <= value <= one.high:
-            raise InputError(f"expected {one.low:g} to {one.high:g} {one.unit}", field=f"{field}.values.{name}",
-                             value=value)
+            raise InputError(
+                f"expected {one.low:g} to {one.high:g} {one.unit}", field=f"{field}.values.{name}", value=value
+            )
     values = begun.by_name | plan.values
     if all(values[name] == one.none for name, one in known.items() if one.linear or not plan.values):
-        raise InputError(f"expected a value with an effect; the parameters are {', '.join(known)}",
-                         field=f"{field}.values", value=plan.values)
+        raise InputError(
+            f"expected a value with an effect; the parameters are {', '.join(known)}",
+            field=f"{field}.values",
+            value=plan.values,
+        )
     return begun.at(list(values.values()))

@@ -44,10 +44,14 @@ from avis_ctrl.study.record_checks import check_campaign
 from avis_ctrl.study.rig_channels import with_rig_names
 
 Progress = Callable[[str], None]
-CAUTION = ("the standard deviations include only the noise of these records; values that were not fitted (such as "
-           "force constants, sensitivities, positions) count as exact")
-TOLERANT = ("the standard deviations include noise, the tolerances of the rig file, and errors of the response that "
-            "nothing in the model explains")
+CAUTION = (
+    "the standard deviations include only the noise of these records; values that were not fitted (such as "
+    "force constants, sensitivities, positions) count as exact"
+)
+TOLERANT = (
+    "the standard deviations include noise, the tolerances of the rig file, and errors of the response that "
+    "nothing in the model explains"
+)
 
 
 @dataclass(frozen=True)
@@ -114,8 +118,12 @@ class Identification:
         return self.campaign_fit.information
 
 
-def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions | None = None,
-             progress: Progress = lambda text: None) -> Identification:
+def identify(
+    measured: Campaign | FrequencyResponse,
+    rig: Rig,
+    options: IdentifyOptions | None = None,
+    progress: Progress = lambda text: None,
+) -> Identification:
     """Identify a rig.
 
     Raises
@@ -136,17 +144,28 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
             progress(unplayed)
         if model.amplifier_corner_Hz:
             progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz))
-        progress(f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
-                 + (f"; {split.how}" if split else ""))
-        found = fit_campaign(fitted, model, band, options.priors, options.starts, options.seed, progress=progress,
-                             tolerances=tolerances_of(rig))
+        progress(
+            f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
+            + (f"; {split.how}" if split else "")
+        )
+        found = fit_campaign(
+            fitted,
+            model,
+            band,
+            options.priors,
+            options.starts,
+            options.seed,
+            progress=progress,
+            tolerances=tolerances_of(rig),
+        )
         far = far_from_file(model, found.information)
         for sentence in far:
             progress(f"  warning: {sentence}")
         found = replace(found, notes=(*far, *found.notes, *([unplayed] if unplayed else [])))
         floor = any(block.block.kind == "floor measured" for block in found.fit.residuals)
-        report = identifiability_report(found.information, found.structure, floor,
-                                        {name: sigma for name, (_, sigma) in options.priors.items()})
+        report = identifiability_report(
+            found.information, found.structure, floor, {name: sigma for name, (_, sigma) in options.priors.items()}
+        )
         progress(f"the data determine {found.information.rank} of {len(model.names)} combinations of parameters")
         advice = _advice(found, fitted, report, progress)
         kalman, note = _kalman(split.fitted if split else measured, rig, model.names, options, progress)
@@ -154,8 +173,22 @@ def identify(measured: Campaign | FrequencyResponse, rig: Rig, options: Identify
         validation = validate(found, fitted, held_out)
     identified = found.fit.model.rig
     seconds = time.monotonic() - began
-    return Identification(rig, identified, options, measured, findings, split, found, report, advice, validation,
-                          kalman, note, identification_provenance(measured, rig, options, seconds), seconds)
+    return Identification(
+        rig,
+        identified,
+        options,
+        measured,
+        findings,
+        split,
+        found,
+        report,
+        advice,
+        validation,
+        kalman,
+        note,
+        identification_provenance(measured, rig, options, seconds),
+        seconds,
+    )
 
 
 def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> None:
@@ -168,8 +201,11 @@ def _check(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> 
         if options.band_Hz is not None:
             low, high = excited_band(measured)
             if options.band_Hz[0] >= high or options.band_Hz[1] <= low:
-                raise InputError(f"the records are excited from {low:.3g} to {high:.3g} Hz; expected a band that "
-                                 "overlaps this one", field="band_Hz", value=options.band_Hz)
+                raise InputError(
+                    f"the records are excited from {low:.3g} to {high:.3g} Hz; expected a band that overlaps this one",
+                    field="band_Hz",
+                    value=options.band_Hz,
+                )
 
 
 def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
@@ -186,7 +222,8 @@ def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
 def amplifier_words(corner_Hz: float, stated_Hz: float | None) -> str:
     """The corner in words, and whether it was stated."""
     return f"amplifiers with a first-order lag of {corner_Hz:g} Hz" + (
-        "" if stated_Hz else ", the default for tables with accelerometers; --amplifier-corner sets another corner")
+        "" if stated_Hz else ", the default for tables with accelerometers; --amplifier-corner sets another corner"
+    )
 
 
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:
@@ -197,21 +234,26 @@ def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: Ident
     if isinstance(measured, Campaign):
         unit, sensors, actuators, sampled = measured.y_unit, measured.y_names, measured.u_names, True
         if measured.records[0].header.u_unit != "V":
-            raise InputError("expected commanded voltages in V", field="unit of u",
-                             value=measured.records[0].header.u_unit)
+            raise InputError(
+                "expected commanded voltages in V", field="unit of u", value=measured.records[0].header.u_unit
+            )
     else:
         unit, sensors, sampled = measured.output_unit, measured.outputs, False
         actuators = tuple(name for name in measured.inputs if name not in ("vx", "vy", "vz"))
     names = named_parameters(rig, options.parameters, unit) if options.parameters else default_parameters(rig)
     if homeless := [name for name in names if name.startswith(("corner.", "damping."))]:
-        raise InputError("a rig file states one suspension for all geophones, so that these could not be written",
-                         field="parameters", value=homeless)
+        raise InputError(
+            "a rig file states one suspension for all geophones, so that these could not be written",
+            field="parameters",
+            value=homeless,
+        )
     corner = amplifier_corner(rig, options.amplifier_corner_Hz)
     return ResponseModel.of(rig, names, unit, sensors, actuators, sampled, corner)
 
 
-def _gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions,
-           progress: Progress) -> tuple[Finding, ...]:
+def _gates(
+    measured: Campaign | FrequencyResponse, model: ResponseModel, options: IdentifyOptions, progress: Progress
+) -> tuple[Finding, ...]:
     """Findings in the records before any fit; none for frequency responses."""
     if not isinstance(measured, Campaign):
         return ()
@@ -220,8 +262,9 @@ def _gates(measured: Campaign | FrequencyResponse, model: ResponseModel, options
     return check_campaign(measured, model, options.despite_gates, progress)
 
 
-def _divide(measured: Campaign | FrequencyResponse, options: IdentifyOptions) -> tuple[
-        Split | None, Campaign | FrequencyResponse, Campaign | FrequencyResponse, tuple[float, float]]:
+def _divide(
+    measured: Campaign | FrequencyResponse, options: IdentifyOptions
+) -> tuple[Split | None, Campaign | FrequencyResponse, Campaign | FrequencyResponse, tuple[float, float]]:
     """Split, data to fit, held-out data, and the band."""
     if isinstance(measured, FrequencyResponse):
         band = options.band_Hz or (float(measured.frequency_Hz[0]), float(measured.frequency_Hz[-1]))
@@ -239,13 +282,17 @@ def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, Freq
     held = (place // stretch) % 4 == 3
     near = np.convolve(held, np.ones(2 * gap + 1), mode="same") > 0
     if not np.any(held) or np.all(near):
-        raise InputError(f"expected more than {4 * stretch} lines, of which a quarter is held out", value=len(place),
-                         field="lines of the frequency response")
+        raise InputError(
+            f"expected more than {4 * stretch} lines, of which a quarter is held out",
+            value=len(place),
+            field="lines of the frequency response",
+        )
     return measured.at(~near), measured.at(held)
 
 
-def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport,
-            progress: Progress) -> tuple[str, ...]:
+def _advice(
+    found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport, progress: Progress
+) -> tuple[str, ...]:
     """Benefit of a further record like the fitted ones, or of another kind."""
     model = found.structure
     if found.information.rank == len(model.names) or not isinstance(fitted, Campaign):
@@ -257,14 +304,16 @@ def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, report: Id
     level = float(np.mean([h.level_V for h in driven]))
     try:
         drive = Drive(level, sum(h.duration_s for h in driven), found.band_Hz)
-        return needed_experiment(found.information, model, drive, campaign_noise(
-            [one.block for one in found.fit.residuals]), report=report)
+        return needed_experiment(
+            found.information, model, drive, campaign_noise([one.block for one in found.fit.residuals]), report=report
+        )
     except AvisError as error:
         return (f"No advice on further records: {error}",)
 
 
-def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str], options: IdentifyOptions,
-            progress: Progress) -> tuple[EkfResult | None, str]:
+def _kalman(
+    fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str], options: IdentifyOptions, progress: Progress
+) -> tuple[EkfResult | None, str]:
     if not options.kalman:
         return None, "the extended Kalman filter was not requested"
     if not isinstance(fitted, Campaign):
@@ -280,14 +329,21 @@ def _kalman(fitted: Campaign | FrequencyResponse, rig: Rig, names: Sequence[str]
         return None, f"the extended Kalman filter failed: {error}"
 
 
-def identification_provenance(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
-                              ) -> dict[str, Any]:
+def identification_provenance(
+    measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions, seconds: float
+) -> dict[str, Any]:
     """Provenance of an identification, with the hash of the measurement."""
     if isinstance(measured, Campaign):
         data, source = digest(measured), measured.source
     else:
         data = hashlib.sha256(measured.frequency_Hz.tobytes() + measured.value.tobytes()).hexdigest()
         source = measured.method
-    return provenance(rig, repr(replace(options, priors={})) + repr(sorted(options.priors.items())) + data,
-                      options.seed, seconds, ("numpy", "scipy", "numba", "h5py"), measurement=source,
-                      measurement_sha256=data)
+    return provenance(
+        rig,
+        repr(replace(options, priors={})) + repr(sorted(options.priors.items())) + data,
+        options.seed,
+        seconds,
+        ("numpy", "scipy", "numba", "h5py"),
+        measurement=source,
+        measurement_sha256=data,
+    )

@@ -39,23 +39,38 @@ _COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 
 _AVIS: dict[str, Any] = _COMMON | {
     "loop": {"amplifier_corner_Hz": 300.0},
     "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0}},
-    "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0], "transition_octaves": 0.8,
-                         "tolerance_dB": 1.0},
+    "transmissibility": {
+        "peak_dB": 3.5,
+        "band_dB": -7.0,
+        "band_Hz": [1.0, 10.0],
+        "transition_octaves": 0.8,
+        "tolerance_dB": 1.0,
+    },
     "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0, "reduction": 30.0},
     "synthesis": {"max_iterations": 8, "target_mu": 0.9},
-    "requirement": [{"quantity": "mu_upper", "at_most": 1.0}, {"quantity": "mu_gap_percent", "at_most": 5.0},
-                    {"quantity": "worst_case_peak_transmissibility_dB", "at_most": 4.0},
-                    {"quantity": "worst_case_band_transmissibility_dB", "at_most": -6.0},
-                    {"quantity": "fastest_controller_pole_Hz", "at_most": 250.0}]}
+    "requirement": [
+        {"quantity": "mu_upper", "at_most": 1.0},
+        {"quantity": "mu_gap_percent", "at_most": 5.0},
+        {"quantity": "worst_case_peak_transmissibility_dB", "at_most": 4.0},
+        {"quantity": "worst_case_band_transmissibility_dB", "at_most": -6.0},
+        {"quantity": "fastest_controller_pole_Hz", "at_most": 250.0},
+    ],
+}
 _HALCYONICS: dict[str, Any] = _COMMON | {
     "loop": {"amplifier_corner_Hz": 300.0, "integrator_corner_Hz": 0.1},
     "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 150.0, "high_percent": 400.0}},
-    "transmissibility": {"peak_dB": 3.5, "band_dB": -12.0, "band_Hz": [4.0, 16.0], "transition_octaves": 0.8,
-                         "tolerance_dB": 1.0},
+    "transmissibility": {
+        "peak_dB": 3.5,
+        "band_dB": -12.0,
+        "band_Hz": [4.0, 16.0],
+        "transition_octaves": 0.8,
+        "tolerance_dB": 1.0,
+    },
     "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 30.0},
     "floor": {"velocity_rms_m_per_s": 2e-5},
     "synthesis": {"max_iterations": 8, "target_mu": 0.95},
-    "requirement": _AVIS["requirement"]}
+    "requirement": _AVIS["requirement"],
+}
 
 
 def design_start(found: Identification, template: Path | Design | None = None) -> tuple[dict[str, str], InDesign]:
@@ -114,7 +129,8 @@ def identification_design(content: UncertaintyFile, template: Design, rig: Rig) 
     asked = template.uncertainty
     uncertainty: dict[str, Any] = {
         "parameters_percent": _not_identified(asked.parameters_percent, content, rig.parameters()),
-        "parameters_absolute": _not_identified(asked.parameters_absolute, content, rig.parameters())}
+        "parameters_absolute": _not_identified(asked.parameters_absolute, content, rig.parameters()),
+    }
     if asked.actuator_chains is not None:
         uncertainty["actuator_chains"] = _chains(asked.actuator_chains, content, template).model_dump()
     if asked.sensor_chains is not None:
@@ -149,8 +165,9 @@ def default_keep(rig: Rig) -> list[str]:
     reached = [name for name in COORDINATES if name in drivable(rig) and name in sensed(rig)]
     keep = [name for name in _COMMON["keep"] if name in reached] or reached[:1]
     if not keep:
-        raise InputError("expected a coordinate that the drives can move and the sensors can measure", field="keep",
-                         value=rig.name)
+        raise InputError(
+            "expected a coordinate that the drives can move and the sensors can measure", field="keep", value=rig.name
+        )
     return keep
 
 
@@ -162,31 +179,42 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
     shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
     # A quarter of the sample rate: the hold distorts faster poles.
-    asked = [one | {"at_most": rig.sample_rate_Hz / 4} if one["quantity"] == "fastest_controller_pole_Hz" else one
-             for one in shape["requirement"]]
-    return design_from_table(shape | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig),
-                                      "uncertainty": uncertainty, "requirement": asked})
+    asked = [
+        one | {"at_most": rig.sample_rate_Hz / 4} if one["quantity"] == "fastest_controller_pole_Hz" else one
+        for one in shape["requirement"]
+    ]
+    return design_from_table(
+        shape
+        | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig), "uncertainty": uncertainty, "requirement": asked}
+    )
 
 
 def assumed_weights(rig: Rig) -> str:
     """Comment lines above a `default_design`: the table for which its weights were chosen, compared with this one."""
     shipped = load_rig("avis" if isinstance(rig, AvisTable) else "halcyonics_loaded")
-    lines = ["No weights were specified for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
-             "[control_effort] and [[requirement]] are those of the shipped design for the first of these two tables:"]
+    lines = [
+        "No weights were specified for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
+        "[control_effort] and [[requirement]] are those of the shipped design for the first of these two tables:",
+    ]
     for what, one in (("shipped", shipped), ("this table", rig)):
         eom = one.equations_of_motion()
         modes = eom.natural_frequencies().frequencies_Hz
-        lines.append(f"  {what}: {toml_value(one.name)}, {eom.M[0, 0]:.4g} kg, modes from {modes.min():.3g} to "
-                     f"{modes.max():.3g} Hz")
+        lines.append(
+            f"  {what}: {toml_value(one.name)}, {eom.M[0, 0]:.4g} kg, modes from {modes.min():.3g} to "
+            f"{modes.max():.3g} Hz"
+        )
     lines.append("Before you design, change them, and add [floor] if needed, to suit this table.")
     return "".join(f"# {line}\n" for line in lines)
 
 
 def _not_identified(ranges: dict[str, float], content: UncertaintyFile, known: Collection[str]) -> dict[str, float]:
     """Ranges of the parameters that this rig has and that were not identified."""
-    return {pattern: value for pattern, value in ranges.items()
-            if not any(fnmatchcase(name, pattern) for name in content.names)
-            and any(fnmatchcase(name, pattern) for name in known)}
+    return {
+        pattern: value
+        for pattern, value in ranges.items()
+        if not any(fnmatchcase(name, pattern) for name in content.names)
+        and any(fnmatchcase(name, pattern) for name in known)
+    }
 
 
 def _chains(asked: ChainUncertainty, content: UncertaintyFile, template: Design) -> ChainUncertainty:

@@ -39,8 +39,11 @@ def identified_rig(model: ResponseModel) -> Rig:
     if not sensitive and "loop_delay_s" not in model.names:
         return rig
     if not isinstance(rig, AvisTable):
-        raise InputError("a rig file of this kind has one sensitivity and one delay for all; leave them out",
-                         field="parameters", value=sensitive or ["loop_delay_s"])
+        raise InputError(
+            "a rig file of this kind has one sensitivity and one delay for all; leave them out",
+            field="parameters",
+            value=sensitive or ["loop_delay_s"],
+        )
     rig = rig.with_sensor_gains(dict(zip(model.sensors.names, model.sensors.sensitivity.tolist(), strict=True)))
     return replace(rig, acquisition=replace(rig.acquisition, loop_delay_s=model.delay_s))
 
@@ -53,8 +56,10 @@ def require_readable(found: Identification) -> None:
     try:
         rig_from(tomllib.loads(identified_toml(found)), getattr(found.rig, "load", None) is not None)
     except InputError as error:
-        raise InputError(f"the identified values are not a valid rig: {error}; a value that was taken as known is "
-                         "wrong", field="rig.toml") from None
+        raise InputError(
+            f"the identified values are not a valid rig: {error}; a value that was taken as known is wrong",
+            field="rig.toml",
+        ) from None
 
 
 def identified_toml(found: Identification) -> str:
@@ -64,14 +69,20 @@ def identified_toml(found: Identification) -> str:
     comments = {}
     for name, sigma in zip(information.names, information.standard_deviation, strict=True):
         if name in known:
-            comments[name] = (f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}" if np.isfinite(sigma) else
-                              f"{name.rpartition('.')[2]} known only in combination (start {start[name].value:.4g})")
+            comments[name] = (
+                f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
+                if np.isfinite(sigma)
+                else f"{name.rpartition('.')[2]} known only in combination (start {start[name].value:.4g})"
+            )
     p = found.provenance
-    header = [f"{found.rig.name}, identified by avis_ctrl {p['avis_ctrl']} on {p['date']}",
-              f"from {p['measurement'] or 'a measurement'}, SHA-256 {p['measurement_sha256'][:16]}",
-              f"{information.rank} of {len(information.names)} combinations of parameters are determined; standard "
-              "deviations (1 sigma) beside the values",
-              "the report and result.json list the combinations", found.caution]
+    header = [
+        f"{found.rig.name}, identified by avis_ctrl {p['avis_ctrl']} on {p['date']}",
+        f"from {p['measurement'] or 'a measurement'}, SHA-256 {p['measurement_sha256'][:16]}",
+        f"{information.rank} of {len(information.names)} combinations of parameters are determined; standard "
+        "deviations (1 sigma) beside the values",
+        "the report and result.json list the combinations",
+        found.caution,
+    ]
     return rig_toml(identified_rig(found.campaign_fit.fit.model), comments, "\n".join(header))
 
 
@@ -80,38 +91,78 @@ def result_dict(found: Identification) -> dict[str, Any]:
     fit, information = found.campaign_fit.fit, found.information
     start = found.start.parameters()
     rows = {}
-    for name, value, sigma, unit in zip(information.names, information.values, information.standard_deviation,
-                                        information.units, strict=True):
-        rows[name] = {"value": float(value), "std": float(sigma) if np.isfinite(sigma) else None, "unit": unit,
-                      "start": float(start[name].value) if name in start else None}
+    for name, value, sigma, unit in zip(
+        information.names, information.values, information.standard_deviation, information.units, strict=True
+    ):
+        rows[name] = {
+            "value": float(value),
+            "std": float(sigma) if np.isfinite(sigma) else None,
+            "unit": unit,
+            "start": float(start[name].value) if name in start else None,
+        }
     return {
-        "format": "avis-identification", "version": 1, "rig": found.rig.name,
+        "format": "avis-identification",
+        "version": 1,
+        "rig": found.rig.name,
         "loaded": getattr(found.rig, "load", None) is not None,
         "parameters": rows,
         "covariance": {"names": list(information.names), "matrix": information.covariance.tolist()},
-        "rank": information.rank, "condition": information.condition,
+        "rank": information.rank,
+        "condition": information.condition,
         "identifiability": list(found.identifiability.sentences),
-        "fit": {"chi2_per_dof_of_measured_noise": found.campaign_fit.first.chi2_per_dof if found.campaign_fit.measured
-                else None, "dof": fit.dof, "held_at_bounds": list(fit.held), "band_Hz": list(
-            found.campaign_fit.band_Hz), "converged": fit.converged, "starts_chi2": list(fit.starts),
-            "notes": list(found.campaign_fit.notes)},
-        "advice": list(found.advice), "validation": found.validation.as_dict(),
-        "gates": [{"gate": f.gate, "severity": f.severity, "sentence": f.sentence, "channels": list(f.channels),
-                   "records": list(f.records)} for f in found.findings],
-        "unit_of_y": found.model.sensors.unit, "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
+        "fit": {
+            "chi2_per_dof_of_measured_noise": found.campaign_fit.first.chi2_per_dof
+            if found.campaign_fit.measured
+            else None,
+            "dof": fit.dof,
+            "held_at_bounds": list(fit.held),
+            "band_Hz": list(found.campaign_fit.band_Hz),
+            "converged": fit.converged,
+            "starts_chi2": list(fit.starts),
+            "notes": list(found.campaign_fit.notes),
+        },
+        "advice": list(found.advice),
+        "validation": found.validation.as_dict(),
+        "gates": [
+            {
+                "gate": f.gate,
+                "severity": f.severity,
+                "sentence": f.sentence,
+                "channels": list(f.channels),
+                "records": list(f.records),
+            }
+            for f in found.findings
+        ],
+        "unit_of_y": found.model.sensors.unit,
+        "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
         "turning": found.model.turning._asdict(),
         "tolerances": [{**one.to_json(), "unit": one.unit} for one in found.campaign_fit.tolerances],
         "suspensions": {name: list(own) for name, own in found.model.sensors.detuned.items()},
-        "provenance": dict(found.provenance), "seconds": found.seconds}
+        "provenance": dict(found.provenance),
+        "seconds": found.seconds,
+    }
 
 
-def write_identification(found: Identification, folder: Path, html: bytes | None = None, pdf: bytes | None = None,
-                         more: dict[str, str] | None = None) -> list[Path]:
+def write_identification(
+    found: Identification,
+    folder: Path,
+    html: bytes | None = None,
+    pdf: bytes | None = None,
+    more: dict[str, str] | None = None,
+) -> list[Path]:
     """Write all files or none; result.json is last, so its presence shows that the others are complete."""
-    texts = {RIG_FILE: identified_toml(found).encode(), **{name: text.encode() for name, text in (more or {}).items()},
-             "report.html": html, "report.pdf": pdf, RESULT_FILE: as_json(result_dict(found))}
-    return write_together(folder, {name: content for name, content in texts.items() if content is not None},
-                          [folder / name for name in FILES])
+    texts = {
+        RIG_FILE: identified_toml(found).encode(),
+        **{name: text.encode() for name, text in (more or {}).items()},
+        "report.html": html,
+        "report.pdf": pdf,
+        RESULT_FILE: as_json(result_dict(found)),
+    }
+    return write_together(
+        folder,
+        {name: content for name, content in texts.items() if content is not None},
+        [folder / name for name in FILES],
+    )
 
 
 def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
@@ -135,11 +186,14 @@ def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
     if not model.sensors.suspensions:  # ideal sensors
         return model
     try:
-        own = tuple((float(known[name][0]), float(known[name][1])) if name in known else old
-                    for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=True))
+        own = tuple(
+            (float(known[name][0]), float(known[name][1])) if name in known else old
+            for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=True)
+        )
     except (KeyError, IndexError, TypeError, ValueError):
-        raise InputError("expected corner and damping ratio by name", file=folder / RESULT_FILE, field="suspensions",
-                         value=known) from None
+        raise InputError(
+            "expected corner and damping ratio by name", file=folder / RESULT_FILE, field="suspensions", value=known
+        ) from None
     return replace(model, sensors=replace(model.sensors, suspensions=own))
 
 
@@ -147,8 +201,9 @@ def _result(folder: Path) -> dict[str, Any]:
     return read_json(folder / RESULT_FILE, "avis-identification", "the folder of avis identify or avis gap")
 
 
-def write_predictions(folder: Path, campaign: Campaign, out: Path,
-                      progress: Callable[[str], None] = lambda text: None) -> None:
+def write_predictions(
+    folder: Path, campaign: Campaign, out: Path, progress: Callable[[str], None] = lambda text: None
+) -> None:
     """Write /records/NN/y, simulated from the u and floor of a campaign, in the unit of its y.
 
     The simulation includes the second-order terms of the table's rotations.
@@ -159,8 +214,9 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
     ComputationError : the disk cannot store the file.
     """
     rig, corner, turning = read_identified(folder)
-    model = replace(ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner),
-                    turning=turning)
+    model = replace(
+        ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner), turning=turning
+    )
     model = _suspended(model, folder)
     limits = rig.converter.limits_V if campaign.y_unit == "V" and rig.converter else None
     with replacing(out) as file:
@@ -169,8 +225,11 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
             h = record.header
             progress(f"record {h.name}: {h.duration_s:.4g} s")
             if abs(h.sample_rate_Hz * model.period_s - 1) > 1e-6:
-                raise InputError(f"expected the rig's own {1 / model.period_s:g} Hz", value=h.sample_rate_Hz,
-                                 field=f"record {h.name}: sample_rate_Hz")
+                raise InputError(
+                    f"expected the rig's own {1 / model.period_s:g} Hz",
+                    value=h.sample_rate_Hz,
+                    field=f"record {h.name}: sample_rate_Hz",
+                )
             group = file.create_group(f"records/{h.name}")
             data = group.create_dataset("y", (h.samples, len(h.y_names)), np.float64)
             data.attrs.update({"names": np.array(h.y_names, dtype=object).astype("S"), "unit": h.y_unit})
@@ -179,5 +238,5 @@ def write_predictions(folder: Path, campaign: Campaign, out: Path,
             for start, stop in ranges(h.samples, PIECE):
                 # Includes the next sample: the floor is interpolated linearly to it within this piece.
                 u, floor = model_inputs(model, record.load(start, min(stop + 1, h.samples)))
-                y = predictor.read(u[:stop - start], floor)
+                y = predictor.read(u[: stop - start], floor)
                 data[start:stop] = y if limits is None else np.clip(y, *limits)

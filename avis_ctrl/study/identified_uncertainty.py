@@ -45,17 +45,27 @@ class InDesign:
         if not np.any(drowned):
             return ""
         edges = np.flatnonzero(np.diff(np.concatenate([[False], drowned, [False]])))
-        where = ", ".join(f"{f[first]:.3g} Hz" if last == first + 1 else f"{f[first]:.3g} to {f[last - 1]:.3g} Hz"
-                          for first, last in edges.reshape(-1, 2))
+        where = ", ".join(
+            f"{f[first]:.3g} Hz" if last == first + 1 else f"{f[first]:.3g} to {f[last - 1]:.3g} Hz"
+            for first, last in edges.reshape(-1, 2)
+        )
         largest = 100 * float(np.max(self.spread.bound(self.confidence)[drowned]))
-        return (f"Measurement noise hides the response at {where}: there noise alone causes a spread of 100 % or more "
-                f"(bound up to {largest:.0f} %), so that the data contain no information on the model. The uncertainty "
-                "is assumed to be 100 % there, or more only where the measurement proves it. To measure it, record "
-                "longer or at a higher level.")
+        return (
+            f"Measurement noise hides the response at {where}: there noise alone causes a spread of 100 % or more "
+            f"(bound up to {largest:.0f} %), so that the data contain no information on the model. The uncertainty "
+            "is assumed to be 100 % there, or more only where the measurement proves it. To measure it, record "
+            "longer or at a higher level."
+        )
 
 
-def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidence: float = 0.95,
-              declared: NeglectedDynamics | None = None, factor: float = 1.0) -> InDesign:
+def in_design(
+    content: UncertaintyFile,
+    rig: Rig,
+    keep: Sequence[str],
+    confidence: float = 0.95,
+    declared: NeglectedDynamics | None = None,
+    factor: float = 1.0,
+) -> InDesign:
     """The bounded directions and the covering filter of an identification, for the coordinates of a design.
 
     Parameters
@@ -71,15 +81,22 @@ def in_design(content: UncertaintyFile, rig: Rig, keep: Sequence[str], confidenc
     spread = next((one for one in content.spread if sorted(one.keep) == sorted(keep)), None)
     if spread is None:
         known = "; ".join(", ".join(one.keep) for one in content.spread)
-        raise InputError(f"the uncertainty file is valid for {known}; identify again with --design FILE, a design file "
-                         "that keeps the coordinates wanted here", field="keep", value=list(keep))
+        raise InputError(
+            f"the uncertainty file is valid for {known}; identify again with --design FILE, a design file "
+            "that keeps the coordinates wanted here",
+            field="keep",
+            value=list(keep),
+        )
     values, own = spread.values(), [name in rig.parameters() for name in content.names]
     names = [name for name, here in zip(content.names, own, strict=True) if here]
     # Sensors and delay are not parameters of the rig's equations: the measured spread covers their errors.
     found = directions_that_matter(rig, names, content.factor()[own], keep, 2 * np.pi * JUDGED_HZ, confidence)
-    directions = tuple(UncertainDirection(DIRECTION.format(k), tuple(
-        (name, float(change)) for name, change in zip(names, row, strict=True) if change))
-        for k, row in enumerate(found.changes, 1))
+    directions = tuple(
+        UncertainDirection(
+            DIRECTION.format(k), tuple((name, float(change)) for name, change in zip(names, row, strict=True) if change)
+        )
+        for k, row in enumerate(found.changes, 1)
+    )
     omega = 2 * np.pi * values.frequency_Hz
     left = np.interp(np.log(omega), np.log(found.omega), found.rest)
     # A spread of exactly zero has no logarithm; 1e-9 is negligible.

@@ -33,10 +33,13 @@ def without_each(plant: DesignPlant, K: StateSpace, omega: float) -> list[tuple[
         keep_w, keep_z = np.ones(M.shape[1], bool), np.ones(M.shape[0], bool)
         place = list(P.blocks.slices())[k]
         keep_w[place[1]], keep_z[place[2]] = False, False
-        rest = BlockStructure(tuple(everything[:k] + everything[k + 1:]))
+        rest = BlockStructure(tuple(everything[:k] + everything[k + 1 :]))
         found.append((f"uncertainty of {block.name}", _mu(M[np.ix_(keep_z, keep_w)], rest)))
-    for prefix, words in (("e_", "transmissibility bound"), ("effort_", "control effort bound"),
-                          ("compliance_", "compliance bound")):
+    for prefix, words in (
+        ("e_", "transmissibility bound"),
+        ("effort_", "control effort bound"),
+        ("compliance_", "compliance bound"),
+    ):
         left = [name for name in P.z if not name.startswith(prefix)]
         if len(left) in (0, len(P.z)):
             continue
@@ -59,17 +62,21 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
         return ""
     spread = _spread_there(plant, mu.mu.omega)
     if no_better_than_none(mu, others):
-        return (f"The synthesis found no controller better than none: with the best controller found mu is "
-                f"{mu.mu.upper:.3g}, at {mu.mu.omega / (2 * np.pi):.3g} Hz, which is not smaller than without control. "
-                f"No D-K iteration came closer to the bounds with this uncertainty. "
-                f"{spread or 'Specify less uncertainty or wider bounds'}.")
+        return (
+            f"The synthesis found no controller better than none: with the best controller found mu is "
+            f"{mu.mu.upper:.3g}, at {mu.mu.omega / (2 * np.pi):.3g} Hz, which is not smaller than without control. "
+            f"No D-K iteration came closer to the bounds with this uncertainty. "
+            f"{spread or 'Specify less uncertainty or wider bounds'}."
+        )
     worth = (1 - WORTH_NAMING) * mu.mu.upper
     reliefs = [(name, value) for name, value in without_each(plant, mu.K, mu.mu.omega) if value < worth]
     relief = [f"{name} ({value:.2f} without it)" for name, value in reliefs]
-    text = (f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g}, at "
-            f"{mu.mu.omega / (2 * np.pi):.3g} Hz. Main contributions there: "
-            f"{', '.join(relief[:4]) or 'no single one'}. "
-            f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met.")
+    text = (
+        f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g}, at "
+        f"{mu.mu.omega / (2 * np.pi):.3g} Hz. Main contributions there: "
+        f"{', '.join(relief[:4]) or 'no single one'}. "
+        f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met."
+    )
     if spread and any(RESPONSE in name for name, _ in reliefs):
         text += f" {spread}."
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
@@ -100,6 +107,8 @@ def _spread_there(plant: DesignPlant, omega: float) -> str:
         beside = "assumed, because noise hides the response there"
     else:
         beside = f"{100 * weight.data[nearest]:.3g} % in the data there"
-    return (f"The uncertainty of the identified response is {100 * size:.3g} % at {omega / (2 * np.pi):.3g} Hz "
-            f"({beside}). To reduce it, record longer, at a higher level or with more records; or relax the "
-            "requirements at this frequency")
+    return (
+        f"The uncertainty of the identified response is {100 * size:.3g} % at {omega / (2 * np.pi):.3g} Hz "
+        f"({beside}). To reduce it, record longer, at a higher level or with more records; or relax the "
+        "requirements at this frequency"
+    )

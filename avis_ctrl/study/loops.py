@@ -31,8 +31,9 @@ class LoopSettings:
     states: int = 3
 
 
-def tuned_loops(plant: DesignPlant, rig: Rig, design: Design, K: StateSpace, settings: LoopSettings = LoopSettings()
-                ) -> Candidate:
+def tuned_loops(
+    plant: DesignPlant, rig: Rig, design: Design, K: StateSpace, settings: LoopSettings = LoopSettings()
+) -> Candidate:
     """Decentralised loops tuned on mu: the force on an axis depends on the measured velocity of that axis only.
 
     They are found by descent on the peak of mu, from the diagonal part of the controller K or from the classical

@@ -59,45 +59,64 @@ def rig_text(new: NewRig) -> str:
     """
     if new.mounts not in (3, 4):
         raise InputError("expected 3 or 4; add further mounts to the file afterwards", field="mounts", value=new.mounts)
-    for field in ("mass_kg", "vertical_Hz", "horizontal_Hz", "damping", "constant_N_per_V", "limit_V",
-                  "sample_rate_Hz"):
+    for field in (
+        "mass_kg",
+        "vertical_Hz",
+        "horizontal_Hz",
+        "damping",
+        "constant_N_per_V",
+        "limit_V",
+        "sample_rate_Hz",
+    ):
         require_positive(getattr(new, field), field)
     if len(new.size_m) != 3 or not all(0 < side <= LIMITS.farthest_m for side in new.size_m):
-        raise InputError(f"expected three positive lengths in metres, at most {LIMITS.farthest_m:g}", field="size_m",
-                         value=new.size_m)
+        raise InputError(
+            f"expected three positive lengths in metres, at most {LIMITS.farthest_m:g}",
+            field="size_m",
+            value=new.size_m,
+        )
     if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):
         raise InputError("expected a name without quotes", field="name", value=new.name)
     x, y, z = new.size_m
-    inertia = new.mass_kg / 12 * np.array([y ** 2 + z ** 2, x ** 2 + z ** 2, x ** 2 + y ** 2])
+    inertia = new.mass_kg / 12 * np.array([y**2 + z**2, x**2 + z**2, x**2 + y**2])
     own = new.mass_kg / new.mounts
     k = [own * (2 * np.pi * f) ** 2 for f in (new.horizontal_Hz, new.horizontal_Hz, new.vertical_Hz)]
     c = [2 * new.damping * np.sqrt(own * stiffness) for stiffness in k]
     places = _places(new)
-    text = (f"# {new.name}: a first rig file. Lines marked \"assumed\" follow from a homogeneous box on equal mounts:\n"
-            "# replace them by your own numbers. docs/rig_file.md explains every key; avis identify measures most.\n"
-            f'name = "{new.name}"\n\n[payload]\nmass_kg = {new.mass_kg:g}\n'
-            f"inertia_kgm2 = {_row(inertia)}             # assumed: homogeneous box, about the centre of mass\n"
-            "centre_of_mass_m = [0.0, 0.0, 0.0]   # assumed: in the geometric centre\n")
+    text = (
+        f'# {new.name}: a first rig file. Lines marked "assumed" follow from a homogeneous box on equal mounts:\n'
+        "# replace them by your own numbers. docs/rig_file.md explains every key; avis identify measures most.\n"
+        f'name = "{new.name}"\n\n[payload]\nmass_kg = {new.mass_kg:g}\n'
+        f"inertia_kgm2 = {_row(inertia)}             # assumed: homogeneous box, about the centre of mass\n"
+        "centre_of_mass_m = [0.0, 0.0, 0.0]   # assumed: in the geometric centre\n"
+    )
     for place in places:
-        text += (f"\n[[isolator]]\nposition_m = {_row(place)}\n"
-                 f"stiffness_N_per_m = {_row(k)}   # from {new.horizontal_Hz:g} Hz along x and y, "
-                 f"{new.vertical_Hz:g} Hz along z\ndamping_Ns_per_m = {_row(c)}    # damping ratio {new.damping:g}\n")
+        text += (
+            f"\n[[isolator]]\nposition_m = {_row(place)}\n"
+            f"stiffness_N_per_m = {_row(k)}   # from {new.horizontal_Hz:g} Hz along x and y, "
+            f"{new.vertical_Hz:g} Hz along z\ndamping_Ns_per_m = {_row(c)}    # damping ratio {new.damping:g}\n"
+        )
     text += f"\n[actuators]\nlimit_V = {new.limit_V:g}\n"
     for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
         for letter, direction in (("z", (0, 0, 1)), axis):
-            text += (f'\n[[drive]]\nname = "A{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
-                     f"direction = {_row(direction)}\nconstant_N_per_V = {new.constant_N_per_V:g}\n")
+            text += (
+                f'\n[[drive]]\nname = "A{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
+                f"direction = {_row(direction)}\nconstant_N_per_V = {new.constant_N_per_V:g}\n"
+            )
     sensor = _geophone(new.geophone)
     for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
         for letter, direction in (("z", (0, 0, 1)), axis):
-            text += (f'\n[[geophone]]\nname = "S{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
-                     f"direction = {_row(direction)}\n{sensor}")
+            text += (
+                f'\n[[geophone]]\nname = "S{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
+                f"direction = {_row(direction)}\n{sensor}"
+            )
     return text + (
         f"\n[acquisition]\nsample_rate_Hz = {new.sample_rate_Hz:g}\nadc_bits = 16                        # assumed\n"
         "adc_range_V = 10.0                   # assumed\n"
         f"loop_delay_s = {1 / new.sample_rate_Hz:g}                 # assumed: one sample\n"
         "\n[ambient]\nfloor_velocity_rms_m_per_s = 2e-6    # assumed: a quiet laboratory\n"
-        "sensor_noise_rms_V = 0.001           # assumed\n")
+        "sensor_noise_rms_V = 0.001           # assumed\n"
+    )
 
 
 def rig_of(text: str) -> Rig:
@@ -137,9 +156,11 @@ def _geophone(path: Path | None) -> str:
         if wrong := check_against_name(entry):
             raise InputError(f"the file contradicts itself: {'; '.join(wrong)}", file=path)
         source, gain, corner, damping = f"from {entry.file}", entry.gain_Vs_per_m, entry.corner_Hz, entry.damping
-    return (f"sensitivity_Vs_per_m = {gain:.6g}          # {source}\nsuspension_Hz = {corner:.6g}\n"
-            f"suspension_damping = {damping:.6g}\ncompensated_Hz = {min(0.5, corner):g}   # assumed: by "
-            "an analogue filter\ncompensated_damping = 0.7\npreamplifier_gain = 100.0            # assumed\n")
+    return (
+        f"sensitivity_Vs_per_m = {gain:.6g}          # {source}\nsuspension_Hz = {corner:.6g}\n"
+        f"suspension_damping = {damping:.6g}\ncompensated_Hz = {min(0.5, corner):g}   # assumed: by "
+        "an analogue filter\ncompensated_damping = 0.7\npreamplifier_gain = 100.0            # assumed\n"
+    )
 
 
 @dataclass(frozen=True)
@@ -170,8 +191,11 @@ def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
     """
     known = rig.parameters()
     spreads = {"mass": new.mass_percent, "isolator*.k_*": new.stiffness_percent, "isolator*.c_*": new.damping_percent}
-    spreads = {name: value for name, value in spreads.items()
-               if name in known or (any(one.startswith(name.partition("*")[0]) for one in known) and "*" in name)}
+    spreads = {
+        name: value
+        for name, value in spreads.items()
+        if name in known or (any(one.startswith(name.partition("*")[0]) for one in known) and "*" in name)
+    }
     start = default_design(rig, new.title, spreads)
     shape = start.model_dump(exclude_none=True)
     shape["rig"] = rig_name
@@ -188,11 +212,11 @@ def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
 _REMARKS = {
     "[loop]": "Assumed: corner of the current amplifiers.",
     "[uncertainty.parameters_percent]": "Half-width of each parameter's range; the bounds hold for all such plants.\n"
-                                        "# After avis identify, use its uncertainty.json instead.",
+    "# After avis identify, use its uncertainty.json instead.",
     "[uncertainty.actuator_chains]": "Assumed: neglected dynamics of each drive, 100 % at the crossover frequency.",
     "[transmissibility]": "Upper bounds from floor to payload: peak_dB at every frequency, band_dB inside band_Hz.",
     "[control_effort]": "Assumed: floor velocity at which the drives may reach their voltage limit.\n"
-                        "# The controller rolls off above bandwidth_Hz.",
+    "# The controller rolls off above bandwidth_Hz.",
     "[synthesis]": "The D-K iteration ends as soon as mu is below target_mu, or after max_iterations.",
     "[simulation]": "Check on the nonlinear table: duration of each run, and number of random plants of the set.",
     "[[requirement]]": "Rows of the verdict. All quantities: docs/design_file.md.",
@@ -201,8 +225,13 @@ _REMARKS = {
 
 def design_text(design: Design) -> str:
     """The text of the design file, with a comment above each section."""
-    lines, told = ["# A first design file: change what is marked \"Assumed\" to suit your table. docs/design_file.md "
-                   "explains every key."], set()
+    lines, told = (
+        [
+            '# A first design file: change what is marked "Assumed" to suit your table. docs/design_file.md '
+            "explains every key."
+        ],
+        set(),
+    )
     for line in design_toml(design).splitlines():
         if line in _REMARKS and line not in told:
             lines.append(f"# {_REMARKS[line]}")

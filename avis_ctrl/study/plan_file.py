@@ -36,8 +36,13 @@ def plan_from_table(table: dict[str, Any], file: object = None) -> CampaignPlan:
     return validated(CampaignPlan, table, file)
 
 
-def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered", *, perturbed: bool = False,
-                 duration_s: float = 60.0) -> CampaignPlan:
+def default_plan(
+    rig: Rig,
+    scheme: Literal["zippered", "orthogonal"] = "zippered",
+    *,
+    perturbed: bool = False,
+    duration_s: float = 60.0,
+) -> CampaignPlan:
     """Multisines at three levels, noise, rest and a shaken floor.
 
     scheme : "zippered" gives 4 multisine records, in which each drive has its own lines; the lines are permuted from
@@ -47,13 +52,26 @@ def default_plan(rig: Rig, scheme: Literal["zippered", "orthogonal"] = "zippered
     """
     ambient = {} if rig.ambient is not None else {"velocity_rms_m_per_s": AMBIENT_M_PER_S}
     most = 2 if scheme == "zippered" else 1
-    records: list[dict[str, Any]] = [{"excitation": "multisine", "level_percent": level, "records": count}
-                           for level, count in ((12.5, 1), (25.0, 1), (50.0, most))]
-    records += [{"excitation": "noise", "level_percent": 50.0}, {"excitation": "rest"},
-                {"excitation": "floor", "floor_rms_m_per_s": SHAKEN_M_PER_S, "band_Hz": [0.5, 60.0]}]
+    records: list[dict[str, Any]] = [
+        {"excitation": "multisine", "level_percent": level, "records": count}
+        for level, count in ((12.5, 1), (25.0, 1), (50.0, most))
+    ]
+    records += [
+        {"excitation": "noise", "level_percent": 50.0},
+        {"excitation": "rest"},
+        {"excitation": "floor", "floor_rms_m_per_s": SHAKEN_M_PER_S, "band_Hz": [0.5, 60.0]},
+    ]
     truth = {"perturb_percent": 5.0, "perturb_damping_percent": 20.0} if perturbed else {}
-    return plan_from_table({"title": f"Default campaign of {rig.name}", "duration_s": duration_s, "ambient": ambient,
-                            "multisine": {"scheme": scheme}, "truth": truth, "record": records})
+    return plan_from_table(
+        {
+            "title": f"Default campaign of {rig.name}",
+            "duration_s": duration_s,
+            "ambient": ambient,
+            "multisine": {"scheme": scheme},
+            "truth": truth,
+            "record": records,
+        }
+    )
 
 
 def plan_toml(plan: CampaignPlan) -> str:

@@ -122,8 +122,9 @@ class Wiring:
     decoding: np.ndarray
 
 
-def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Sequence[Uncertain] = (),
-                gravity: bool = True) -> DesignPlant:
+def build_plant(
+    design: Design, rig: Rig, wiring: Wiring | None = None, fit: Sequence[Uncertain] = (), gravity: bool = True
+) -> DesignPlant:
     """The generalized plant of a design.
 
     wiring : of a controller made for another rig; by default that for this rig. fit : uncertain elements in addition to
@@ -170,8 +171,10 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     weights |= {f"{NOISE}{one.tag}": one.weight for one in noises if one.weight.flicker}
     if errors is not None:
         _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
-    offset = max(_offset(design.control_effort, one, weight, len(axes), reference)
-                 for one, weight in zip(seen.noise, flicker, strict=True))
+    offset = max(
+        _offset(design.control_effort, one, weight, len(axes), reference)
+        for one, weight in zip(seen.noise, flicker, strict=True)
+    )
     _performance(diagram, design, axes, matrix[used], rig.limits_of(actuators), offset, weights)
     inputs = {name: one.weight for one in noises for name in one.inputs}
     w = [*(f"floor_{a}_dot" for a in axes), *inputs, *(f"force_{a}" for a in axes)]
@@ -180,11 +183,25 @@ def build_plant(design: Design, rig: Rig, wiring: Wiring | None = None, fit: Seq
     physical = [*(f"{a}_dot" for a in axes), *(f"{a}_rel" for a in axes), *(f"{n}_command" for n in actuators)]
     u, y = [f"command_{a}" for a in axes], [f"seen_{a}_dot" for a in axes]
     full = diagram.plant(w, [*weighted, *compliance, *physical], u, y)
-    asked = w if design.compliance else w[:len(axes) + len(inputs)]
-    return DesignPlant(full, full.restricted(asked, [*weighted, *compliance]), uncertain, axes, actuators,
-                       decoder.sensors, matrix[used], decoding, seen.chain, seen.noise[0].shape, reference, floor,
-                       weights, identified, inputs, tuple(
-                           axis for axis, name in zip(axes, design.keep, strict=True) if name in seen.relative))
+    asked = w if design.compliance else w[: len(axes) + len(inputs)]
+    return DesignPlant(
+        full,
+        full.restricted(asked, [*weighted, *compliance]),
+        uncertain,
+        axes,
+        actuators,
+        decoder.sensors,
+        matrix[used],
+        decoding,
+        seen.chain,
+        seen.noise[0].shape,
+        reference,
+        floor,
+        weights,
+        identified,
+        inputs,
+        tuple(axis for axis, name in zip(axes, design.keep, strict=True) if name in seen.relative),
+    )
 
 
 def _identified(design: Design, rig: Rig) -> InDesign | None:
@@ -222,8 +239,10 @@ def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
     rms = design.floor.velocity_rms_m_per_s
     if rms is None:
         if rig.ambient is None:
-            raise InputError("the rig file has no [ambient] section: give the floor's r.m.s. velocity here",
-                             field="floor.velocity_rms_m_per_s")
+            raise InputError(
+                "the rig file has no [ambient] section: give the floor's r.m.s. velocity here",
+                field="floor.velocity_rms_m_per_s",
+            )
         rms = rig.ambient.floor_velocity_rms_m_per_s
     return shipped_spectrum(design.floor.spectrum).scaled_to_rms(rms, design.floor.band_Hz[0], design.floor.band_Hz[1])
 
@@ -231,13 +250,21 @@ def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
 def _rig_part(diagram: Diagram, uncertain: UncertainRig, actuators: tuple[str, ...]) -> None:
     system, axes = uncertain.system, uncertain.coordinates
     deltas = [name for name in system.inputs if name.startswith("w:")]
-    diagram.add("rig", system.select(
-        [*(name for name in system.outputs if name.startswith("z:")), *(f"{a}_dot" for a in axes),
-         *(f"{a}_rel" for a in axes)],
-        [*deltas, *actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)]), "rig")
+    diagram.add(
+        "rig",
+        system.select(
+            [
+                *(name for name in system.outputs if name.startswith("z:")),
+                *(f"{a}_dot" for a in axes),
+                *(f"{a}_rel" for a in axes),
+            ],
+            [*deltas, *actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)],
+        ),
+        "rig",
+    )
     place = 0
     for block in uncertain.blocks.blocks:
-        names = deltas[place:place + block.rows]
+        names = deltas[place : place + block.rows]
         place += block.rows
         diagram.uncertain(block, names, [f"z:{name[2:]}" for name in names])
     for axis in axes:
@@ -249,8 +276,16 @@ def _rig_part(diagram: Diagram, uncertain: UncertainRig, actuators: tuple[str, .
         diagram.means(name, "voltage that acts at the motor", "V")
 
 
-def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, ...], actuators: tuple[str, ...],
-                   allocation: np.ndarray, weights: dict[str, Weight], identified: InDesign | None) -> None:
+def _actuator_side(
+    diagram: Diagram,
+    design: Design,
+    rig: Rig,
+    axes: tuple[str, ...],
+    actuators: tuple[str, ...],
+    allocation: np.ndarray,
+    weights: dict[str, Weight],
+    identified: InDesign | None,
+) -> None:
     """Delay including the converter's hold, amplifier, allocation, neglected dynamics."""
     corner = 2 * np.pi * design.loop.amplifier_corner_Hz
     # A zero-order hold delays by half a sample on average.
@@ -261,19 +296,27 @@ def _actuator_side(diagram: Diagram, design: Design, rig: Rig, axes: tuple[str, 
         diagram.means(f"command_{axis}", "force commanded by the controller", "N")
         diagram.means(f"drive_{axis}", "commanded force after delay and amplifier", "N")
     # Voltages at the amplifiers, to which the limits apply, after delay and lag (both of unit gain).
-    diagram.add("allocation", gain(allocation, [f"drive_{a}" for a in axes], [f"{n}_command" for n in actuators]),
-                "allocation")
+    diagram.add(
+        "allocation", gain(allocation, [f"drive_{a}" for a in axes], [f"{n}_command" for n in actuators]), "allocation"
+    )
     for name in actuators:
         diagram.means(f"{name}_command", "voltage of the channel", "V")
     if identified is not None:
         _response_error(diagram, identified, axes, actuators, allocation, weights)
     else:
-        _chains(diagram, design.uncertainty.actuator_chains, actuators, "{}_command", "{}", "actuator chain {}",
-                weights)
+        _chains(
+            diagram, design.uncertainty.actuator_chains, actuators, "{}_command", "{}", "actuator chain {}", weights
+        )
 
 
-def _response_error(diagram: Diagram, identified: InDesign, axes: tuple[str, ...], actuators: tuple[str, ...],
-                    allocation: np.ndarray, weights: dict[str, Weight]) -> None:
+def _response_error(
+    diagram: Diagram,
+    identified: InDesign,
+    axes: tuple[str, ...],
+    actuators: tuple[str, ...],
+    allocation: np.ndarray,
+    weights: dict[str, Weight],
+) -> None:
     """(I + W Delta) on the axes' forces, Delta full: difference of the measured from the identified response.
 
     Errors per channel do not suffice: an error on one axis by the force of another need not be a channel error.
@@ -283,13 +326,17 @@ def _response_error(diagram: Diagram, identified: InDesign, axes: tuple[str, ...
     for axis, tag in zip(axes, tags, strict=True):
         diagram.add(f"W {RESPONSE} {axis}", identified.weight.system(f"drive_{axis}", f"z:{tag}"), "weight")
         diagram.means(f"w:{tag}", "force by which the response differs from the identified one", "N")
-    diagram.add("identified response error", gain(allocation, [f"w:{tag}" for tag in tags],
-                                                  [f"{name}_error" for name in actuators]), "allocation")
+    diagram.add(
+        "identified response error",
+        gain(allocation, [f"w:{tag}" for tag in tags], [f"{name}_error" for name in actuators]),
+        "allocation",
+    )
     for name in actuators:
         diagram.add(f"actuator chain {name}", summing_junction(name, [f"{name}_command", f"{name}_error"]), "actuator")
         diagram.means(f"{name}_error", "voltage equivalent to the response error", "V")
-    diagram.uncertain(ComplexFull(len(axes), len(axes), RESPONSE), [f"w:{tag}" for tag in tags],
-                      [f"z:{tag}" for tag in tags])
+    diagram.uncertain(
+        ComplexFull(len(axes), len(axes), RESPONSE), [f"w:{tag}" for tag in tags], [f"z:{tag}" for tag in tags]
+    )
 
 
 def neglected_dynamics(chains: ChainUncertainty) -> NeglectedDynamics:
@@ -297,8 +344,15 @@ def neglected_dynamics(chains: ChainUncertainty) -> NeglectedDynamics:
     return NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100)
 
 
-def _chains(diagram: Diagram, uncertainty: ChainUncertainty | None, names: tuple[str, ...], before: str, after: str,
-            title: str, weights: dict[str, Weight]) -> None:
+def _chains(
+    diagram: Diagram,
+    uncertainty: ChainUncertainty | None,
+    names: tuple[str, ...],
+    before: str,
+    after: str,
+    title: str,
+    weights: dict[str, Weight],
+) -> None:
     """(1 + W delta) in each channel: neglected dynamics as multiplicative input uncertainty."""
     for name in names:
         read, made, label = before.format(name), after.format(name), title.format(name)
@@ -325,9 +379,16 @@ def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes:
     return float(spread * group.offset_rtHz * reference / allowed / noise.magnitude(np.zeros(1))[0])
 
 
-def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decoding: np.ndarray,
-                 rows: tuple[np.ndarray, np.ndarray], flicker: Sequence[FlickerNoise], reference: float,
-                 uncertain: bool) -> list[_Noise]:
+def _sensor_side(
+    diagram: Diagram,
+    axes: tuple[str, ...],
+    seen: Sensing,
+    decoding: np.ndarray,
+    rows: tuple[np.ndarray, np.ndarray],
+    flicker: Sequence[FlickerNoise],
+    reference: float,
+    uncertain: bool,
+) -> list[_Noise]:
     """Sensor chains of the logical axes and their noise. The chains are equal, so decoding and chain commute.
 
     rows : (n_s, n_axes) each, from the axes' motion to the motion along each sensor, and to its apparent acceleration
@@ -335,15 +396,19 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
 
     One unit of noise accompanies 1 m/s of floor velocity: sensor density over floor density.
     """
-    groups = [_Noise.of(axes, group, weight, decoding, reference, k)
-              for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))]
+    groups = [
+        _Noise.of(axes, group, weight, decoding, reference, k)
+        for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))
+    ]
     inertial = seen.decoder.inertial
     # Decoded motion in space, and decoded motion relative to the chassis.
     by_velocity, by_relative = (decoding[:, one] @ rows[0][one] for one in (inertial, ~inertial))
     by_tilt = decoding @ rows[1]
     for k, axis in enumerate(axes):
-        both = ((by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
-                (by_relative[k], "rel", seen.relative_chain, f"position chain {axis}", f"{axis}_against_chassis"))
+        both = (
+            (by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
+            (by_relative[k], "rel", seen.relative_chain, f"position chain {axis}", f"{axis}_against_chassis"),
+        )
         ways = [one for one in both if np.any(np.abs(one[0]) > 1e-9)]
         clean = f"clean_{axis}_dot"
         for row, of, chain, label, made in ways:
@@ -355,19 +420,31 @@ def _sensor_side(diagram: Diagram, axes: tuple[str, ...], seen: Sensing, decodin
         own = [one for one in groups if axis in one.axes]
         for one in own:
             one.add(diagram, axis)
-        terms = [clean, *(f"sensor_noise_{axis}{one.tag}" for one in own),
-                 *([f"chain_error_{axis}"] if uncertain else [])]
+        terms = [
+            clean,
+            *(f"sensor_noise_{axis}{one.tag}" for one in own),
+            *([f"chain_error_{axis}"] if uncertain else []),
+        ]
         diagram.add(f"sum {axis}", summing_junction(f"seen_{axis}_dot", terms), "sum")
         diagram.means(clean, "velocity as the sensors' band shows it", "m/s")
         diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
     for one in groups:
-        diagram.add(f"noise mixing{one.tag}", gain(one.mix, one.inputs, [f"mixed_{name}" for name in one.inputs]),
-                    "allocation")
+        diagram.add(
+            f"noise mixing{one.tag}", gain(one.mix, one.inputs, [f"mixed_{name}" for name in one.inputs]), "allocation"
+        )
     return groups
 
 
-def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.ndarray, np.ndarray], of: str,
-              chain: StateSpace, label: str, made: str) -> None:
+def _chain_of(
+    diagram: Diagram,
+    axes: tuple[str, ...],
+    k: int,
+    rows: tuple[np.ndarray, np.ndarray],
+    of: str,
+    chain: StateSpace,
+    label: str,
+    made: str,
+) -> None:
     """The common sensor chain of an axis, applied to its decoded motion and to gravity; rows (n_axes,) each."""
     read, (row, tilt) = f"{axes[k]}_{of}", rows
     if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
@@ -378,8 +455,9 @@ def _chain_of(diagram: Diagram, axes: tuple[str, ...], k: int, rows: tuple[np.nd
     system = chain.renamed([read], [made])
     if felt := [a for a in range(len(axes)) if abs(tilt[a]) > 1e-9 * GRAVITY]:
         # The input of the chain is velocity: the rate of the apparent acceleration is integrated twice.
-        diagram.add(f"gravity in {label}", gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"]),
-                    "sum")
+        diagram.add(
+            f"gravity in {label}", gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"]), "sum"
+        )
         diagram.means(f"{made}_tilt", "rate of what gravity adds to the measured acceleration", "m/s^3")
         system = with_rate_input(system, f"{made}_tilt", 2)
     diagram.add(label, system, "sensor")
@@ -397,8 +475,14 @@ class _Noise:
     tag: str
 
     @staticmethod
-    def of(axes: tuple[str, ...], group: NoiseGroup, weight: FlickerNoise, decoding: np.ndarray, reference: float,
-           number: int) -> _Noise:
+    def of(
+        axes: tuple[str, ...],
+        group: NoiseGroup,
+        weight: FlickerNoise,
+        decoding: np.ndarray,
+        reference: float,
+        number: int,
+    ) -> _Noise:
         own = decoding * group.share
         served = [k for k in range(len(axes)) if np.any(np.abs(own[k]) > 1e-9)]
         # own = L Q: L is a square root of own own', even if this is singular (fewer sensors of this kind than axes).
@@ -420,8 +504,15 @@ class _Noise:
         diagram.means(f"sensor_noise_{name}", "sensor noise as velocity", "m/s")
 
 
-def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[str, ...], sensors: tuple[str, ...],
-                   rows: np.ndarray, decoding: np.ndarray, weights: dict[str, Weight]) -> None:
+def _sensor_errors(
+    diagram: Diagram,
+    uncertainty: ChainUncertainty,
+    axes: tuple[str, ...],
+    sensors: tuple[str, ...],
+    rows: np.ndarray,
+    decoding: np.ndarray,
+    weights: dict[str, Weight],
+) -> None:
     """Errors of the decoded velocities by the neglected dynamics of each sensor chain: decoding (W Delta) rows."""
     used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
     weight = neglected_dynamics(uncertainty)
@@ -431,26 +522,44 @@ def _sensor_errors(diagram: Diagram, uncertainty: ChainUncertainty, axes: tuple[
         diagram.add(f"at {sensors[k]}", gain([rows[k]], [f"clean_{a}_dot" for a in axes], [f"{sensors[k]}_dot"]), "sum")
         diagram.add(f"W {label}", weight.system(f"{sensors[k]}_dot", f"z:{label}"), "weight")
         diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
-    diagram.add("decoding of errors", gain(decoding[:, used], [f"w:{label}" for label in labels],
-                                           [f"chain_error_{a}" for a in axes]), "allocation")
+    diagram.add(
+        "decoding of errors",
+        gain(decoding[:, used], [f"w:{label}" for label in labels], [f"chain_error_{a}" for a in axes]),
+        "allocation",
+    )
     for axis in axes:
         diagram.means(f"chain_error_{axis}", "what neglected sensor dynamics add to the velocity", "m/s")
 
 
-def _performance(diagram: Diagram, design: Design, axes: tuple[str, ...], allocation: np.ndarray, limits_V: np.ndarray,
-                 offset: float, weights: dict[str, Weight]) -> None:
+def _performance(
+    diagram: Diagram,
+    design: Design,
+    axes: tuple[str, ...],
+    allocation: np.ndarray,
+    limits_V: np.ndarray,
+    offset: float,
+    weights: dict[str, Weight],
+) -> None:
     """Weighted outputs, per m/s of floor velocity (compliance: per newton); limits_V (n_actuators,)."""
     asked, effort = design.transmissibility, design.control_effort
     band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
-    weights["transmissibility"] = TransmissibilityBound(asked.peak_dB, (band,), asked.transition_octaves,
-                                                        asked.tolerance_dB)
+    weights["transmissibility"] = TransmissibilityBound(
+        asked.peak_dB, (band,), asked.transition_octaves, asked.tolerance_dB
+    )
     load = np.abs(allocation) * (limits_V.max() / limits_V)[:, None]
     for k, axis in enumerate(axes):
         diagram.add(f"W_T {axis}", weights["transmissibility"].system(f"{axis}_dot", f"e_{axis}"), "weight")
         # Voltage of the channel that reaches its limit first for a force on this axis.
         first = int(np.argmax(load[:, k]))
-        weight = ControlEffort(float(limits_V[first]), effort.floor_velocity_m_per_s, effort.bandwidth_Hz,
-                               effort.reduction, 1, offset, effort.offset_corner_Hz)
+        weight = ControlEffort(
+            float(limits_V[first]),
+            effort.floor_velocity_m_per_s,
+            effort.bandwidth_Hz,
+            effort.reduction,
+            1,
+            offset,
+            effort.offset_corner_Hz,
+        )
         weights[f"{EFFORT} {axis}" if np.ptp(limits_V) else EFFORT] = weight
         volts = weight.system(f"command_{axis}", f"effort_{axis}").scaled(right=float(np.abs(allocation[first, k])))
         diagram.add(f"W_u {axis}", volts, "weight")

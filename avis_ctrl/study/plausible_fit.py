@@ -26,14 +26,18 @@ class FitPlausibility:
     known: float = 0.1
 
 
-def far_from_file(start: ResponseModel, information: Information, settings: FitPlausibility = FitPlausibility()
-                  ) -> tuple[str, ...]:
+def far_from_file(
+    start: ResponseModel, information: Information, settings: FitPlausibility = FitPlausibility()
+) -> tuple[str, ...]:
     """A sentence with the likely cause if a mass or moment of inertia is far from the rig file's; otherwise empty."""
     before = dict(zip(start.names, start.values, strict=True))
-    found = [(name, float(value / before[name]), float(value), unit)
-             for name, value, unit, sigma in zip(
-                 information.names, information.values, information.units, information.standard_deviation, strict=True)
-             if before[name] > 0 and value > 0 and sigma <= settings.known * value]
+    found = [
+        (name, float(value / before[name]), float(value), unit)
+        for name, value, unit, sigma in zip(
+            information.names, information.values, information.units, information.standard_deviation, strict=True
+        )
+        if before[name] > 0 and value > 0 and sigma <= settings.known * value
+    ]
     far = [one for one in found if one[0] in INERTIAL and not 1 / settings.far < one[1] < settings.far]
     if not far:
         return ()
@@ -42,8 +46,10 @@ def far_from_file(start: ResponseModel, information: Information, settings: FitP
     others = [one[1] for one in found if one[0] in INERTIAL or ".k_" in one[0] or one[0].startswith("k_")]
     if len(others) > 2 and max(others) / min(others) < settings.alike:
         middle = float(np.median(others))
-        return (f"{said}, and all masses, moments of inertia and stiffnesses that are well determined are about "
-                f"{middle:.2g} times those of the file. A response to the drives depends only on their ratio to the "
-                f"force constants and sensitivities: check these for a factor of {middle:.2g} or {1 / middle:.2g}",)
+        return (
+            f"{said}, and all masses, moments of inertia and stiffnesses that are well determined are about "
+            f"{middle:.2g} times those of the file. A response to the drives depends only on their ratio to the "
+            f"force constants and sensitivities: check these for a factor of {middle:.2g} or {1 / middle:.2g}",
+        )
     more = f"; also far from the file: {', '.join(one[0] for one in far[1:])}" if len(far) > 1 else ""
     return (f"{said}{more}. Check the rig file, and whether these data determine the value",)

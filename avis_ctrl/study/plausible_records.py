@@ -64,13 +64,26 @@ class RecordPlausibility:
 SETTINGS = RecordPlausibility()
 Response = Callable[[np.ndarray], np.ndarray]
 # Fields of rig files by parameter name; other parameters are named by themselves.
-FIELDS = {"mass": "payload.mass_kg", "J": "payload.inertia_kgm2", "Ixx": "payload.inertia_kgm2",
-          "Iyy": "payload.inertia_kgm2", "Izz": "payload.inertia_kgm2", "isolator.k": "isolator.stiffness_N_per_m",
-          "isolator.c": "isolator.damping_Ns_per_m", "actuator": "actuators.constant_N_per_V",
-          "e": "actuators.constant_N_per_V", "k_s": "suspension.k_s_N_per_m", "k_a": "suspension.k_a_N_per_m",
-          "k_t": "suspension.k_t_N_per_m", "k_r": "suspension.k_r_Nm_per_rad", "d1": "suspension.d1_Ns_per_m",
-          "d3": "suspension.d3_Ns_per_m", "d4": "suspension.d4_Nms_per_rad", "d5": "suspension.d5_Nms_per_rad",
-          "d6": "suspension.d6_Nms_per_rad"}
+FIELDS = {
+    "mass": "payload.mass_kg",
+    "J": "payload.inertia_kgm2",
+    "Ixx": "payload.inertia_kgm2",
+    "Iyy": "payload.inertia_kgm2",
+    "Izz": "payload.inertia_kgm2",
+    "isolator.k": "isolator.stiffness_N_per_m",
+    "isolator.c": "isolator.damping_Ns_per_m",
+    "actuator": "actuators.constant_N_per_V",
+    "e": "actuators.constant_N_per_V",
+    "k_s": "suspension.k_s_N_per_m",
+    "k_a": "suspension.k_a_N_per_m",
+    "k_t": "suspension.k_t_N_per_m",
+    "k_r": "suspension.k_r_Nm_per_rad",
+    "d1": "suspension.d1_Ns_per_m",
+    "d3": "suspension.d3_Ns_per_m",
+    "d4": "suspension.d4_Nms_per_rad",
+    "d5": "suspension.d5_Nms_per_rad",
+    "d6": "suspension.d6_Nms_per_rad",
+}
 # Units of the rig parameters that are tried. Factors of a channel's gain are not among them, because an error of one of
 # them cannot be distinguished from an error of another.
 UNITS = ("kg", "kg m^2", "N/m", "N s/m", "N m/rad", "N m s/rad")
@@ -117,21 +130,24 @@ def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
     return float(np.mean([size[there[:, k], k].mean() for k in np.flatnonzero(columns)]))
 
 
-def records_fit(measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
-                ) -> tuple[Finding, ...]:
+def records_fit(
+    measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
+) -> tuple[Finding, ...]:
     """`check_records`; with `despite`, its error is only reported as a line of progress."""
     try:
         return check_records(measured, model)
     except InputError as error:
         if not despite:
-            raise InputError(f"{error.expected}; --despite-gates continues anyway", field=error.field,
-                             value=error.value) from None
+            raise InputError(
+                f"{error.expected}; --despite-gates continues anyway", field=error.field, value=error.value
+            ) from None
         progress(f"  stop: {error}")
         return ()
 
 
-def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS
-                  ) -> tuple[Finding, ...]:
+def check_records(
+    measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS
+) -> tuple[Finding, ...]:
     """Refuse records that a single unit error explains, or that no table similar to the rig could have produced.
 
     Returns warnings on sensors that are off by one factor in all bands; these do not stop the analysis.
@@ -142,11 +158,15 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     """
     ratio = measured.sample_rate_Hz / model.rig.sample_rate_Hz
     if not 1 / settings.rate < ratio < settings.rate:
-        raise InputError(f"the rig file has {model.rig.sample_rate_Hz:g} Hz, {1 / ratio:g} times as much; did you mean "
-                         f"{measured.sample_rate_Hz * 1e3:g} (given in kHz)?" if ratio < 1 else
-                         f"the rig file has {model.rig.sample_rate_Hz:g} Hz; is the rig file's value in kHz, or that "
-                         "of the records in mHz?", field="sample_rate_Hz of the records",
-                         value=measured.sample_rate_Hz)
+        raise InputError(
+            f"the rig file has {model.rig.sample_rate_Hz:g} Hz, {1 / ratio:g} times as much; did you mean "
+            f"{measured.sample_rate_Hz * 1e3:g} (given in kHz)?"
+            if ratio < 1
+            else f"the rig file has {model.rig.sample_rate_Hz:g} Hz; is the rig file's value in kHz, or that "
+            "of the records in mHz?",
+            field="sample_rate_Hz of the records",
+            value=measured.sample_rate_Hz,
+        )
     seen = record_spectra(measured, settings)
     if seen is None:
         return ()
@@ -154,6 +174,7 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     def response(of: ResponseModel) -> np.ndarray:
         G = of.response(seen.omega)
         return G[:, :, [of.inputs.index(name) for name in measured.u_names]]
+
     G = response(model)
     now = seen.decades(G)
     before = distance(now)
@@ -165,24 +186,34 @@ def check_records(measured: Campaign, model: ResponseModel, settings: RecordPlau
     left = [one for one in found if one[0] <= settings.fits and one[0] <= settings.share * max(before, worst)]
     if left:
         _, field, value, said = left[0]
-        raise InputError(f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages; "
-                         f"{said}", field=field, value=value)
+        raise InputError(
+            f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages; {said}",
+            field=field,
+            value=value,
+        )
     if before > settings.hopeless:
-        raise InputError(f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages, "
-                         "and no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
-                         "force constants", field="records")
+        raise InputError(
+            f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages, "
+            "and no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
+            "force constants",
+            field="records",
+        )
     return doubts
 
 
-def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
-            ) -> tuple[Finding, ...]:
+def _doubts(
+    decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
+) -> tuple[Finding, ...]:
     """Warnings on sensors of one kind that measure the same multiple of the prediction in all bands."""
     off: list[tuple[str, float, str]] = []
     kinds = {one.name: one.quantity for one in model.rig.sensors()}
     for name, column in zip(measured.y_names, decades.T, strict=True):
         there = column[np.isfinite(column)]
-        if there.size >= 3 and abs(middle := float(np.median(there))) > settings.far and (
-                np.median(np.abs(there - middle)) < settings.fits):
+        if (
+            there.size >= 3
+            and abs(middle := float(np.median(there))) > settings.far
+            and (np.median(np.abs(there - middle)) < settings.fits)
+        ):
             off.append((kinds.get(name, ""), middle, name))
     alike: list[list[tuple[str, float, str]]] = []
     for one in sorted(off):
@@ -195,12 +226,23 @@ def _doubts(decades: np.ndarray, measured: Campaign, model: ResponseModel, setti
         kind = sensors[0][0]
         factor = 10.0 ** float(np.median([one[1] for one in sensors]))
         names = tuple(name for name in measured.y_names if name in [one[2] for one in sensors])
-        likely = " (9.81 is g: is a sensitivity given in V/g instead of V s^2/m, or the reverse?)" if (
-            kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665))) else ""
-        found.append(Finding("units", "warning", f"The signal of {listed(names)} is {factor:.3g} times the one that "
-                             f"the rig's model predicts for these voltages, in all frequency bands{likely}. Check "
-                             "sensitivity, gain and unit before you trust the fit.", names,
-                             value=factor, limit=10.0 ** settings.far))
+        likely = (
+            " (9.81 is g: is a sensitivity given in V/g instead of V s^2/m, or the reverse?)"
+            if (kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665)))
+            else ""
+        )
+        found.append(
+            Finding(
+                "units",
+                "warning",
+                f"The signal of {listed(names)} is {factor:.3g} times the one that "
+                f"the rig's model predicts for these voltages, in all frequency bands{likely}. Check "
+                "sensitivity, gain and unit before you trust the fit.",
+                names,
+                value=factor,
+                limit=10.0**settings.far,
+            )
+        )
     return tuple(found)
 
 
@@ -218,11 +260,14 @@ def _worst_channel(decades: np.ndarray, settings: RecordPlausibility) -> float:
 
 def record_spectra(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> RecordSpectra | None:
     """Spectra of the first records with drive voltages; None if there are none, or too few samples."""
-    driven = [one for one in measured.records if one.header.level_V > 0 or one.header.excitation in ("multisine",
-                                                                                                      "noise", "sine")]
+    driven = [
+        one
+        for one in measured.records
+        if one.header.level_V > 0 or one.header.excitation in ("multisine", "noise", "sine")
+    ]
     parts, peak_u, peak_y = [], np.zeros(len(measured.u_names)), 0.0
     length = 0
-    for record in driven[:settings.records]:
+    for record in driven[: settings.records]:
         seen = excerpt(record, settings.samples)
         if not seen.driven:
             continue
@@ -251,39 +296,67 @@ def record_spectra(measured: Campaign, settings: RecordPlausibility = SETTINGS) 
 Candidate = tuple[float, str, object, str]
 
 
-def _candidates(seen: RecordSpectra, G: np.ndarray, now: np.ndarray, measured: Campaign, model: ResponseModel,
-                response: Callable[[ResponseModel], np.ndarray], settings: RecordPlausibility) -> Iterator[Candidate]:
+def _candidates(
+    seen: RecordSpectra,
+    G: np.ndarray,
+    now: np.ndarray,
+    measured: Campaign,
+    model: ResponseModel,
+    response: Callable[[ResponseModel], np.ndarray],
+    settings: RecordPlausibility,
+) -> Iterator[Candidate]:
     """(remaining distance, field, value, question) for each corrected error, the simplest first."""
     for c in settings.gain_decades:
-        yield distance(now - c) + _rare(c, settings), *_common_gain(10.0 ** c, seen, measured, model)
+        yield distance(now - c) + _rare(c, settings), *_common_gain(10.0**c, seen, measured, model)
     for k, name in enumerate(measured.y_names):
         for c in settings.gain_decades:
             one = now.copy()
             one[:, k] -= c
-            yield distance(one) + settings.scope / 2, *_sensor_gain(name, 10.0 ** c, model)
+            yield distance(one) + settings.scope / 2, *_sensor_gain(name, 10.0**c, model)
     for k, name in enumerate(measured.u_names):
         for c in settings.gain_decades[:2]:
             volts = np.ones(len(measured.u_names))
-            volts[k] = 10.0 ** c
-            yield (distance(seen.decades(G, volts)) + settings.scope / 2, f"force constant of {name}", None,
-                   f"did you mean {10.0 ** c:g} times that constant, or is u of {name} given in "
-                   f"{'kV' if c > 0 else 'mV'} instead of V?")
+            volts[k] = 10.0**c
+            yield (
+                distance(seen.decades(G, volts)) + settings.scope / 2,
+                f"force constant of {name}",
+                None,
+                f"did you mean {10.0**c:g} times that constant, or is u of {name} given in "
+                f"{'kV' if c > 0 else 'mV'} instead of V?",
+            )
     for unit in ("V", "m", "m/s", "m/s^2"):
         if unit != measured.y_unit:
             try:
-                other = response(ResponseModel.of(model.rig, (), unit, measured.y_names, measured.u_names,
-                                                  model.period_s > 0, model.amplifier_corner_Hz))
+                other = response(
+                    ResponseModel.of(
+                        model.rig,
+                        (),
+                        unit,
+                        measured.y_names,
+                        measured.u_names,
+                        model.period_s > 0,
+                        model.amplifier_corner_Hz,
+                    )
+                )
             except InputError:
                 continue
             for c in (0.0, 3.0, -3.0):
-                much = f" times {10.0 ** c:g}" if c else ""
-                yield (distance(seen.decades(other) - c) + settings.scope, "unit of y", measured.y_unit,
-                       f"did you mean {unit}{much}?")
+                much = f" times {10.0**c:g}" if c else ""
+                yield (
+                    distance(seen.decades(other) - c) + settings.scope,
+                    "unit of y",
+                    measured.y_unit,
+                    f"did you mean {unit}{much}?",
+                )
     yield from _of_rig(seen, model, response, settings)
 
 
-def _of_rig(seen: RecordSpectra, model: ResponseModel, response: Callable[[ResponseModel], np.ndarray],
-            settings: RecordPlausibility) -> Iterator[Candidate]:
+def _of_rig(
+    seen: RecordSpectra,
+    model: ResponseModel,
+    response: Callable[[ResponseModel], np.ndarray],
+    settings: RecordPlausibility,
+) -> Iterator[Candidate]:
     """Errors of each kind of rig parameter; all parameters of a kind have the same factor."""
     known = model.rig.parameters()
     kinds: dict[str, list[str]] = {}
@@ -318,8 +391,9 @@ def _kind(name: str) -> str:
     return re.sub(r"_[xyz]$", "", re.sub(r"\d+", "", name))
 
 
-def _common_gain(factor: float, seen: RecordSpectra, measured: Campaign, model: ResponseModel
-                 ) -> tuple[str, object, str]:
+def _common_gain(
+    factor: float, seen: RecordSpectra, measured: Campaign, model: ResponseModel
+) -> tuple[str, object, str]:
     """Question on a factor common to all channels: force constants, sensitivities, units of u and y.
 
     A value beyond a limit is named first, then a value that the factor would bring into the usual range.
@@ -328,28 +402,44 @@ def _common_gain(factor: float, seen: RecordSpectra, measured: Campaign, model: 
     limits, full = rig.limits_of(measured.u_names), rig.acquisition.adc_range_V if rig.acquisition else np.inf
     k = int(np.argmax(seen.peak_u / limits))
     if factor == 1e-3 and seen.peak_u[k] > 3 * limits[k]:
-        return ("u of the records", float(f"{seen.peak_u[k]:.4g}"), f"the limit of drive {measured.u_names[k]} is "
-                f"{limits[k]:g} V: did you mean {seen.peak_u[k] / 1e3:.4g} V (given in mV)?")
+        return (
+            "u of the records",
+            float(f"{seen.peak_u[k]:.4g}"),
+            f"the limit of drive {measured.u_names[k]} is "
+            f"{limits[k]:g} V: did you mean {seen.peak_u[k] / 1e3:.4g} V (given in mV)?",
+        )
     if factor == 1e3 and unit == "V" and seen.peak_y > 3 * full:
-        return ("y of the records", float(f"{seen.peak_y:.4g}"), f"the converter's range is {full:g} V: did you mean "
-                f"{seen.peak_y / 1e3:.4g} V (given in mV)?")
+        return (
+            "y of the records",
+            float(f"{seen.peak_y:.4g}"),
+            f"the converter's range is {full:g} V: did you mean {seen.peak_y / 1e3:.4g} V (given in mV)?",
+        )
     options: list[tuple[float, str, object, str]] = []
     mass = float(rig.equations_of_motion().M[0, 0])
     push = float(np.max(np.abs(rig.equations_of_motion().T[:3]) @ rig.drive_limits_V())) / mass
     constants = [p.value for p in rig.parameters().values() if p.unit == "N/V"]
     if constants:
-        options.append((_gained(RANGES.acceleration, push, factor), "actuators.constant_N_per_V", constants[0],
-                        f"{constants[0] * factor:g}"))
+        options.append(
+            (
+                _gained(RANGES.acceleration, push, factor),
+                "actuators.constant_N_per_V",
+                constants[0],
+                f"{constants[0] * factor:g}",
+            )
+        )
     if unit == "V":
-        for part, keys in ((rig.geophones, ("sensitivity_Vs_per_m", "preamplifier_gain")),
-                           (rig.accelerometers, ("sensitivity_Vs2_per_m",))):
+        for part, keys in (
+            (rig.geophones, ("sensitivity_Vs_per_m", "preamplifier_gain")),
+            (rig.accelerometers, ("sensitivity_Vs2_per_m",)),
+        ):
             for key in keys if part is not None else ():
                 value = getattr(part, key, None)
                 value = value[0] if isinstance(value, tuple) and value else value
                 if isinstance(value, float) and value > 0:
                     section = "geophones" if part is rig.geophones else "accelerometers"
-                    options.append((_gained(RANGES.keys[key], value, factor), f"{section}.{key}", value,
-                                    f"{value * factor:g}"))
+                    options.append(
+                        (_gained(RANGES.keys[key], value, factor), f"{section}.{key}", value, f"{value * factor:g}")
+                    )
     options.sort(key=lambda one: one[0])
     prefix = {1e3: ("m", "k"), 1e-3: ("k", "m")}.get(factor)
     records = f"are the records' y in {prefix[0]}{unit} or u in {prefix[1]}V?" if prefix else ""
@@ -368,6 +458,9 @@ def _gained(within: Range, value: float, factor: float) -> float:
 def _sensor_gain(name: str, factor: float, model: ResponseModel) -> tuple[str, object, str]:
     k = model.sensors.names.index(name)
     value = float(model.sensors.sensitivity[k])
-    return (f"sensitivity of {name}", value,
-            f"only {name} differs: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
-            "preamplifier), or is it recorded in a different unit from the others?")
+    return (
+        f"sensitivity of {name}",
+        value,
+        f"only {name} differs: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
+        "preamplifier), or is it recorded in a different unit from the others?",
+    )

@@ -34,22 +34,25 @@ def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[Predictio
         for source in campaign.records:
             record = source.load()
             y = record.y - record.y.mean(axis=0)
-            size = np.sqrt(np.mean(y ** 2, axis=0))
+            size = np.sqrt(np.mean(y**2, axis=0))
             group = file[f"records/{source.header.name}"]
             if np.all(size > 0):
-                yield PredictionErrors(source.header.name, {name: _relative(data[()] - y, size)
-                                                            for name, data in group.items()}, _noise(record, size))
+                yield PredictionErrors(
+                    source.header.name,
+                    {name: _relative(data[()] - y, size) for name, data in group.items()},
+                    _noise(record, size),
+                )
 
 
 def _relative(error: np.ndarray, size: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.var(error, axis=0) / size ** 2)))
+    return float(np.sqrt(np.mean(np.var(error, axis=0) / size**2)))
 
 
 def _noise(record: Record, size: np.ndarray) -> float | None:
     period, count = record.header.period_samples, record.header.periods - 1
     if not period or count < 2 or record.floor is not None:  # the response to a measured floor is predicted
         return None
-    y = record.y[period:(count + 1) * period].reshape(count, period, -1)
+    y = record.y[period : (count + 1) * period].reshape(count, period, -1)
     spread = (y - y.mean(axis=0)).reshape(-1, y.shape[2])
     # Subtracting the mean removes 1/count of the noise power.
     return _relative(spread, size) * float(np.sqrt(count / (count - 1)))
@@ -57,13 +60,23 @@ def _noise(record: Record, size: np.ndarray) -> float | None:
 
 def compared(errors: Sequence[PredictionErrors]) -> str:
     """A remark on the errors of two models; empty for one model, or if the updated model is better."""
-    pairs = np.array([(one.relative["y_baseline"], one.relative["y_updated"]) for one in errors
-                      if {"y_baseline", "y_updated"} <= set(one.relative)])
+    pairs = np.array(
+        [
+            (one.relative["y_baseline"], one.relative["y_updated"])
+            for one in errors
+            if {"y_baseline", "y_updated"} <= set(one.relative)
+        ]
+    )
     if not len(pairs):
         return ""
     if np.array_equal(pairs[:, 0], pairs[:, 1]):
         return "both models give the same predictions: no named effect influences them"
-    before, after = np.sqrt(np.mean(pairs ** 2, axis=0))
-    return (f"the updated model has a larger error than the baseline ({100 * after:.3g} % instead of "
+    before, after = np.sqrt(np.mean(pairs**2, axis=0))
+    return (
+        (
+            f"the updated model has a larger error than the baseline ({100 * after:.3g} % instead of "
             f"{100 * before:.3g} %): this campaign is from a different table, or from one without the named effects"
-            ) if after > before else ""
+        )
+        if after > before
+        else ""
+    )

@@ -12,8 +12,9 @@ import avis_ctrl
 from avis_ctrl.rigs.rig import Rig
 
 
-def provenance(rig: Rig | None, inputs: str, seed: int | None, seconds: float, libraries: tuple[str, ...], /, **own: Any
-               ) -> dict[str, Any]:
+def provenance(
+    rig: Rig | None, inputs: str, seed: int | None, seconds: float, libraries: tuple[str, ...], /, **own: Any
+) -> dict[str, Any]:
     """The section `provenance` of a result file.
 
     Parameters
@@ -25,6 +26,13 @@ def provenance(rig: Rig | None, inputs: str, seed: int | None, seconds: float, l
     """
     values = [] if rig is None else sorted((name, one.value) for name, one in rig.parameters().items())
     text = repr(values) + inputs
-    return {"avis_ctrl": avis_ctrl.__version__, **own, "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
-            "seed": seed, "date": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": seconds,
-            "python": platform.python_version(), **{name: metadata.version(name) for name in libraries}}
+    return {
+        "avis_ctrl": avis_ctrl.__version__,
+        **own,
+        "inputs_sha256": hashlib.sha256(text.encode()).hexdigest(),
+        "seed": seed,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": seconds,
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in libraries},
+    }

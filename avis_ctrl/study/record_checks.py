@@ -20,15 +20,27 @@ def expectation(model: ResponseModel) -> Expectation:
 
     def response(omega: np.ndarray, inputs: tuple[str, ...]) -> np.ndarray:
         return model.response(omega)[:, :, [model.inputs.index(name) for name in inputs]]
+
     return Expectation(
-        y_range_V=converter.limits_V if converter else None, y_lsb_V=converter.lsb_V if converter else None,
+        y_range_V=converter.limits_V if converter else None,
+        y_lsb_V=converter.lsb_V if converter else None,
         drive_limits_V=dict(zip(model.actuators, rig.limits_of(model.actuators).tolist(), strict=True)),
         sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if converter and rig.ambient else None,
-        u_names=model.actuators, y_names=model.sensors.names, u_unit="V", y_unit=model.sensors.unit, response=response)
+        u_names=model.actuators,
+        y_names=model.sensors.names,
+        u_unit="V",
+        y_unit=model.sensors.unit,
+        response=response,
+    )
 
 
-def check_campaign(measured: Campaign, model: ResponseModel, despite_gates: bool, progress: Callable[[str], None],
-                   named_later: Collection[str] = ()) -> tuple[Finding, ...]:
+def check_campaign(
+    measured: Campaign,
+    model: ResponseModel,
+    despite_gates: bool,
+    progress: Callable[[str], None],
+    named_later: Collection[str] = (),
+) -> tuple[Finding, ...]:
     """Findings of all checks; warnings and stops are reported to `progress`.
 
     despite_gates : continue if a check reports a stop. named_later : gates whose findings the caller's own analysis
@@ -47,6 +59,9 @@ def check_campaign(measured: Campaign, model: ResponseModel, despite_gates: bool
             progress(f"  {one.severity}: {one.sentence}")
     if raised is not None:
         more = f" (and {len(stops) - 1} more, above)" if len(stops) > 1 else ""
-        raise InputError(f"{raised.sentence.rstrip('.')}{more}; --despite-gates continues anyway",
-                         field="measurement", value=raised.gate)
+        raise InputError(
+            f"{raised.sentence.rstrip('.')}{more}; --despite-gates continues anyway",
+            field="measurement",
+            value=raised.gate,
+        )
     return findings

@@ -16,8 +16,9 @@ USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output")}
 WHAT = {"u": "actuators", "y": "sensors"}
 
 
-def with_rig_names(rig: Rig, measured: Campaign | FrequencyResponse,
-                   columns: Mapping[str, Sequence[str]] | None = None) -> Campaign | FrequencyResponse:
+def with_rig_names(
+    rig: Rig, measured: Campaign | FrequencyResponse, columns: Mapping[str, Sequence[str]] | None = None
+) -> Campaign | FrequencyResponse:
     """The measurement with the rig's name, if the file states none, and the rig's channels, if only numbered.
 
     Numbered channels, if as many as the rig has, are assumed to be in the order of the rig. A note of the campaign
@@ -43,8 +44,10 @@ def with_rig_names(rig: Rig, measured: Campaign | FrequencyResponse,
             continue
         if len(had[role]) == len(own) and any(had[role] == numbered(stem, len(own)) for stem in stems):
             changes[role] = own
-            notes.append(f"{role}: the file does not name its channels; assumed to be in the order of the rig "
-                         f"{rig.name}: {', '.join(own)} (otherwise use --columns {role}_names=...)")
+            notes.append(
+                f"{role}: the file does not name its channels; assumed to be in the order of the rig "
+                f"{rig.name}: {', '.join(own)} (otherwise use --columns {role}_names=...)"
+            )
         else:
             unknown.append(role)
     if unknown:
@@ -64,8 +67,13 @@ def numbered(stem: str, count: int) -> tuple[str, ...]:
     return tuple(f"{stem}{k + 1}" for k in range(count))
 
 
-def _refusal(rig: Rig, had: Mapping[str, Sequence[str]], known: Mapping[str, Sequence[str]],
-             of_rig: Mapping[str, Sequence[str]], stated: str) -> InputError:
+def _refusal(
+    rig: Rig,
+    had: Mapping[str, Sequence[str]],
+    known: Mapping[str, Sequence[str]],
+    of_rig: Mapping[str, Sequence[str]],
+    stated: str,
+) -> InputError:
     """Error on the channels of one or both roles, with instructions."""
     strange = {role: [name for name in names if name not in known[role]] for role, names in had.items()}
     said = "; ".join(f"the {WHAT[role]} of the rig {rig.name} are {', '.join(of_rig[role])}" for role in had)
@@ -75,6 +83,8 @@ def _refusal(rig: Rig, had: Mapping[str, Sequence[str]], known: Mapping[str, Seq
         return InputError(f"the file is a campaign of {stated}, not of {rig.name}; {said}", field=field, value=value)
     example = ",".join(f"{role}_names={'+'.join(of_rig[role][:2])}+..." for role in had)
     counts = " and ".join(f"{len(names)} of {role}" for role, names in had.items())
-    said += (f"; if the file's channels ({counts}) are some of these, name them in the order of the file: "
-             f"--columns {example} (option of identify and convert)")
+    said += (
+        f"; if the file's channels ({counts}) are some of these, name them in the order of the file: "
+        f"--columns {example} (option of identify and convert)"
+    )
     return InputError(said, field=field, value=value)

@@ -38,10 +38,12 @@ def gain_limit(plant: DesignPlant, sample_rate_Hz: float, settings: RollOffSetti
     """
     blocks, P, u, y = plant.full.blocks, plant.full.P, plant.full.u, plant.full.y
     omega = np.geomspace(1.0, settings.beyond, settings.points) * np.pi * sample_rate_Hz
-    table = P.select([*P.outputs[:blocks.n_z], *y], [*P.inputs[:blocks.n_w], *u]).frequency_response(omega)
+    table = P.select([*P.outputs[: blocks.n_z], *y], [*P.inputs[: blocks.n_w], *u]).frequency_response(omega)
     gain = skewed_upper_bound(table[:, None], blocks.with_performance(len(u), len(y))).beta
     if not np.all(np.isfinite(gain)):
-        raise ComputationError("the table above half the sample rate has no bounded gain over the uncertainty set",
-                               next_step="design with smaller uncertainty")
+        raise ComputationError(
+            "the table above half the sample rate has no bounded gain over the uncertainty set",
+            next_step="design with smaller uncertainty",
+        )
     images = np.where(np.arange(omega.size) == 0, 2.0, 1.0)
     return GainLimit(omega, 1 / ((2 + settings.held) * images * gain))

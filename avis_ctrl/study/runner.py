@@ -49,8 +49,9 @@ Stop = AbstractContextManager[Callable[[], bool]]
 NEVER: Stop = nullcontext(lambda: False)
 
 
-def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None, source: Path | None = None,
-               stop: Stop = NEVER) -> DesignResult:
+def run_design(
+    design: Design, rig: Rig, progress: Progress = lambda text: None, source: Path | None = None, stop: Stop = NEVER
+) -> DesignResult:
     """Run a design on a rig.
 
     Parameters
@@ -72,8 +73,11 @@ def run_design(design: Design, rig: Rig, progress: Progress = lambda text: None,
 
 
 # Controllers from which the D-K iteration starts, by their kind in its history.
-INITIAL = {HINF: "H-infinity, uncertainty as performance", NOMINAL: "H-infinity, nominal plant",
-           GIVEN: "from the comparison"}
+INITIAL = {
+    HINF: "H-infinity, uncertainty as performance",
+    NOMINAL: "H-infinity, nominal plant",
+    GIVEN: "from the comparison",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +90,9 @@ class Comparison:
     by_axis: tuple[AxisGain, ...] = ()
 
 
-def other_controllers(design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
-                      ) -> tuple[list[Candidate], list[FailedController]]:
+def other_controllers(
+    design: Design, plant: DesignPlant, rig: Rig, progress: Progress = lambda text: None
+) -> tuple[list[Candidate], list[FailedController]]:
     """Controllers for comparison that do not depend on mu: nominal H-infinity, classical skyhook, no control.
 
     A controller that cannot be designed does not stop the study: it is returned among the failed ones.
@@ -114,8 +119,9 @@ class PendingBounds:
     peak_limit: float | None
 
 
-def start_bounds(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers
-                 ) -> PendingBounds:
+def start_bounds(
+    design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers
+) -> PendingBounds:
     """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design requires."""
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
@@ -125,30 +131,49 @@ def start_bounds(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[
     return PendingBounds(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
 
 
-def synthesise(design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate],
-               progress: Progress = lambda text: None, stop: Stop = NEVER) -> tuple[Candidate, DKIteration]:
+def synthesise(
+    design: Design,
+    plant: DesignPlant,
+    rig: Rig,
+    others: Sequence[Candidate],
+    progress: Progress = lambda text: None,
+    stop: Stop = NEVER,
+) -> tuple[Candidate, DKIteration]:
     """The mu controller and its D-K iteration, which starts from the best of the other controllers."""
     with threadpool_limits(1):
+
         def shown(row: Any) -> bool:
             """Called after each iteration; False stops it."""
             # Numbered as in the report, where the initial controllers are rows of the same table.
             if row.kind in INITIAL:
-                progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, "
-                         f"order {row.order}")
+                progress(
+                    f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, "
+                    f"order {row.order}"
+                )
                 return True
             ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
             kind = "" if row.kind == "D-K" else f" ({row.kind})"
-            progress(f"step {row.iteration}, D-K iteration{kind}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
-                     f"order {row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s")
+            progress(
+                f"step {row.iteration}, D-K iteration{kind}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
+                f"order {row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
+            )
             return not ends
+
         with stop as enough:
             mu, made = mu_optimal(design, plant, rig, shown, others)
         progress(mu.notes[-1])
         return mu, made
 
 
-def finish(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteration, compared: Comparison, seconds: float,
-             source: Path | None = None) -> DesignResult:
+def finish(
+    design: Design,
+    plant: DesignPlant,
+    rig: Rig,
+    synthesis: DKIteration,
+    compared: Comparison,
+    seconds: float,
+    source: Path | None = None,
+) -> DesignResult:
     """The verdict, the error of the reduction to the kept axes, and the provenance."""
     controllers = compared.controllers
     with threadpool_limits(1):
@@ -159,21 +184,43 @@ def finish(design: Design, plant: DesignPlant, rig: Rig, synthesis: DKIteration,
         verdict = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else ""
         unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
         passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in compared.loop.companions.passive]
-        notes = tuple(text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks())
-                      if text)
-    requirements = (*check_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
-                    *check_requirements(design, controllers, compared.by_axis))
-    return DesignResult(design, rig, plant, controllers, synthesis.history, requirements, reduction, six_dof,
-                        compared.loop, design_provenance(design, source, rig, seconds), seconds, notes, compared.failed,
-                        compared.by_axis)
+        notes = tuple(
+            text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks()) if text
+        )
+    requirements = (
+        *check_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
+        *check_requirements(design, controllers, compared.by_axis),
+    )
+    return DesignResult(
+        design,
+        rig,
+        plant,
+        controllers,
+        synthesis.history,
+        requirements,
+        reduction,
+        six_dof,
+        compared.loop,
+        design_provenance(design, source, rig, seconds),
+        seconds,
+        notes,
+        compared.failed,
+        compared.by_axis,
+    )
 
 
 ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
 
 
-def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[Candidate],
-            failed: Sequence[FailedController] = (), progress: Progress = lambda text: None,
-            early: PendingBounds | None = None) -> Comparison:
+def compare(
+    design: Design,
+    plant: DesignPlant,
+    rig: Rig,
+    candidates: Sequence[Candidate],
+    failed: Sequence[FailedController] = (),
+    progress: Progress = lambda text: None,
+    early: PendingBounds | None = None,
+) -> Comparison:
     """Bounds of every controller, of the tuned loops and the tuned skyhook if required, and the simulation of mu.
 
     Runs on two processes, in parallel with those of `early`. The simulation waits for the bounds of all other
@@ -189,8 +236,7 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
     begun = early.bounds if early is not None else {}
     with Workers() as workers:
-        jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name
-                for c in candidates}
+        jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}
         if "loops" in design.compare_with:
             made = next(c.K for c in candidates if c.name == "mu")
             jobs[workers.submit(_tuned, design, plant, rig, "loops", made, samples)] = "loops"
@@ -200,8 +246,12 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         def gather() -> None:
             for job in as_completed(jobs):
                 found[jobs[job]] = one = job.result()
-                progress(f"  {one.title}: {one.reason}" if isinstance(one, FailedController)
-                         else f"  done: bounds of {one.title}")
+                progress(
+                    f"  {one.title}: {one.reason}"
+                    if isinstance(one, FailedController)
+                    else f"  done: bounds of {one.title}"
+                )
+
         gather()
         mu = found["mu"]
         if isinstance(mu, FailedController):
@@ -214,8 +264,11 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
         jobs = {}
         if "skyhook" in design.compare_with:
             limit = skyhook_limit(design, mu)
-            jobs = {begun["skyhook"] if early is not None and limit == early.peak_limit else
-                    workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples): "skyhook"}
+            jobs = {
+                begun["skyhook"]
+                if early is not None and limit == early.peak_limit
+                else workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples): "skyhook"
+            }
         gather()
         loop = simulation.result()
         proved = [one.result() for one in by_axis]
@@ -232,22 +285,29 @@ def compare(design: Design, plant: DesignPlant, rig: Rig, candidates: Sequence[C
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
-    measured = {name: replace(one, rest=at_rest(bare_loop(design, rig, plant, one.K)) if one.K is not None else None)
-                for name, one in found.items() if isinstance(one, ControllerResult)}
-    return Comparison(tuple(measured[name] for name in ORDER if name in measured),
-                      tuple(sorted(every, key=lambda one: ORDER.index(one.name))), loop,
-                      tuple(AxisGain(axis, mine, its) for axis, mine, its in
-                            zip(plant.axes, proved, rival, strict=True)))
+    measured = {
+        name: replace(one, rest=at_rest(bare_loop(design, rig, plant, one.K)) if one.K is not None else None)
+        for name, one in found.items()
+        if isinstance(one, ControllerResult)
+    }
+    return Comparison(
+        tuple(measured[name] for name in ORDER if name in measured),
+        tuple(sorted(every, key=lambda one: ORDER.index(one.name))),
+        loop,
+        tuple(AxisGain(axis, mine, its) for axis, mine, its in zip(plant.axes, proved, rival, strict=True)),
+    )
 
 
-def _worst_of_axis(design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
-                   ) -> float:
+def _worst_of_axis(
+    design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
+) -> float:
     with threadpool_limits(1):
         return worst_of_axis(design, plant, axis, K, stability)
 
 
-def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray
-              ) -> ControllerResult | FailedController:
+def _measured(
+    design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray
+) -> ControllerResult | FailedController:
     with threadpool_limits(1):
         try:
             return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
@@ -255,8 +315,9 @@ def _measured(design: Design, plant: DesignPlant, c: Candidate, samples: np.ndar
             return FailedController(c.name, c.title, c.kind, str(error))
 
 
-def _tuned(design: Design, plant: DesignPlant, rig: Rig, name: Literal["skyhook", "loops"], given: Any,
-           samples: np.ndarray) -> ControllerResult | FailedController:
+def _tuned(
+    design: Design, plant: DesignPlant, rig: Rig, name: Literal["skyhook", "loops"], given: Any, samples: np.ndarray
+) -> ControllerResult | FailedController:
     """given : allowed peak of the skyhook, or the controller from which the loops start."""
     make, title = (tuned_skyhook, "skyhook, tuned") if name == "skyhook" else (tuned_loops, LOOPS_TITLE)
     with threadpool_limits(1):
@@ -279,6 +340,11 @@ def _asked_peaks(design: Design) -> list[float]:
 
 def design_provenance(design: Design, source: Path | None, rig: Rig, seconds: float) -> dict[str, Any]:
     """Provenance of a design. source : design file."""
-    return provenance(rig, design.model_dump_json(), design.simulation.seed, seconds,
-                      ("numpy", "scipy", "slycot", "cvxpy", "clarabel", "numba"),
-                      design_file=source.name if source else None)
+    return provenance(
+        rig,
+        design.model_dump_json(),
+        design.simulation.seed,
+        seconds,
+        ("numpy", "scipy", "slycot", "cvxpy", "clarabel", "numba"),
+        design_file=source.name if source else None,
+    )

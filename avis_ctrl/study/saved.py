@@ -19,8 +19,13 @@ STUDY = "study.json"
 
 def study_dict(design: Design, rig: Rig) -> dict[str, Any]:
     """The inputs of a study; the rig as the text of a rig file. Raises InputError for a rig without a file format."""
-    return {"format": "avis-study", "version": 1, "design": design.model_dump(), "rig": rig_toml(rig),
-            "loaded": getattr(rig, "load", None) is not None}
+    return {
+        "format": "avis-study",
+        "version": 1,
+        "design": design.model_dump(),
+        "rig": rig_toml(rig),
+        "loaded": getattr(rig, "load", None) is not None,
+    }
 
 
 def read_saved(folder: Path) -> tuple[Design, Rig]:

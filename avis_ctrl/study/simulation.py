@@ -44,14 +44,22 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
         rest = at_rest(loops[0])
         # The offsets that use the largest part of a drive's range; with an integrating controller there is no
         # equilibrium.
-        offset = [replace(one, sensors=replace(one.sensors, offset_V=rest.worst_offset_V)) for one in loops
-                  ] if np.isfinite(rest.percent) else loops
+        offset = (
+            [replace(one, sensors=replace(one.sensors, offset_V=rest.worst_offset_V)) for one in loops]
+            if np.isfinite(rest.percent)
+            else loops
+        )
         check = check_designs(offset, design.simulation.duration_s, design.simulation.seed)
         unstable = [loop for loop, one in zip(loops, check.plants, strict=True) if not one.stable]
         nominal = loops[0]
-        return Simulated(companions, check, digital_controller(nominal),
-                         nominal.loop_delay_s * nominal.sample_rate_Hz,
-                         find_culprit(unstable[0]) if unstable else None, rest)
+        return Simulated(
+            companions,
+            check,
+            digital_controller(nominal),
+            nominal.loop_delay_s * nominal.sample_rate_Hz,
+            find_culprit(unstable[0]) if unstable else None,
+            rest,
+        )
 
 
 def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
@@ -61,13 +69,22 @@ def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None
     """
     if K is None:
         K = gain(np.zeros((len(design.keep), len(design.keep))))
-    return SampledLoop(rig, K, tuple(design.keep), {}, sensor_bank(design, rig),
-                       floor_by_coordinate(design, rig, plant.floor), name="nominal", gravity=True,
-                       amplifier_corner_Hz=design.loop.amplifier_corner_Hz)
+    return SampledLoop(
+        rig,
+        K,
+        tuple(design.keep),
+        {},
+        sensor_bank(design, rig),
+        floor_by_coordinate(design, rig, plant.floor),
+        name="nominal",
+        gravity=True,
+        amplifier_corner_Hz=design.loop.amplifier_corner_Hz,
+    )
 
 
-def nominal_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None,
-                 companions: Companions | None = None) -> SampledLoop:
+def nominal_loop(
+    design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None, companions: Companions | None = None
+) -> SampledLoop:
     """The design's controller and the loops of the other axes (designed here by default) on the nominal rig."""
     bare = bare_loop(design, rig, plant, K)
     companions = companions or design_companions(bare, plant.weights.get("actuator chain *"), design.floor.band_Hz)
@@ -86,8 +103,9 @@ class SixDofSettings:
 SETTINGS = SixDofSettings()
 
 
-def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
-                  companions: Companions) -> SixDofCheck:
+def six_dof_check(
+    design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult, companions: Companions
+) -> SixDofCheck:
     """Compare the transmissibility of the sampled loop in six degrees of freedom with that of the design model.
 
     The frequencies are those of the design model, lower ones, the ends of the band, and points around the peaks, over
@@ -106,6 +124,7 @@ def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: Controll
 
     def sigma(omega: np.ndarray) -> np.ndarray:
         return np.linalg.norm(every(omega)[:, kept][:, :, kept], ord=2, axis=(1, 2))
+
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     inside = (T2.omega >= low) & (T2.omega <= high)
     slow = np.geomspace(2 * np.pi * SETTINGS.slowest_Hz, T2.omega[0], SETTINGS.points, endpoint=False)
@@ -113,11 +132,16 @@ def six_dof_check(design: Design, rig: Rig, plant: DesignPlant, result: Controll
     band = whole[(whole >= low) & (whole <= high)]
     omega = np.unique(np.concatenate([refine_maxima(sigma, part, sigma(part))[0] for part in (whole, band)]))
     if not np.any(inside):  # a band between two of the design model's frequencies
-        inside = np.arange(T2.omega.size) == np.argmin(np.abs(np.log(T2.omega ** 2 / (low * high))))
+        inside = np.arange(T2.omega.size) == np.argmin(np.abs(np.log(T2.omega**2 / (low * high))))
     deviation = 20 * np.max(np.abs(np.log10(sigma(T2.omega[inside]) / T2.sigma[inside])))
     response = every(omega)
-    return SixDofCheck(omega, sigma(omega), np.linalg.norm(response[:, kept][:, :, others], ord=2, axis=(1, 2)),
-                       np.abs(np.einsum("nii->ni", response)), float(deviation))
+    return SixDofCheck(
+        omega,
+        sigma(omega),
+        np.linalg.norm(response[:, kept][:, :, others], ord=2, axis=(1, 2)),
+        np.abs(np.einsum("nii->ni", response)),
+        float(deviation),
+    )
 
 
 def sensor_bank(design: Design, rig: Rig) -> SensorBank:
@@ -129,20 +153,24 @@ def floor_by_coordinate(design: Design, rig: Rig, spectrum: SpectrumModel) -> di
     """Floor spectra: the site's level for each translation, and for each kept rotation at the edge."""
     rms, (low, high) = spectrum.rms(*_band(design)), _band(design)
     turning = spectrum.scaled_to_rms(rms / rig.edge_m, low, high)
-    return {name: turning if name.startswith("phi") else spectrum
-            for name in COORDINATES if name in design.keep or not name.startswith("phi")}
+    return {
+        name: turning if name.startswith("phi") else spectrum
+        for name in COORDINATES
+        if name in design.keep or not name.startswith("phi")
+    }
 
 
 def _band(design: Design) -> tuple[float, float]:
     return design.floor.band_Hz[0], design.floor.band_Hz[1]
 
 
-def perturbed_loops(design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult,
-                    nominal: SampledLoop) -> Iterator[SampledLoop]:
+def perturbed_loops(
+    design: Design, rig: Rig, plant: DesignPlant, result: ControllerResult, nominal: SampledLoop
+) -> Iterator[SampledLoop]:
     """The worst case of transmissibility, then the random plants, as rigs with changed parameters and channels."""
     blocks = plant.synthesis.blocks
     if result.worst_peak.delta is not None:
-        delta = result.worst_peak.delta[:blocks.n_w, :blocks.n_z]
+        delta = result.worst_peak.delta[: blocks.n_w, : blocks.n_z]
         yield with_delta(rig, plant, nominal, "worst case", delta, result.worst_peak.omega)
     rng = np.random.default_rng((design.simulation.seed, 2))
     samples = random_perturbations(plant, design.simulation.random_plants, design.simulation.seed)
@@ -151,15 +179,22 @@ def perturbed_loops(design: Design, rig: Rig, plant: DesignPlant, result: Contro
         yield with_delta(rig, plant, nominal, f"random {k}", delta, 2 * np.pi * 10 ** rng.uniform(0.0, 2.0))
 
 
-def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, delta: np.ndarray,
-               omega: float) -> SampledLoop:
+def with_delta(
+    rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, delta: np.ndarray, omega: float
+) -> SampledLoop:
     """The loop around the rig with a given perturbation."""
     blocks = plant.synthesis.blocks
-    real = {block.name: complex(np.ravel(value)[0]).real
-            for value, block in zip(blocks.values(delta), blocks.blocks, strict=True) if block.kind == "real"}
+    real = {
+        block.name: complex(np.ravel(value)[0]).real
+        for value, block in zip(blocks.values(delta), blocks.blocks, strict=True)
+        if block.kind == "real"
+    }
     changed = rig.with_parameters(plant.rig.values([real[p.name] for p in plant.rig.parameters]))
-    chains = {block.name: (value, block) for value, block in zip(blocks.values(delta), blocks.blocks, strict=True)
-              if block.kind != "real"}
+    chains = {
+        block.name: (value, block)
+        for value, block in zip(blocks.values(delta), blocks.blocks, strict=True)
+        if block.kind != "real"
+    }
     actuators = rig.equations_of_motion().actuators
     coupling = _response_error(rig, plant, nominal.axes, chains, omega)
     drives = [_chain(plant, chains, "actuator chain", one, omega) for one in actuators]
@@ -167,8 +202,9 @@ def with_delta(rig: Rig, plant: DesignPlant, nominal: SampledLoop, name: str, de
     return nominal.with_plant(name, changed, drives, sensors, coupling)
 
 
-def _response_error(rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains: dict[str, Any], omega: float
-                    ) -> StateSpace | None:
+def _response_error(
+    rig: Rig, plant: DesignPlant, keep: tuple[str, ...], chains: dict[str, Any], omega: float
+) -> StateSpace | None:
     """I + A W(s) Delta(s) T from all drives to all drives; None if the plant has no such error.
 
     T maps volts to the forces on the axes, A maps the additional forces back to volts.

@@ -55,8 +55,9 @@ class SkyhookSettings:
 def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
     """Critical damping of each decoupled axis, with the usual corners."""
     loops = classical_loops(plant, rig, design)
-    return Candidate("skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(),
-                     (in_words(loops),))
+    return Candidate(
+        "skyhook_classical", "skyhook, critical damping", "skyhook", loops.controller(), (in_words(loops),)
+    )
 
 
 def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
@@ -64,8 +65,9 @@ def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
     return Skyhook(plant.axes, critical_gains(rig, design.keep), *CUSTOMARY_CORNERS_HZ)
 
 
-def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: float,
-                  settings: SkyhookSettings = SkyhookSettings()) -> Candidate:
+def tuned_skyhook(
+    plant: DesignPlant, rig: Rig, design: Design, peak_limit: float, settings: SkyhookSettings = SkyhookSettings()
+) -> Candidate:
     """The best skyhook found for a limit on the worst-case peak.
 
     Of the tunings that meet the limit, it has the smallest worst-case transmissibility in the band. If none meets it,
@@ -94,18 +96,24 @@ def tuned_skyhook(plant: DesignPlant, rig: Rig, design: Design, peak_limit: floa
         target = settings.room * peak_limit * min(1.0, missed)
     best, loops = min(ranked, key=lambda one: one[0].key())
     if best.unstable:
-        raise ComputationError("no skyhook tuning tried is stable on the nominal plant",
-                               measured=f"gains from {task.search.gain_factor[0]:g} to {task.search.gain_factor[1]:g} "
-                                        "times critical damping",
-                               cause="the phase of the sensors and the delay turns damping into excitation",
-                               next_step="change the corners in [skyhook], or use sensors with a lower corner")
+        raise ComputationError(
+            "no skyhook tuning tried is stable on the nominal plant",
+            measured=f"gains from {task.search.gain_factor[0]:g} to {task.search.gain_factor[1]:g} "
+            "times critical damping",
+            cause="the phase of the sensors and the delay turns damping into excitation",
+            next_step="change the corners in [skyhook], or use sensors with a lower corner",
+        )
     notes = [in_words(loops), *at_limits(loops, task.search)]
     if loops is classical:
-        notes.append("this is critical damping with the usual corners: no better tuning was found for the whole "
-                     "uncertainty set")
+        notes.append(
+            "this is critical damping with the usual corners: no better tuning was found for the whole uncertainty set"
+        )
     if not best.meets:
-        reached = (f"this one has the lowest, {decibels(best.peak):+.2f} dB" if np.isfinite(best.peak)
-                   else "none is proved stable for the whole uncertainty set")
+        reached = (
+            f"this one has the lowest, {decibels(best.peak):+.2f} dB"
+            if np.isfinite(best.peak)
+            else "none is proved stable for the whole uncertainty set"
+        )
         notes.append(f"no skyhook tuning found has a worst-case peak below {decibels(peak_limit):+.2f} dB: {reached}")
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
 
@@ -128,14 +136,24 @@ class WorstCaseTuning:
     def search(self, rig: Rig) -> Search:
         """The search over the design's range on sampled plants."""
         asked, plant = self.design.skyhook, self.plant
-        scenarios = Scenarios.sample(plant.full, plant.floor_velocities, plant.velocities, 2 * np.pi * TUNING_HZ,
-                                     self.settings.samples, self.design.simulation.seed)
-        search = TuningRange(critical_gains(rig, self.design.keep), tilt_corner_Hz=_pair(asked.tilt_corner_Hz),
-                             roll_off_Hz=_pair(asked.roll_off_Hz))
+        scenarios = Scenarios.sample(
+            plant.full,
+            plant.floor_velocities,
+            plant.velocities,
+            2 * np.pi * TUNING_HZ,
+            self.settings.samples,
+            self.design.simulation.seed,
+        )
+        search = TuningRange(
+            critical_gains(rig, self.design.keep),
+            tilt_corner_Hz=_pair(asked.tilt_corner_Hz),
+            roll_off_Hz=_pair(asked.roll_off_Hz),
+        )
         return Search(scenarios, plant.axes, search, self.band_Hz)
 
-    def tuned(self, task: Search, points: Sequence[np.ndarray],
-              target: float) -> tuple[np.ndarray, list[np.ndarray], Search]:
+    def tuned(
+        self, task: Search, points: Sequence[np.ndarray], target: float
+    ) -> tuple[np.ndarray, list[np.ndarray], Search]:
         """The best tuning by the worst case at each frequency, the known points, and the search with its worst cases.
 
         Each round improves the points on the samples. The worst case of the best point is then added to the samples,
@@ -159,8 +177,12 @@ class WorstCaseTuning:
         closed = motion.closed(task.search.skyhook(task.axes, point).controller())
         if not closed.is_stable():
             return Merit(np.inf, np.inf, self.peak_limit, 1.0), None
-        found = worst_gain(closed.frequency_response(task.scenarios.omega), motion.blocks, count=self.settings.ascents,
-                           iterations=self.settings.ascent_steps)
+        found = worst_gain(
+            closed.frequency_response(task.scenarios.omega),
+            motion.blocks,
+            count=self.settings.ascents,
+            iterations=self.settings.ascent_steps,
+        )
         return Merit(float(np.max(found.gain)), float(np.max(found.gain[task.inside])), self.peak_limit), found.delta
 
     def with_worst_case(self, task: Search, worst: MuPeak) -> Search:
@@ -187,8 +209,9 @@ class WorstCaseTuning:
         if worst.upper > self.peak_limit:
             return Merit(worst.upper, np.inf, self.peak_limit), worst
         low, high = self.band_Hz
-        band = worst_case_gain(closed, motion.blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK,
-                               points=SETTINGS.few_points)
+        band = worst_case_gain(
+            closed, motion.blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK, points=SETTINGS.few_points
+        )
         return Merit(worst.upper, band.upper, self.peak_limit), worst
 
 
@@ -208,15 +231,21 @@ def in_words(loops: Skyhook) -> str:
 
 def at_limits(loops: Skyhook, search: TuningRange) -> list[str]:
     """A sentence on tuned values at an end of their range, where a wider range may give a better result."""
-    values = [*((f"the gain of {axis}", gain / critical, search.gain_factor) for axis, gain, critical in
-                zip(loops.axes, loops.gains, search.critical, strict=True)),
-              ("the tilt corner", loops.tilt_corner_Hz, search.tilt_corner_Hz),
-              ("the roll-off", loops.roll_off_Hz, search.roll_off_Hz)]
+    values = [
+        *(
+            (f"the gain of {axis}", gain / critical, search.gain_factor)
+            for axis, gain, critical in zip(loops.axes, loops.gains, search.critical, strict=True)
+        ),
+        ("the tilt corner", loops.tilt_corner_Hz, search.tilt_corner_Hz),
+        ("the roll-off", loops.roll_off_Hz, search.roll_off_Hz),
+    ]
     found = [name for name, value, ends in values if min(abs(np.log(value / end)) for end in ends) < 1e-6]
     if not found:
         return []
-    return [f"{' and '.join(found)} {'is' if len(found) == 1 else 'are'} at the end of the range searched: a wider "
-            "range may give a better skyhook"]
+    return [
+        f"{' and '.join(found)} {'is' if len(found) == 1 else 'are'} at the end of the range searched: a wider "
+        "range may give a better skyhook"
+    ]
 
 
 def _pair(limits: list[float]) -> tuple[float, float]:

@@ -23,8 +23,9 @@ def toml_value(value: Any) -> str:
 def _sections(title: str, table: dict[str, Any]) -> list[list[str]]:
     """Lines of a section and of its subsections."""
     inner = {key: value for key, value in table.items() if isinstance(value, dict)}
-    many = {key: value for key, value in table.items() if value and isinstance(value, list)
-            and isinstance(value[0], dict)}
+    many = {
+        key: value for key, value in table.items() if value and isinstance(value, list) and isinstance(value[0], dict)
+    }
     plain = _lines({key: value for key, value in table.items() if key not in inner and key not in many})
     found = [[f"[{title}]", *plain] if title else plain] if plain else []
     before = f"{title}." if title else ""

@@ -79,8 +79,13 @@ class SpreadSection(Section):
 
     def values(self) -> FrfSpread:
         """The spread as arrays."""
-        return FrfSpread(tuple(self.keep), np.array(self.frequency_Hz), np.array(self.measured), np.array(self.noise),
-                         tuple(self.confidence))
+        return FrfSpread(
+            tuple(self.keep),
+            np.array(self.frequency_Hz),
+            np.array(self.measured),
+            np.array(self.noise),
+            tuple(self.confidence),
+        )
 
 
 class UncertaintyFile(Section):
@@ -132,12 +137,19 @@ class UncertaintyFile(Section):
         known = rig.parameters()
         for one in self.parameter:
             if one.name in known and abs(known[one.name].value - one.value) > 1e-9 * one.scale:
-                raise InputError(f"the identification found {one.value:.9g} {one.unit}; expected the rig file that was "
-                                 "written with it", field=f"{one.name} of the rig {rig.name}",
-                                 value=known[one.name].value)
+                raise InputError(
+                    f"the identification found {one.value:.9g} {one.unit}; expected the rig file that was "
+                    "written with it",
+                    field=f"{one.name} of the rig {rig.name}",
+                    value=known[one.name].value,
+                )
         if rig.name != self.rig or rig_sha256(rig) != self.rig_sha256:
-            raise InputError(f"the uncertainty was identified on {self.rig} with other parameters than this rig file "
-                             "has; expected the rig file that was written with it", field="rig", value=rig.name)
+            raise InputError(
+                f"the uncertainty was identified on {self.rig} with other parameters than this rig file "
+                "has; expected the rig file that was written with it",
+                field="rig",
+                value=rig.name,
+            )
 
 
 def rig_sha256(rig: Rig) -> str:

@@ -37,16 +37,22 @@ def all_axes(result: DesignResult) -> str:
     inside = (six.omega >= 2 * np.pi * low) & (six.omega <= 2 * np.pi * high)
     peak, band = (decibels(np.max(sigma)) for sigma in (six.kept, six.kept[inside]))
     inside_band = f"from {low:g} to {high:g} Hz"
-    beyond = [f"{value:+.1f} dB {where} (bound {decibels(bound.upper):+.1f} dB)"
-              for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
-              if np.isfinite(bound.upper) and value > decibels(bound.upper)]
+    beyond = [
+        f"{value:+.1f} dB {where} (bound {decibels(bound.upper):+.1f} dB)"
+        for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
+        if np.isfinite(bound.upper) and value > decibels(bound.upper)
+    ]
     outside = _outside(result, six.alone[inside].max(axis=0), inside_band)
     locked = f"The worst-case bounds hold for {listed(result.design.keep)} with the other coordinates locked"
     if beyond:
-        return (f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
-                f"{outside}")
-    reached = ("With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
-               f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}")
+        return (
+            f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
+            f"{outside}"
+        )
+    reached = (
+        "With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
+        f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}"
+    )
     if not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
         return f"{reached}. For the other plants of the uncertainty set there is no bound.{outside}"
     return f"{locked}. {reached}.{outside}"
@@ -54,12 +60,15 @@ def all_axes(result: DesignResult) -> str:
 
 def _outside(result: DesignResult, most: np.ndarray, inside_band: str) -> str:
     """What the axes outside the design do: most (6,), largest gain of each axis in the band."""
-    rows = [f"{name} {decibels(most[k]):+.1f} dB" for k, name in enumerate(COORDINATES)
-            if name not in result.design.keep]
+    rows = [
+        f"{name} {decibels(most[k]):+.1f} dB" for k, name in enumerate(COORDINATES) if name not in result.design.keep
+    ]
     if not rows:
         return ""
-    return (f" The axes outside the design have skyhook loops or remain passive: {inside_band} each transmits its own "
-            f"floor motion with at most {listed(rows)} (nominal).")
+    return (
+        f" The axes outside the design have skyhook loops or remain passive: {inside_band} each transmits its own "
+        f"floor motion with at most {listed(rows)} (nominal)."
+    )
 
 
 def requirement_rows(result: DesignResult) -> list[tuple[str, str, str, bool]]:
@@ -77,9 +86,11 @@ def refuse_unstable(result: DesignResult) -> None:
     if not (text := unstable(result)):
         return
     kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""
-    steps = {"table": "check the rig file's stiffness, centre of mass and damping",
-             "nonlinear": "check whether the drive voltages of that plant are at their limits, and its floor motion",
-             "controller": "add the axes that move to keep in the design file, or reduce the bandwidth"}
+    steps = {
+        "table": "check the rig file's stiffness, centre of mass and damping",
+        "nonlinear": "check whether the drive voltages of that plant are at their limits, and its floor motion",
+        "controller": "add the axes that move to keep in the design file, or reduce the bandwidth",
+    }
     step = steps.get(kind, "use sensors with a lower corner frequency, or add these axes to keep in the design file")
     raise ComputationError(text.removesuffix("."), next_step=step)
 
@@ -90,6 +101,8 @@ def _counted(result: DesignResult) -> str:
     if not asked:
         return "The design file states no requirements, so there is no verdict."
     if missed:
-        return (f"{len(missed)} of {len(asked)} requirements {'is' if len(missed) == 1 else 'are'} not met: "
-                f"{'; '.join(missed)}.")
+        return (
+            f"{len(missed)} of {len(asked)} requirements {'is' if len(missed) == 1 else 'are'} not met: "
+            f"{'; '.join(missed)}."
+        )
     return f"All {len(asked)} requirements are met." if len(asked) > 1 else "The requirement is met."

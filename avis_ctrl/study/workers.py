@@ -49,6 +49,7 @@ def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, nicen
         while os.getppid() == parent:
             time.sleep(SETTINGS.watch_s)
         os._exit(1)
+
     threading.Thread(target=watch, daemon=True).start()
 
 
@@ -80,8 +81,13 @@ class Workers:
     def __enter__(self) -> Workers:
         # A forked child has the compiled code and the libraries already.
         method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-        self._pool = (ProcessPoolExecutor(self._count, multiprocessing.get_context(method), as_worker,
-                                          (os.getpid(), *self._manners)) if self._count > 1 else None)
+        self._pool = (
+            ProcessPoolExecutor(
+                self._count, multiprocessing.get_context(method), as_worker, (os.getpid(), *self._manners)
+            )
+            if self._count > 1
+            else None
+        )
         self._others = set(multiprocessing.active_children())
         return self
 

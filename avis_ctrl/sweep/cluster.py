@@ -20,12 +20,16 @@ def require_distributed() -> None:
     try:
         import distributed  # noqa: F401
     except ImportError:
-        raise InputError("expected dask.distributed: pip install \"avis_ctrl[cluster]\"; without --scheduler and "
-                         "--workers a sweep needs nothing more", field="--scheduler or --workers") from None
+        raise InputError(
+            'expected dask.distributed: pip install "avis_ctrl[cluster]"; without --scheduler and '
+            "--workers a sweep needs nothing more",
+            field="--scheduler or --workers",
+        ) from None
 
 
-def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, settings: SweepSettings | None = None
-               ) -> Iterator[dict[str, Any]]:
+def on_cluster(
+    tasks: Sequence[Task], address: str | None, workers: int, settings: SweepSettings | None = None
+) -> Iterator[dict[str, Any]]:
     """Content of each point as it is finished, in any order.
 
     If a worker dies, its points are given to other workers.
@@ -48,13 +52,25 @@ def on_cluster(tasks: Sequence[Task], address: str | None, workers: int, setting
     # A killed worker or a lost scheduler is reported in a row or in one line, not in the library's log.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": settings.deaths - 1,
-                                             "distributed.comm.timeouts.connect": settings.patience_s}))
+        stack.enter_context(
+            dask.config.set(
+                {
+                    "distributed.scheduler.allowed-failures": settings.deaths - 1,
+                    "distributed.comm.timeouts.connect": settings.patience_s,
+                }
+            )
+        )
         if address is None:
             with _ignored_interrupts():
-                cluster = stack.enter_context(library.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL))
+                cluster = stack.enter_context(
+                    library.LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        processes=True,
+                        dashboard_address="127.0.0.1:0",
+                        silence_logs=logging.CRITICAL,
+                    )
+                )
             address = cluster.scheduler_address
         client = stack.enter_context(_connected(library.Client, address, settings.patience_s))
         # Tasks are named by their identity: a resumed sweep joins tasks that are still running.
@@ -83,15 +99,22 @@ def _connected(client_of: Any, address: str, patience_s: float) -> Iterator[Any]
     try:
         client = client_of(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError, ImportError) as error:
-        raise InputError(f"expected the address of a dask scheduler, such as tcp://HOST:8786 "
-                         f"({' '.join(str(error).split()) or type(error).__name__})", field="--scheduler",
-                         value=address) from None
+        raise InputError(
+            f"expected the address of a dask scheduler, such as tcp://HOST:8786 "
+            f"({' '.join(str(error).split()) or type(error).__name__})",
+            field="--scheduler",
+            value=address,
+        ) from None
     try:
         try:
             client.wait_for_workers(1, timeout=patience_s)
         except TimeoutError:
-            raise InputError(f"expected a scheduler with a worker; none came within {patience_s:g} s; start one with "
-                             f"dask worker {address} --nthreads 1", field="--scheduler", value=address) from None
+            raise InputError(
+                f"expected a scheduler with a worker; none came within {patience_s:g} s; start one with "
+                f"dask worker {address} --nthreads 1",
+                field="--scheduler",
+                value=address,
+            ) from None
         yield client
     finally:
         with contextlib.suppress(TimeoutError, OSError):
@@ -107,7 +130,8 @@ def _content(future: Any, task: Task) -> dict[str, Any]:
     except KilledWorker:
         return lost(task, "every process that computed it died; likely cause: memory, or a fault in compiled code")
     except CancelledError:
-        raise ComputationError("the scheduler was lost", next_step="run the same command again: finished points are "
-                               "kept") from None
+        raise ComputationError(
+            "the scheduler was lost", next_step="run the same command again: finished points are kept"
+        ) from None
     except Exception as error:  # for example, a worker that cannot load the package
         return lost(task, f"{type(error).__name__}: {' '.join(str(error).split())}")

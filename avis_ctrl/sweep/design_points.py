@@ -37,18 +37,25 @@ class DesignBase:
     table: dict[str, Any]
     rig: Rig
     others: dict[str, DesignBase] = field(default_factory=dict)
-    quantities: Mapping[str, str] = field(default_factory=lambda: {
-        "mu_upper": "mu, upper bound [1]", "mu_lower": "mu, lower bound [1]", "guaranteed": "bounds proved",
-        "worst_case_peak_transmissibility_dB": "worst-case transmissibility, peak [dB]",
-        BAND: "worst-case transmissibility in the band [dB]", "order": "states of the controller [1]"})
+    quantities: Mapping[str, str] = field(
+        default_factory=lambda: {
+            "mu_upper": "mu, upper bound [1]",
+            "mu_lower": "mu, lower bound [1]",
+            "guaranteed": "bounds proved",
+            "worst_case_peak_transmissibility_dB": "worst-case transmissibility, peak [dB]",
+            BAND: "worst-case transmissibility in the band [dB]",
+            "order": "states of the controller [1]",
+        }
+    )
     pareto: tuple[str, str] | None = ("mu_upper", BAND)
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> DesignBase:
         """Raises InputError for a base that is missing or is not a design file."""
         if file.rig is not None:
-            raise InputError("expected no rig: the design file names it; vary the key \"rig\"", field="rig",
-                             value=file.rig)
+            raise InputError(
+                'expected no rig: the design file names it; vary the key "rig"', field="rig", value=file.rig
+            )
         return cls.of(folder / file.base, file.kind == "skyhook")
 
     @classmethod
@@ -97,8 +104,10 @@ class DesignJob:
 
     def _mu(self) -> tuple[ControllerResult, dict[str, Any]]:
         result = run_design(self.design, self.rig)
-        return result.controller("mu"), {"stable": result.stable,
-                                         "requirements_met": all(one.met for one in result.requirements)}
+        return result.controller("mu"), {
+            "stable": result.stable,
+            "requirements_met": all(one.met for one in result.requirements),
+        }
 
     def _skyhook(self) -> tuple[ControllerResult, dict[str, Any]]:
         plant = build_plant(self.design, self.rig)
@@ -109,7 +118,11 @@ class DesignJob:
 
 def figures_of(found: ControllerResult) -> dict[str, Any]:
     """The figures of a controller for the table."""
-    return {"mu_upper": found.mu.upper, "mu_lower": found.mu.lower,
-            "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
-            "worst_case_peak_transmissibility_dB": decibels(found.worst_peak.upper),
-            BAND: decibels(found.worst_band.upper), "order": found.order}
+    return {
+        "mu_upper": found.mu.upper,
+        "mu_lower": found.mu.lower,
+        "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
+        "worst_case_peak_transmissibility_dB": decibels(found.worst_peak.upper),
+        BAND: decibels(found.worst_band.upper),
+        "order": found.order,
+    }

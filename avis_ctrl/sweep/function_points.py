@@ -33,8 +33,9 @@ class FunctionBase:
         try:
             made = cls(path.read_text(encoding="utf-8"), path, name)
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"expected a Python file ({getattr(error, 'strerror', None) or error})", file=path
-                             ) from None
+            raise InputError(
+                f"expected a Python file ({getattr(error, 'strerror', None) or error})", file=path
+            ) from None
         FunctionJob(made.source, path, name, {}).function()
         return made
 
@@ -71,11 +72,14 @@ class FunctionJob:
         try:
             exec(compile(self.source, str(self.path), "exec"), module.__dict__)
         except (Exception, SystemExit) as error:
-            raise InputError(f"expected a Python file that runs: {type(error).__name__}: "
-                             f"{' '.join(str(error).split())}", file=self.path) from None
+            raise InputError(
+                f"expected a Python file that runs: {type(error).__name__}: {' '.join(str(error).split())}",
+                file=self.path,
+            ) from None
         if not callable(found := getattr(module, self.name, None)):
-            raise InputError("expected the name of a function in the file", file=self.path, field="base",
-                             value=self.name)
+            raise InputError(
+                "expected the name of a function in the file", file=self.path, field="base", value=self.name
+            )
         return found
 
     def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -47,10 +47,17 @@ class GapBase:
     rig_name: str
     rig: Rig
     digests: dict[Path, str] = field(default_factory=dict)
-    quantities: Mapping[str, str] = field(default_factory=lambda: {
-        "verdict": "verdict", "effects": "named effects", "nrmse_nominal": "gap before [1]",
-        "nrmse_identified": "gap after identification [1]", "nrmse": "gap with the named effects [1]",
-        "noise_nrmse": "noise [1]", "search_seconds": "time of the search [s]"})
+    quantities: Mapping[str, str] = field(
+        default_factory=lambda: {
+            "verdict": "verdict",
+            "effects": "named effects",
+            "nrmse_nominal": "gap before [1]",
+            "nrmse_identified": "gap after identification [1]",
+            "nrmse": "gap with the named effects [1]",
+            "noise_nrmse": "noise [1]",
+            "search_seconds": "time of the search [s]",
+        }
+    )
     pareto: tuple[str, str] | None = ("search_seconds", "nrmse")
 
     @classmethod
@@ -68,12 +75,12 @@ class GapBase:
 
     def job(self, point: Mapping[str, Any]) -> GapJob:
         """The campaign, the rig and the options of a point."""
-        names = {"base": self.campaign, "rig": self.rig_name} | {key: point[key] for key in ("base", "rig")
-                                                                if key in point}
+        names = {"base": self.campaign, "rig": self.rig_name} | {
+            key: point[key] for key in ("base", "rig") if key in point
+        }
         if wrong := [key for key, name in names.items() if not isinstance(name, str)]:
             raise InputError("expected the name of a file", field=wrong[0], value=names[wrong[0]])
-        given = {key: value for key, value in point.items() if key not in names and
-                 not key.startswith((VALUE, FACTOR))}
+        given = {key: value for key, value in point.items() if key not in names and not key.startswith((VALUE, FACTOR))}
         options = validated(Options, given)
         path = (self.folder / names["base"]).resolve()
         if path not in self.digests:
@@ -99,12 +106,21 @@ class GapJob:
         """Figures of the finding, and gap.json."""
         o = self.options
         band = None if o.band_Hz is None else (o.band_Hz[0], o.band_Hz[1])
-        found = find_gap(_campaign(self.campaign), self.rig,
-                         GapOptions(o.seed, band, o.gates, o.despite_gates, o.amplifier_corner_Hz))
+        found = find_gap(
+            _campaign(self.campaign),
+            self.rig,
+            GapOptions(o.seed, band, o.gates, o.despite_gates, o.amplifier_corner_Hz),
+        )
         gap, errors = found.gap, [stage.nrmse for stage in found.gap.stages]
-        figures = {"verdict": gap.verdict, "effects": "; ".join(f"{one.name} at {one.location}" for one in gap.effects),
-                   "nrmse_nominal": errors[0], "nrmse_identified": errors[1], "nrmse": errors[-1],
-                   "noise_nrmse": gap.noise_nrmse, "search_seconds": gap.seconds}
+        figures = {
+            "verdict": gap.verdict,
+            "effects": "; ".join(f"{one.name} at {one.location}" for one in gap.effects),
+            "nrmse_nominal": errors[0],
+            "nrmse_identified": errors[1],
+            "nrmse": errors[-1],
+            "noise_nrmse": gap.noise_nrmse,
+            "search_seconds": gap.seconds,
+        }
         return figures, {"gap": found.to_json()}
 
 

@@ -31,7 +31,7 @@ def keys_of(model: type[BaseModel], before: str = "") -> dict[str, bool]:
 def parts_of(key: str, known: Mapping[str, bool]) -> list[str]:
     """Split a dotted key; an arbitrary key inside a table ("isolator*.k_z") keeps its dots."""
     for table in (name for name, free in known.items() if free and key.startswith(f"{name}.")):
-        return [*table.split("."), key[len(table) + 1:]]
+        return [*table.split("."), key[len(table) + 1 :]]
     return key.split(".")
 
 
@@ -55,8 +55,10 @@ def expanded(key: str, known: Mapping[str, bool], rig: Rig) -> list[str]:
         return found
     every = [*known, *names]
     last = {name.rpartition(".")[2]: name for name in reversed(every)}
-    near = [*difflib.get_close_matches(key, every, n=3),
-            *(last[one] for one in difflib.get_close_matches(key.rpartition(".")[2], last, n=2))]
+    near = [
+        *difflib.get_close_matches(key, every, n=3),
+        *(last[one] for one in difflib.get_close_matches(key.rpartition(".")[2], last, n=2)),
+    ]
     hint = f"did you mean {' or '.join(dict.fromkeys(near))}?" if near else f"expected one of {', '.join(known)}"
     raise InputError(f"unknown key; {hint}", field="key", value=key)
 

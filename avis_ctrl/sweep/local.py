@@ -39,7 +39,7 @@ def on_this_machine(tasks: Sequence[Task], jobs: int) -> Iterator[dict[str, Any]
                 yield lost(batch[0], "its process was killed twice; likely cause: memory, or a fault in compiled code")
                 continue
             suspects += [task for task in handed_out if task.identity not in finished]
-            waiting = waiting[len(handed_out):]
+            waiting = waiting[len(handed_out) :]
 
 
 def _parallel(tasks: Sequence[Task], jobs: int, handed_out: list[Task]) -> Iterator[dict[str, Any]]:
@@ -47,9 +47,11 @@ def _parallel(tasks: Sequence[Task], jobs: int, handed_out: list[Task]) -> Itera
         for task in tasks:
             handed_out.append(task)
             yield joblib.delayed(_in_worker)(task, os.getpid())
+
     # Each process gets one task at a time, and only when it is free: the tasks in progress are known.
-    parallel = joblib.Parallel(jobs, backend="loky", return_as="generator_unordered", batch_size=1,
-                               pre_dispatch=jobs, max_nbytes=None)
+    parallel = joblib.Parallel(
+        jobs, backend="loky", return_as="generator_unordered", batch_size=1, pre_dispatch=jobs, max_nbytes=None
+    )
     yield from parallel(calls())
 
 

@@ -42,8 +42,12 @@ def write_sweep(sweep: Sweep, folder: Path) -> list[Path]:
         assert sweep.pareto is not None
         # Up to two values are readable as labels of a few points; otherwise the label is the row number.
         in_words = len(front) <= 12 and len(columns(sweep)[0]) <= 2
-        names = [", ".join(f"{key.rpartition('.')[2]} {_short(row.point[key])}" for key in row.point)
-                 if in_words else str(k + 1) for k, row in enumerate(sweep.rows)]
+        names = [
+            ", ".join(f"{key.rpartition('.')[2]} {_short(row.point[key])}" for key in row.point)
+            if in_words
+            else str(k + 1)
+            for k, row in enumerate(sweep.rows)
+        ]
         labels = [sweep.quantities.get(name, name) for name in sweep.pareto]
         contents["pareto.png"] = pareto_png(_values(sweep), labels, names, sweep.file.title)
     contents["sweep.html"] = _page(sweep, front, contents.get("pareto.png")).encode()
@@ -67,8 +71,14 @@ def _number(row: Row, name: str) -> float:
 
 def _cells(sweep: Sweep, row: Row) -> list[Any]:
     keys, figures = columns(sweep)
-    return [*(row.point.get(key) for key in keys), *(row.figures.get(name) for name in figures), row.seconds,
-            row.status, row.message, row.identity]
+    return [
+        *(row.point.get(key) for key in keys),
+        *(row.figures.get(name) for name in figures),
+        row.seconds,
+        row.status,
+        row.message,
+        row.identity,
+    ]
 
 
 def _head(sweep: Sweep) -> list[str]:
@@ -81,39 +91,76 @@ def _csv(sweep: Sweep) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(_head(sweep))
     for row in sweep.rows:
-        table.writerow(["" if cell is None else cell if isinstance(cell, str) else json.dumps(cell, default=str)
-                        for cell in _cells(sweep, row)])
+        table.writerow(
+            [
+                "" if cell is None else cell if isinstance(cell, str) else json.dumps(cell, default=str)
+                for cell in _cells(sweep, row)
+            ]
+        )
     return text.getvalue()
 
 
 def _dict(sweep: Sweep, front: list[int]) -> dict[str, Any]:
-    rows = [{"identity": row.identity or None, "parameters": row.point, "status": row.status, "message": row.message,
-             "seconds": row.seconds, "figures": row.figures} for row in sweep.rows]
+    rows = [
+        {
+            "identity": row.identity or None,
+            "parameters": row.point,
+            "status": row.status,
+            "message": row.message,
+            "seconds": row.seconds,
+            "figures": row.figures,
+        }
+        for row in sweep.rows
+    ]
     pareto = None if sweep.pareto is None else {"quantities": sweep.pareto, "front": [k + 1 for k in front]}
-    return {"format": "avis-sweep", "version": 1, "title": sweep.file.title, "kind": sweep.file.kind,
-            "quantities": sweep.quantities, "points": rows, "pareto": pareto, "computed": sweep.computed,
-            "provenance": sweep.provenance}
+    return {
+        "format": "avis-sweep",
+        "version": 1,
+        "title": sweep.file.title,
+        "kind": sweep.file.kind,
+        "quantities": sweep.quantities,
+        "points": rows,
+        "pareto": pareto,
+        "computed": sweep.computed,
+        "provenance": sweep.provenance,
+    }
 
 
 def _page(sweep: Sweep, front: list[int], png: bytes | None) -> str:
-    picture = f'<p><img alt="Pareto front" src="data:image/png;base64,{base64.b64encode(png).decode()}" ' \
-              'style="max-width:100%"></p>' if png else ""
+    picture = (
+        f'<p><img alt="Pareto front" src="data:image/png;base64,{base64.b64encode(png).decode()}" '
+        'style="max-width:100%"></p>'
+        if png
+        else ""
+    )
     keys, figures = columns(sweep)
     # A space of no width behind dots and underscores: long keys may be broken there.
-    head = ["point", *(key.replace(".", ".\u200b").replace("_", "_\u200b") for key in keys),
-            *(sweep.quantities.get(name, name) for name in figures), "time [s]", "status", "message"]
-    rows = [[f"{k + 1}{' *' if k in front else ''}", *("" if cell is None else _short(cell)
-                                                       for cell in _cells(sweep, row)[:-1])]
-            for k, row in enumerate(sweep.rows)]
+    head = [
+        "point",
+        *(key.replace(".", ".\u200b").replace("_", "_\u200b") for key in keys),
+        *(sweep.quantities.get(name, name) for name in figures),
+        "time [s]",
+        "status",
+        "message",
+    ]
+    rows = [
+        [
+            f"{k + 1}{' *' if k in front else ''}",
+            *("" if cell is None else _short(cell) for cell in _cells(sweep, row)[:-1]),
+        ]
+        for k, row in enumerate(sweep.rows)
+    ]
     told = [k for k in range(len(head)) if any(row[k] for row in rows)]
     table = html_table([[row[k] for k in told] for row in rows], [head[k] for k in told])
     said = "<p>* on the Pareto front</p>" if front else ""
-    return ('<!doctype html><html lang="en"><meta charset=utf-8>'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            "<style>body{font:14px sans-serif;margin:1.5em}table{border-collapse:collapse}"
-            "td,th{padding:2px 8px;border-bottom:1px solid #ddd;vertical-align:top}</style>"
-            f"<title>{escape(sweep.file.title)}</title><h1>{escape(sweep.file.title)}</h1>{picture}"
-            f'<div style="overflow-x:auto">{table}</div>{said}')
+    return (
+        '<!doctype html><html lang="en"><meta charset=utf-8>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        "<style>body{font:14px sans-serif;margin:1.5em}table{border-collapse:collapse}"
+        "td,th{padding:2px 8px;border-bottom:1px solid #ddd;vertical-align:top}</style>"
+        f"<title>{escape(sweep.file.title)}</title><h1>{escape(sweep.file.title)}</h1>{picture}"
+        f'<div style="overflow-x:auto">{table}</div>{said}'
+    )
 
 
 def _short(value: Any) -> str:

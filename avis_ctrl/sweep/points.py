@@ -31,8 +31,9 @@ class SweepSettings:
     deaths: int = 3
 
 
-def points_of(file: PointsFile, expand: Callable[[str], Sequence[str]], settings: SweepSettings = SweepSettings()
-              ) -> list[Point]:
+def points_of(
+    file: PointsFile, expand: Callable[[str], Sequence[str]], settings: SweepSettings = SweepSettings()
+) -> list[Point]:
     """All points, each with its values by key.
 
     Random axes are drawn together: `count` draws in total. The draws depend on seed and key only.
@@ -51,20 +52,28 @@ def points_of(file: PointsFile, expand: Callable[[str], Sequence[str]], settings
     drawn = [one for one in file.vary if one.random is not None]
     counts = {one.random.count for one in drawn if one.random is not None}
     if len(counts) > 1:
-        raise InputError("expected one count: random axes are drawn together", field="vary.random.count",
-                         value=sorted(counts))
+        raise InputError(
+            "expected one count: random axes are drawn together", field="vary.random.count", value=sorted(counts)
+        )
     sizes = [len(listed), *(len(one.values or ()) for one in grids), *counts]
     if (total := math.prod(sizes)) > settings.max_points:
-        raise InputError(f"expected at most {settings.max_points}; here are {' x '.join(map(str, sizes))}",
-                         field="points", value=total)
+        raise InputError(
+            f"expected at most {settings.max_points}; here are {' x '.join(map(str, sizes))}",
+            field="points",
+            value=total,
+        )
     keys = [key for point in file.point for key in _flat(point)]
     _require_single([*dict.fromkeys(keys), *(one.key for one in file.vary)])
     for key in (*keys, *(one.key for one in grids)):
         expand(key)
     draws = [dict(row) for row in zip(*(_column(one, key) for one in drawn for key in expand(one.key)), strict=True)]
     values = [[(one.key, value) for value in one.values or ()] for one in grids]
-    return [{**point, **dict(chosen), **draw} for point in listed for chosen in itertools.product(*values)
-            for draw in draws or [{}]]
+    return [
+        {**point, **dict(chosen), **draw}
+        for point in listed
+        for chosen in itertools.product(*values)
+        for draw in draws or [{}]
+    ]
 
 
 def _require_single(keys: Sequence[str]) -> None:

@@ -104,8 +104,11 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
     return plan
 
 
-def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks, 1),
-              progress: Progress = lambda done, total, text: None) -> Sweep:
+def run_sweep(
+    plan: Plan,
+    backend: Backend = lambda tasks: on_this_machine(tasks, 1),
+    progress: Progress = lambda done, total, text: None,
+) -> Sweep:
     """Compute the unfinished points, each into its file, and collect all points.
 
     The folder of the points must exist. If the process is killed at any time, the same call continues with the
@@ -123,8 +126,12 @@ def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks
             known[identity] = kept
     waiting = [task for identity, task in tasks.items() if identity not in known]
     if wrong := plan.wrong:  # before minutes of computation
-        progress(len(known), len(tasks), f"{len(wrong)} of {len(plan.points)} points have values that do not fit and "
-                                         f"are not computed; the first: {wrong[0]}")
+        progress(
+            len(known),
+            len(tasks),
+            f"{len(wrong)} of {len(plan.points)} points have values that do not fit and "
+            f"are not computed; the first: {wrong[0]}",
+        )
     progress(len(known), len(tasks), f"{len(known)} were finished before" if known else "")
     for content in backend(waiting) if waiting else ():
         if content["status"] in LASTING:
@@ -133,10 +140,23 @@ def run_sweep(plan: Plan, backend: Backend = lambda tasks: on_this_machine(tasks
         progress(len(known), len(tasks), content["message"])
     rows = tuple(_row(plan, k, known) for k in range(len(plan.points)))
     pareto = plan.file.pareto
-    about = provenance(None, "".join(tasks), None, time.monotonic() - began, ("numpy", "scipy", "numba", "joblib"),
-                       points_file=plan.path.name, points_sha256=plan.sha256)
-    return Sweep(plan.file, rows, plan.base.quantities, (pareto[0], pareto[1]) if pareto else plan.base.pareto,
-                 len(waiting), about)
+    about = provenance(
+        None,
+        "".join(tasks),
+        None,
+        time.monotonic() - began,
+        ("numpy", "scipy", "numba", "joblib"),
+        points_file=plan.path.name,
+        points_sha256=plan.sha256,
+    )
+    return Sweep(
+        plan.file,
+        rows,
+        plan.base.quantities,
+        (pareto[0], pareto[1]) if pareto else plan.base.pareto,
+        len(waiting),
+        about,
+    )
 
 
 def _row(plan: Plan, k: int, known: Mapping[str, dict[str, Any]]) -> Row:

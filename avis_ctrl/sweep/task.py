@@ -86,10 +86,20 @@ def lost(task: Task, message: str) -> dict[str, Any]:
 
 
 def _content(task: Task, status: str, message: str, seconds: float | None, figures: dict[str, Any]) -> dict[str, Any]:
-    return {"format": FORMAT, "version": 1, "identity": task.identity, "status": status, "message": message,
-            "seconds": seconds, "figures": figures,
-            "computed": {"avis_ctrl": avis_ctrl.__version__, "host": platform.node(),
-                         "date": datetime.now(UTC).isoformat(timespec="seconds")}}
+    return {
+        "format": FORMAT,
+        "version": 1,
+        "identity": task.identity,
+        "status": status,
+        "message": message,
+        "seconds": seconds,
+        "figures": figures,
+        "computed": {
+            "avis_ctrl": avis_ctrl.__version__,
+            "host": platform.node(),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        },
+    }
 
 
 def point_path(folder: Path, identity: str) -> Path:
@@ -103,8 +113,13 @@ def read_point(folder: Path, identity: str) -> dict[str, Any] | None:
         content = json.loads(point_path(folder, identity).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    whole = (isinstance(content, dict) and content.get("format") == FORMAT and content.get("identity") == identity
-             and content.get("status") in LASTING and isinstance(content.get("figures"), dict))
+    whole = (
+        isinstance(content, dict)
+        and content.get("format") == FORMAT
+        and content.get("identity") == identity
+        and content.get("status") in LASTING
+        and isinstance(content.get("figures"), dict)
+    )
     return content if whole else None
 
 

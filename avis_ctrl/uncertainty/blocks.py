@@ -171,8 +171,9 @@ class BlockStructure:
     def simplified(self) -> BlockStructure:
         """Complexified, with every repeated scalar replaced by a full block: a superset of perturbations, with one real
         number per block as scaling."""
-        return BlockStructure(tuple(ComplexFull(b.rows, b.cols, b.name) if b.repeated else b
-                                    for b in self.complexified().blocks))
+        return BlockStructure(
+            tuple(ComplexFull(b.rows, b.cols, b.name) if b.repeated else b for b in self.complexified().blocks)
+        )
 
     def assemble(self, values: Sequence[complex | np.ndarray]) -> np.ndarray:
         """Delta (n_w, n_z) from one value per block: a number for scalars, an array for full blocks."""
@@ -183,15 +184,18 @@ class BlockStructure:
 
     def values(self, delta: np.ndarray) -> list[complex | np.ndarray]:
         """Inverse of `assemble`."""
-        return [delta[w, z] if not block.is_scalar_delta else complex(delta[w.start, z.start])
-                for block, w, z in self.slices()]
+        return [
+            delta[w, z] if not block.is_scalar_delta else complex(delta[w.start, z.start])
+            for block, w, z in self.slices()
+        ]
 
     def contains(self, delta: np.ndarray, tolerance: float = 1e-9) -> bool:
         """Whether a matrix has this structure (zero outside the blocks, repeated, real where required)."""
         if delta.shape != (self.n_w, self.n_z):
             return False
-        rebuilt = self.assemble([np.real(v) if b.kind == "real" else v
-                                 for v, b in zip(self.values(delta), self.blocks, strict=True)])
+        rebuilt = self.assemble(
+            [np.real(v) if b.kind == "real" else v for v, b in zip(self.values(delta), self.blocks, strict=True)]
+        )
         error = np.max(np.abs(rebuilt - delta), initial=0.0)
         return bool(error <= tolerance * max(1.0, np.max(np.abs(delta), initial=0.0)))
 

@@ -47,8 +47,9 @@ class RealParameter(Element):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (np.all(np.isfinite([self.low, self.nominal, self.high])) and self.low < self.nominal < self.high):
-            raise InputError(f"expected low < nominal < high, got {self.low:g}, {self.nominal:g}, {self.high:g}",
-                             field=self.name)
+            raise InputError(
+                f"expected low < nominal < high, got {self.low:g}, {self.nominal:g}, {self.high:g}", field=self.name
+            )
 
     def block(self, copies: int) -> Block:
         return RealScalar(copies, self.name)
@@ -98,8 +99,9 @@ class ComplexDisk(Element):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (np.isfinite(self.centre) and np.isfinite(self.radius) and self.radius > 0):
-            raise InputError("expected a finite real centre and a positive radius", field=self.name,
-                             value=(self.centre, self.radius))
+            raise InputError(
+                "expected a finite real centre and a positive radius", field=self.name, value=(self.centre, self.radius)
+            )
 
     def lft(self) -> np.ndarray:
         """(2, 2): value = F_u of this matrix and delta."""
@@ -118,15 +120,20 @@ class Dynamics(Element):
         super().__post_init__()
         for field in ("rows", "cols"):
             if not isinstance(getattr(self, field), int) or getattr(self, field) < 1:
-                raise InputError("expected whole numbers of at least 1", field=f"{self.name}: shape",
-                                 value=(self.rows, self.cols))
+                raise InputError(
+                    "expected whole numbers of at least 1", field=f"{self.name}: shape", value=(self.rows, self.cols)
+                )
 
     def block(self, copies: int) -> Block:
         if self.scalar:
             return ComplexScalar(copies, self.name)
         if copies > 1:
-            raise InputError("dynamics with several inputs or outputs may appear once only: a repeated full block has "
-                             "no bound of mu", field=self.name, value=f"{copies} copies")
+            raise InputError(
+                "dynamics with several inputs or outputs may appear once only: a repeated full block has "
+                "no bound of mu",
+                field=self.name,
+                value=f"{copies} copies",
+            )
         return ComplexFull(self.rows, self.cols, self.name)
 
     def __str__(self) -> str:

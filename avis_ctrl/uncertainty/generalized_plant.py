@@ -82,7 +82,7 @@ class GeneralizedPlant:
 
     def closed(self, K: StateSpace | None) -> StateSpace:
         """N = F_l(P, K); without a controller, P with u = 0."""
-        outputs, inputs = self.P.outputs[:self.P.noutputs - self.nmeas], self.P.inputs[:self.P.ninputs - self.ncon]
+        outputs, inputs = self.P.outputs[: self.P.noutputs - self.nmeas], self.P.inputs[: self.P.ninputs - self.ncon]
         if K is None:
             return self.P.select(list(outputs), list(inputs))
         return lft_lower(self.P, K)
@@ -91,8 +91,8 @@ class GeneralizedPlant:
         """The same connection with fewer performance signals; parts that no output depends on are omitted."""
         if unknown := [name for name in (*w, *z) if name not in (*self.w, *self.z)]:
             raise InputError(f"the performance signals are {[*self.w, *self.z]}", field="w, z", value=unknown)
-        w_delta = self.P.inputs[:self.blocks.n_w]
-        z_delta = self.P.outputs[:self.blocks.n_z]
+        w_delta = self.P.inputs[: self.blocks.n_w]
+        z_delta = self.P.outputs[: self.blocks.n_z]
         parts = _contributing(self.parts, [*z_delta, *z, *self.y])
         inputs, outputs = [*w_delta, *w, *self.u], [*z_delta, *z, *self.y]
         # An omitted input is zero.
@@ -100,8 +100,17 @@ class GeneralizedPlant:
         systems = {p.name: p.system.select(None, [n for n in p.system.inputs if n not in absent]) for p in parts}
         kept = {name for part in parts for name in (*part.system.inputs, *part.system.outputs)}
         signals = tuple(s for s in self.signals if s.name in kept and s.name not in absent)
-        return GeneralizedPlant(connect(systems, inputs, outputs), self.blocks, tuple(w), tuple(z), self.u, self.y,
-                                signals, parts, self.units)
+        return GeneralizedPlant(
+            connect(systems, inputs, outputs),
+            self.blocks,
+            tuple(w),
+            tuple(z),
+            self.u,
+            self.y,
+            signals,
+            parts,
+            self.units,
+        )
 
     def nominal(self) -> GeneralizedPlant:
         """The plant with Delta = 0, without w_delta and z_delta."""
@@ -111,10 +120,21 @@ class GeneralizedPlant:
     def as_dict(self) -> dict[str, Any]:
         """JSON form of the format avis-plant (docs/contracts/design.md)."""
         P = self.P
-        return {"format": "avis-plant", "version": 1, "A": P.A.tolist(), "B": P.B.tolist(), "C": P.C.tolist(),
-                "D": P.D.tolist(), "dt": P.dt, "inputs": list(P.inputs), "outputs": list(P.outputs),
-                "nmeas": self.nmeas, "ncon": self.ncon, "blocks": [b.as_dict() for b in self.blocks.blocks],
-                "performance": {"rows": len(self.w), "cols": len(self.z)}}
+        return {
+            "format": "avis-plant",
+            "version": 1,
+            "A": P.A.tolist(),
+            "B": P.B.tolist(),
+            "C": P.C.tolist(),
+            "D": P.D.tolist(),
+            "dt": P.dt,
+            "inputs": list(P.inputs),
+            "outputs": list(P.outputs),
+            "nmeas": self.nmeas,
+            "ncon": self.ncon,
+            "blocks": [b.as_dict() for b in self.blocks.blocks],
+            "performance": {"rows": len(self.w), "cols": len(self.z)},
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +182,11 @@ class Diagram:
     def uncertain(self, block: Block, w: Sequence[str], z: Sequence[str]) -> None:
         """Declare that `block` maps the signals z to the signals w."""
         if (len(w), len(z)) != (block.rows, block.cols):
-            raise InputError(f"block of {block.rows} x {block.cols} given {len(w)} w and {len(z)} z signals",
-                             field="uncertainty", value=block.name)
+            raise InputError(
+                f"block of {block.rows} x {block.cols} given {len(w)} w and {len(z)} z signals",
+                field="uncertainty",
+                value=block.name,
+            )
         self._blocks.append((block, list(w), list(z)))
 
     def means(self, signal: str, meaning: str, unit: str) -> None:
@@ -184,15 +207,40 @@ class Diagram:
         source = signal_sources(parts, inputs)
         readers = {name: [p.name for p in self._parts if name in p.system.inputs] for name in source}
         if unread := [name for name in source if not readers[name] and name not in outputs]:
-            raise InputError(f"it is driven by {source[unread[0]]} but read by nothing, and is no output",
-                             field="signal", value=unread[0])
-        roles = {**dict.fromkeys(w_delta, "w_delta"), **dict.fromkeys(z_delta, "z_delta"), **dict.fromkeys(w, "w"),
-                 **dict.fromkeys(z, "z"), **dict.fromkeys(u, "u"), **dict.fromkeys(y, "y")}
-        table = tuple(Signal(name, *self._meaning.get(name, ("", "")), source[name], tuple(readers[name]),
-                             roles.get(name, "internal")) for name in source)
-        return GeneralizedPlant(connect(parts, inputs, outputs), BlockStructure(tuple(b for b, _, _ in self._blocks)),
-                                tuple(w), tuple(z), tuple(u), tuple(y), table, tuple(self._parts),
-                                {name: unit for name, (_, unit) in self._meaning.items()})
+            raise InputError(
+                f"it is driven by {source[unread[0]]} but read by nothing, and is no output",
+                field="signal",
+                value=unread[0],
+            )
+        roles = {
+            **dict.fromkeys(w_delta, "w_delta"),
+            **dict.fromkeys(z_delta, "z_delta"),
+            **dict.fromkeys(w, "w"),
+            **dict.fromkeys(z, "z"),
+            **dict.fromkeys(u, "u"),
+            **dict.fromkeys(y, "y"),
+        }
+        table = tuple(
+            Signal(
+                name,
+                *self._meaning.get(name, ("", "")),
+                source[name],
+                tuple(readers[name]),
+                roles.get(name, "internal"),
+            )
+            for name in source
+        )
+        return GeneralizedPlant(
+            connect(parts, inputs, outputs),
+            BlockStructure(tuple(b for b, _, _ in self._blocks)),
+            tuple(w),
+            tuple(z),
+            tuple(u),
+            tuple(y),
+            table,
+            tuple(self._parts),
+            {name: unit for name, (_, unit) in self._meaning.items()},
+        )
 
 
 def sample_lft(system: StateSpace, blocks: BlockStructure, delta: np.ndarray) -> StateSpace:

@@ -91,24 +91,32 @@ class IdentifiedSpread(Weight):
     @property
     def meaning(self) -> str:
         low, high = (self.omega[k] / (2 * np.pi) for k in (0, -1))
-        text = (f"measured relative uncertainty of the response: {100 * np.min(self.data):.2g} to "
-                f"{100 * np.max(self.data):.2g} % from {low:.3g} to {high:.3g} Hz; the filter of order "
-                f"{self.shape.order} lies at most {self.slack_dB:.2f} dB above an envelope with slopes of at most "
-                f"{20 * self.slope:g} dB per decade, constant outside the band")
-        return text if self.declared is None else f"{text}; or the uncertainty stated for the drives, where it is " \
-                                                  f"larger: {self.declared.meaning}"
+        text = (
+            f"measured relative uncertainty of the response: {100 * np.min(self.data):.2g} to "
+            f"{100 * np.max(self.data):.2g} % from {low:.3g} to {high:.3g} Hz; the filter of order "
+            f"{self.shape.order} lies at most {self.slack_dB:.2f} dB above an envelope with slopes of at most "
+            f"{20 * self.slope:g} dB per decade, constant outside the band"
+        )
+        return (
+            text
+            if self.declared is None
+            else f"{text}; or the uncertainty stated for the drives, where it is larger: {self.declared.meaning}"
+        )
 
 
-def covering_spread(omega: np.ndarray, data: np.ndarray, declared: NeglectedDynamics | None = None,
-                    factor: float = 1.0) -> IdentifiedSpread:
+def covering_spread(
+    omega: np.ndarray, data: np.ndarray, declared: NeglectedDynamics | None = None, factor: float = 1.0
+) -> IdentifiedSpread:
     """Filter above an envelope with slopes of 40 dB per decade if order 6 suffices, otherwise of 20 dB per decade.
 
     Raises
     ------
     InputError : as `IdentifiedSpread`. ComputationError : order 12 does not suffice for the flatter envelope.
     """
-    steep, flat = (IdentifiedSpread(omega, data, declared, factor, slope, max_order=order)
-                   for slope, order in zip(SLOPES, ORDERS, strict=True))
+    steep, flat = (
+        IdentifiedSpread(omega, data, declared, factor, slope, max_order=order)
+        for slope, order in zip(SLOPES, ORDERS, strict=True)
+    )
     try:
         _ = steep.shape
     except ComputationError:

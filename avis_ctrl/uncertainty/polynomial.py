@@ -21,8 +21,9 @@ MatrixFunction = Callable[[np.ndarray], np.ndarray]
 ROUND_OFF = 1e3 * np.finfo(float).eps
 
 
-def polynomial_coefficients(function: MatrixFunction, n: int, tolerance: float = 1e-11,
-                            seed: int = 0, cubic: bool = False) -> dict[Exponents, np.ndarray]:
+def polynomial_coefficients(
+    function: MatrixFunction, n: int, tolerance: float = 1e-11, seed: int = 0, cubic: bool = False
+) -> dict[Exponents, np.ndarray]:
     """Coefficients N_a of function(delta) = sum_a delta^a N_a, delta in [-1, 1]^n.
 
     The degree is at most 2 in one parameter (3 if `cubic`, for a parameter that moves a mass and its position) and at
@@ -65,11 +66,15 @@ def _monomials(function: MatrixFunction, n: int, base: np.ndarray, highest: int)
         delta = origin.copy()
         delta[list(which)] -= 1.0
         return function(delta)
+
     reference = moved()
     single = [moved(i) - reference for i in range(n)]
     scale = np.max(np.abs(single), axis=0, initial=0.0) + np.abs(base)
-    interacting = {(i, j) for i, j in combinations(range(n), 2)
-                   if np.any(np.abs(moved(i, j) - reference - single[i] - single[j]) > 1e-12 * scale)}
+    interacting = {
+        (i, j)
+        for i, j in combinations(range(n), 2)
+        if np.any(np.abs(moved(i, j) - reference - single[i] - single[j]) > 1e-12 * scale)
+    }
     exponents = []
     for i in range(n):
         exponents += [_exponent(n, {i: power}) for power in range(1, highest + 1)]
@@ -90,13 +95,16 @@ def evaluate(coefficients: dict[Exponents, np.ndarray], delta: np.ndarray) -> np
     return np.sum([np.prod(np.asarray(delta) ** np.array(a)) * N for a, N in coefficients.items()], axis=0)
 
 
-def _check(function: MatrixFunction, found: dict[Exponents, np.ndarray], samples: np.ndarray,
-           size: np.ndarray) -> None:
+def _check(function: MatrixFunction, found: dict[Exponents, np.ndarray], samples: np.ndarray, size: np.ndarray) -> None:
     for delta in samples:
-        error = np.max(np.abs(function(delta) - evaluate(found, delta)) / (np.abs(found[(0,) * len(delta)]) + size
-                                                                           + np.finfo(float).tiny))
+        error = np.max(
+            np.abs(function(delta) - evaluate(found, delta))
+            / (np.abs(found[(0,) * len(delta)]) + size + np.finfo(float).tiny)
+        )
         if error > 1e-10:
-            raise ComputationError("the rig's matrices are not polynomials of degree 3 in these parameters",
-                                   measured=f"relative error {error:.1e} at a random sample",
-                                   cause="a parameter that enters through a division or a trigonometric function",
-                                   next_step="choose parameters such as mass, inertia, stiffness, damping or position")
+            raise ComputationError(
+                "the rig's matrices are not polynomials of degree 3 in these parameters",
+                measured=f"relative error {error:.1e} at a random sample",
+                cause="a parameter that enters through a division or a trigonometric function",
+                next_step="choose parameters such as mass, inertia, stiffness, damping or position",
+            )

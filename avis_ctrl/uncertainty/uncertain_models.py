@@ -22,9 +22,14 @@ from avis_ctrl.uncertainty.uncertain_system import (
 )
 
 
-def real(name: str, nominal: float, *, percent: float | tuple[float, float] | None = None,
-         plus_minus: float | tuple[float, float] | None = None, range: tuple[float, float] | None = None
-         ) -> UncertainSystem:
+def real(
+    name: str,
+    nominal: float,
+    *,
+    percent: float | tuple[float, float] | None = None,
+    plus_minus: float | tuple[float, float] | None = None,
+    range: tuple[float, float] | None = None,
+) -> UncertainSystem:
     """An uncertain real number, given by exactly one of percent, plus_minus and range.
 
     percent, plus_minus : half the range, relative or absolute; a pair is (below, above). range : (low, high).
@@ -118,8 +123,9 @@ def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
     return reduced(vstacked(stacked))
 
 
-def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequence[str] = (),
-       outputs: Sequence[str] = ()) -> Any:
+def ss(
+    A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
+) -> Any:
     """A system x' = A x + B u, y = C x + D u whose matrices may have uncertain entries; D zero by default.
 
     Each matrix is an array, nested lists with uncertain numbers, or a result of `matrix`. Returns a StateSpace if
@@ -147,9 +153,17 @@ def ss(A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequen
         raise InputError(f"shapes do not fit: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}")
     M = reduced(vstacked([hstacked([a, b]), hstacked([c, d])]))
     inner = np.block([[M.d[:n, :n], M.c[:n]], [M.b[:, :n], M.a]])
-    system = UncertainSystem(inner, np.vstack([M.d[:n, n:], M.b[:, n:]]), np.hstack([M.d[n:, :n], M.c[n:]]),
-                             M.d[n:, n:], (STATES, *M.elements), (n, *M.copies), float(dt), tuple(inputs),
-                             tuple(outputs))
+    system = UncertainSystem(
+        inner,
+        np.vstack([M.d[:n, n:], M.b[:, n:]]),
+        np.hstack([M.d[n:, :n], M.c[n:]]),
+        M.d[n:, n:],
+        (STATES, *M.elements),
+        (n, *M.copies),
+        float(dt),
+        tuple(inputs),
+        tuple(outputs),
+    )
     return system if system.uncertain else system._certain()
 
 
@@ -191,8 +205,12 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
         return connect_systems(whole, inputs, outputs)
     P = connect_systems(whole, [*w, *inputs], [*z, *outputs])
     n, nw, nz = P.nstates, len(w), len(z)
-    parts_ = (np.block([[P.A, P.B[:, :nw]], [P.C[:nz], P.D[:nz, :nw]]]), np.vstack([P.B[:, nw:], P.D[:nz, nw:]]),
-              np.hstack([P.C[nz:], P.D[nz:, :nw]]), P.D[nz:, nw:])
+    parts_ = (
+        np.block([[P.A, P.B[:, :nw]], [P.C[:nz], P.D[:nz, :nw]]]),
+        np.vstack([P.B[:, nw:], P.D[:nz, nw:]]),
+        np.hstack([P.C[nz:], P.D[nz:, :nw]]),
+        P.D[nz:, nw:],
+    )
     kinds = [(STATES, n), *elements] if n else elements
     return reduced(ordered(parts_, kinds, P.dt, tuple(inputs), tuple(outputs)))
 
@@ -209,6 +227,9 @@ def _matrix(given: Any) -> UncertainSystem:
     else:
         made = matrix([[given]]) if np.isscalar(given) else matrix(given)
     if made is None or made.nstates:
-        raise InputError("expected a matrix: numbers or uncertain numbers in rows", field="matrix",
-                         value=np.shape(given) if isinstance(given, np.ndarray) else "a system with states")
+        raise InputError(
+            "expected a matrix: numbers or uncertain numbers in rows",
+            field="matrix",
+            value=np.shape(given) if isinstance(given, np.ndarray) else "a system with states",
+        )
     return made

@@ -35,10 +35,13 @@ class Rig(Protocol):
     @property
     def edge_m(self) -> float:
         """As in `Rig`."""
+
     def parameters(self) -> dict[str, Any]:
         """As in `Rig`."""
+
     def with_parameters(self, values: dict[str, float]) -> Any:
         """As in `Rig`."""
+
     def equations_of_motion(self) -> Any:
         """As in `Rig`."""
 
@@ -55,14 +58,20 @@ class UncertainParameter:
         if not (np.isfinite(self.spread) and self.spread > 0):
             raise InputError("an uncertainty must be a positive number", field=f"{self.name} spread", value=self.spread)
         if not self.absolute and self.spread >= 1:
-            raise InputError("a relative uncertainty must stay below 1 (100 %), or the parameter changes sign",
-                             field=f"{self.name} spread", value=self.spread)
+            raise InputError(
+                "a relative uncertainty must stay below 1 (100 %), or the parameter changes sign",
+                field=f"{self.name} spread",
+                value=self.spread,
+            )
 
     def half_range(self, nominal: float) -> float:
         """Half width of the interval in the parameter's unit."""
         if not self.absolute and nominal == 0.0:
-            raise InputError(f"the nominal value of {self.name} is zero: give its uncertainty in absolute terms",
-                             field=self.name, value=nominal)
+            raise InputError(
+                f"the nominal value of {self.name} is zero: give its uncertainty in absolute terms",
+                field=self.name,
+                value=nominal,
+            )
         return self.spread if self.absolute else self.spread * abs(nominal)
 
     def half_ranges(self, nominal: Mapping[str, float]) -> dict[str, float]:
@@ -95,10 +104,14 @@ class UncertainDirection:
     changes: tuple[tuple[str, float], ...]
 
     def __post_init__(self) -> None:
-        if not self.changes or not all(np.isfinite(change) for _, change in self.changes) \
-                or not any(change for _, change in self.changes):
-            raise InputError("expected finite changes, not all zero", field=f"direction {self.name}",
-                             value=self.changes)
+        if (
+            not self.changes
+            or not all(np.isfinite(change) for _, change in self.changes)
+            or not any(change for _, change in self.changes)
+        ):
+            raise InputError(
+                "expected finite changes, not all zero", field=f"direction {self.name}", value=self.changes
+            )
         if len({name for name, _ in self.changes}) != len(self.changes):
             raise InputError("expected each parameter once", field=f"direction {self.name}", value=self.changes)
 
@@ -110,8 +123,12 @@ class UncertainDirection:
         """Such as "identified direction 1 at +0.8: isolator1.k_z +0.3 %, and 5 parameters by less"."""
         sizes = {name: change / abs(nominal[name]) if nominal[name] else np.inf for name, change in self.changes}
         most = sorted(self.changes, key=lambda one: -abs(sizes[one[0]]))
-        words = [f"{name} {100 * delta * sizes[name]:+.2g} %" if nominal[name] else
-                f"{name} {delta * change:+.2g} {units[name]}" for name, change in most[:WORDS]]
+        words = [
+            f"{name} {100 * delta * sizes[name]:+.2g} %"
+            if nominal[name]
+            else f"{name} {delta * change:+.2g} {units[name]}"
+            for name, change in most[:WORDS]
+        ]
         if len(most) > WORDS:
             words.append(f"and {len(most) - WORDS} parameters by less")
         return f"{self.name} at {delta:+.2g}: {', '.join(words)}"
@@ -175,8 +192,9 @@ class UncertainRig:
         return _moved(self.parameters, deltas, self.nominal)
 
 
-def _moved(parameters: Sequence[Uncertain], deltas: Sequence[float] | np.ndarray, nominal: Mapping[str, float]
-           ) -> dict[str, float]:
+def _moved(
+    parameters: Sequence[Uncertain], deltas: Sequence[float] | np.ndarray, nominal: Mapping[str, float]
+) -> dict[str, float]:
     found: dict[str, float] = {}
     for parameter, delta in zip(parameters, deltas, strict=True):
         for name, half in parameter.half_ranges(nominal).items():
@@ -206,17 +224,21 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
     moved = list(dict.fromkeys(name for p in parameters for name in _names(p)))
     for name in moved:
         if name not in known:
-            raise InputError(f"the rig has no such parameter; it has {sorted(known)}", field="uncertain parameter",
-                             value=name)
+            raise InputError(
+                f"the rig has no such parameter; it has {sorted(known)}", field="uncertain parameter", value=name
+            )
     if len({p.name for p in parameters}) != len(parameters):
-        raise InputError("a parameter is listed twice", field="uncertain parameters",
-                         value=[p.name for p in parameters])
+        raise InputError(
+            "a parameter is listed twice", field="uncertain parameters", value=[p.name for p in parameters]
+        )
     equations = rig.equations_of_motion()
     if unknown := [name for name in keep if name not in equations.coordinates]:
         raise InputError(f"expected some of {list(equations.coordinates)}", field="keep", value=unknown)
     if not (np.allclose(equations.K, equations.K_floor) and np.allclose(equations.C, equations.C_floor)):
-        raise InputError("expected chassis points equal to payload points, so that relative motion is q - q_floor",
-                         field="chassis points")
+        raise InputError(
+            "expected chassis points equal to payload points, so that relative motion is q - q_floor",
+            field="chassis points",
+        )
     kept = [equations.coordinates.index(name) for name in keep]
     nominal = {name: float(known[name].value) for name in moved}
     for parameter in parameters:
@@ -224,8 +246,11 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
     scale = np.array([1.0 / rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
     stretch = _stretches(parameters, nominal)
 
-    rows = {k: (list(keep).index(p.coordinate), p.change) for k, p in enumerate(parameters)
-            if isinstance(p, UncertainEquation)}
+    rows = {
+        k: (list(keep).index(p.coordinate), p.change)
+        for k, p in enumerate(parameters)
+        if isinstance(p, UncertainEquation)
+    }
 
     def N(delta: np.ndarray) -> np.ndarray:
         values = _moved(parameters, delta * stretch, nominal)
@@ -234,9 +259,12 @@ def uncertain_rig(rig: Rig, parameters: Sequence[Uncertain], keep: Sequence[str]
             found[row] += delta[k] * change
         return found
 
-    coefficients = {exponents: matrix / np.prod(stretch ** np.array(exponents, float))
-                    for exponents, matrix in polynomial_coefficients(N, len(parameters), cubic=any(
-                        isinstance(p, UncertainDirection) for p in parameters)).items()}
+    coefficients = {
+        exponents: matrix / np.prod(stretch ** np.array(exponents, float))
+        for exponents, matrix in polynomial_coefficients(
+            N, len(parameters), cubic=any(isinstance(p, UncertainDirection) for p in parameters)
+        ).items()
+    }
     names = tuple(edge_name(name) for name in keep)
     lft = _pull_out(coefficients, len(parameters))
     system = _realise(lft, names, equations.actuators, [p.name for p in parameters])
@@ -299,8 +327,11 @@ def _pull_out(coefficients: dict[Exponents, np.ndarray], n_parameters: int) -> _
         if powers:
             chains.append((powers, *_factor(matrix)))
     # Links of the same parameter are adjacent, so that its delta is one repeated scalar.
-    links = sorted((parameter, chain, position) for chain, (powers, _, _) in enumerate(chains)
-                   for position, parameter in enumerate(powers))
+    links = sorted(
+        (parameter, chain, position)
+        for chain, (powers, _, _) in enumerate(chains)
+        for position, parameter in enumerate(powers)
+    )
     widths = [chains[chain][1].shape[1] for _, chain, _ in links]
     ends = np.cumsum([0, *widths])
     place = {(chain, position): slice(ends[k], ends[k + 1]) for k, (_, chain, position) in enumerate(links)}
@@ -311,15 +342,17 @@ def _pull_out(coefficients: dict[Exponents, np.ndarray], n_parameters: int) -> _
         for position in range(1, len(powers)):
             W[place[chain, position], place[chain, position - 1]] = np.eye(left.shape[1])
         L[:, place[chain, len(powers) - 1]] += left
-    copies = [sum(width for width, link in zip(widths, links, strict=True) if link[0] == k)
-              for k in range(n_parameters)]
+    copies = [
+        sum(width for width, link in zip(widths, links, strict=True) if link[0] == k) for k in range(n_parameters)
+    ]
     M, copies = reduce_copies(np.block([[W, R], [L, N0]]), copies)
     total = sum(copies)
     return _StaticLft(M[total:, total:], M[total:, :total], M[:total, total:], M[:total, :total], copies)
 
 
-def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[str],
-             parameters: list[str]) -> StateSpace:
+def _realise(
+    lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[str], parameters: list[str]
+) -> StateSpace:
     """State space of the LFT with x = (r, v) and inputs e = (w_delta, u, v_f, f)."""
     n, m, total = len(coordinates), len(actuators), sum(lft.copies)
     M, N_rest = lft.N0[:, :n], lft.N0[:, n:]
@@ -327,27 +360,38 @@ def _realise(lft: _StaticLft, coordinates: tuple[str, ...], actuators: Sequence[
     w, u, v_f, f = np.split(np.arange(n_e), [total, total + m, total + m + n])
     # s = S_x x + S_e e; its first rows solve for v'.
     S_x, S_e = np.zeros((3 * n + m, 2 * n)), np.zeros((3 * n + m, n_e))
-    S_x[n:2 * n, n:], S_x[2 * n:3 * n, :n] = np.eye(n), np.eye(n)
-    S_e[n:2 * n, v_f], S_e[3 * n:, u] = -np.eye(n), np.eye(m)
+    S_x[n : 2 * n, n:], S_x[2 * n : 3 * n, :n] = np.eye(n), np.eye(n)
+    S_e[n : 2 * n, v_f], S_e[3 * n :, u] = -np.eye(n), np.eye(m)
     S_x[:n] = -Mi @ N_rest @ S_x[n:]
     S_e[:n] = -Mi @ N_rest @ S_e[n:]
     S_e[:n, w] -= Mi @ lft.L
     S_e[:n, f] += Mi
     # v = (v - v_f) + v_f
-    velocity_x, velocity_e = S_x[n:2 * n], S_e[n:2 * n].copy()
+    velocity_x, velocity_e = S_x[n : 2 * n], S_e[n : 2 * n].copy()
     velocity_e[:, v_f] += np.eye(n)
     z_e = lft.R @ S_e
     z_e[:, w] += lft.W
-    A, B = np.vstack([S_x[n:2 * n], S_x[:n]]), np.vstack([S_e[n:2 * n], S_e[:n]])
-    C = np.vstack([lft.R @ S_x, S_x[2 * n:3 * n], velocity_x, S_x[:n]])
-    D = np.vstack([z_e, S_e[2 * n:3 * n], velocity_e, S_e[:n]])
+    A, B = np.vstack([S_x[n : 2 * n], S_x[:n]]), np.vstack([S_e[n : 2 * n], S_e[:n]])
+    C = np.vstack([lft.R @ S_x, S_x[2 * n : 3 * n], velocity_x, S_x[:n]])
+    D = np.vstack([z_e, S_e[2 * n : 3 * n], velocity_e, S_e[:n]])
 
     # python-control forbids dots in signal names.
-    tags = [name.replace(".", "_") + (f"[{c}]" if copies > 1 else "")
-            for name, copies in zip(parameters, lft.copies, strict=True) for c in range(copies)]
-    inputs = [*(f"w:{tag}" for tag in tags), *actuators, *(f"floor_{name}_dot" for name in coordinates),
-              *(f"force_{name}" for name in coordinates)]
-    outputs = [*(f"z:{tag}" for tag in tags), *(f"{name}_rel" for name in coordinates),
-               *(f"{name}_dot" for name in coordinates), *(f"{name}_ddot" for name in coordinates)]
+    tags = [
+        name.replace(".", "_") + (f"[{c}]" if copies > 1 else "")
+        for name, copies in zip(parameters, lft.copies, strict=True)
+        for c in range(copies)
+    ]
+    inputs = [
+        *(f"w:{tag}" for tag in tags),
+        *actuators,
+        *(f"floor_{name}_dot" for name in coordinates),
+        *(f"force_{name}" for name in coordinates),
+    ]
+    outputs = [
+        *(f"z:{tag}" for tag in tags),
+        *(f"{name}_rel" for name in coordinates),
+        *(f"{name}_dot" for name in coordinates),
+        *(f"{name}_ddot" for name in coordinates),
+    ]
     states = [*(f"{name}_rel" for name in coordinates), *(f"{name}_dot" for name in coordinates)]
     return StateSpace(A, B, C, D, 0.0, tuple(inputs), tuple(outputs), tuple(states))

@@ -119,10 +119,15 @@ class UncertainSystem:
             if one != STATES:
                 for names, letter, count in ((w, "w", copies * one.rows), (z, "z", copies * one.cols)):
                     names += [f"{letter}:{one.name}" + (f"[{k}]" if count > 1 else "") for k in range(count)]
-        P = StateSpace(self.a[:n, :n], np.hstack([self.a[:n, n:], self.b[:n]]),
-                       np.vstack([self.a[n:, :n], self.c[:, :n]]),
-                       np.block([[self.a[n:, n:], self.b[n:]], [self.c[:, n:], self.d]]), self.dt,
-                       (*w, *self.inputs), (*z, *self.outputs))
+        P = StateSpace(
+            self.a[:n, :n],
+            np.hstack([self.a[:n, n:], self.b[:n]]),
+            np.vstack([self.a[n:, :n], self.c[:, :n]]),
+            np.block([[self.a[n:, n:], self.b[n:]], [self.c[:, n:], self.d]]),
+            self.dt,
+            (*w, *self.inputs),
+            (*z, *self.outputs),
+        )
         return P, len(w), len(z)
 
     # -- members of the set ------------------------------------------------------------------
@@ -146,8 +151,11 @@ class UncertainSystem:
         deltas: dict[str, Any] = {}
         for name, value in given.items():
             if name not in known:
-                raise InputError(f"expected some of {', '.join(known) or 'none: nothing is uncertain'}",
-                                 field="substitute", value=name)
+                raise InputError(
+                    f"expected some of {', '.join(known) or 'none: nothing is uncertain'}",
+                    field="substitute",
+                    value=name,
+                )
             one = known[name]
             if isinstance(one, RealParameter):
                 try:
@@ -176,8 +184,9 @@ class UncertainSystem:
                     one_set[name] = float(rng.uniform(one.low, one.high))
                     continue
                 Delta = _random_dynamics(one, rng, grid, self.dt)
-                one_set[name] = (Delta.scaled(one.radius) + as_system(one.centre) if isinstance(one, ComplexDisk)
-                                 else Delta)
+                one_set[name] = (
+                    Delta.scaled(one.radius) + as_system(one.centre) if isinstance(one, ComplexDisk) else Delta
+                )
             found.append(one_set)
         return found
 
@@ -193,8 +202,9 @@ class UncertainSystem:
             element, n, w, z = system._slices()[place]
             if isinstance(delta, StateSpace):
                 if delta.D.shape != (element.rows, element.cols):
-                    raise InputError(f"expected {element.rows} outputs and {element.cols} inputs", field=name,
-                                     value=delta.D.shape)
+                    raise InputError(
+                        f"expected {element.rows} outputs and {element.cols} inputs", field=name, value=delta.D.shape
+                    )
                 inner = as_uncertain(delta)
                 for _ in range(n - 1):
                     inner = _diagonal(inner, as_uncertain(delta))
@@ -254,12 +264,22 @@ class UncertainSystem:
         if self.shape[0] != self.shape[1]:
             raise InputError("expected as many inputs as outputs", field="inverse", value=self.shape)
         if np.linalg.cond(self.d) > SETTINGS.singular:
-            raise ComputationError("the nominal value cannot be inverted", measured=f"D = {self.d.tolist()}",
-                                   cause="a division by zero, or by a strictly proper system",
-                                   next_step="choose a nominal value other than zero")
+            raise ComputationError(
+                "the nominal value cannot be inverted",
+                measured=f"D = {self.d.tolist()}",
+                cause="a division by zero, or by a strictly proper system",
+                next_step="choose a nominal value other than zero",
+            )
         inv = np.linalg.inv(self.d)
-        return replace(self, a=self.a - self.b @ inv @ self.c, b=self.b @ inv, c=-inv @ self.c, d=inv,
-                       inputs=self.outputs, outputs=self.inputs)
+        return replace(
+            self,
+            a=self.a - self.b @ inv @ self.c,
+            b=self.b @ inv,
+            c=-inv @ self.c,
+            d=inv,
+            inputs=self.outputs,
+            outputs=self.inputs,
+        )
 
     def __truediv__(self, other: Any) -> UncertainSystem:
         return self * as_uncertain(other).inverse()
@@ -286,16 +306,26 @@ class UncertainSystem:
             raise InputError(f"feedback of shape {Y.shape} around {X.shape}")
         loop = return_difference(X.matrices, Y.matrices, sign)
         if np.linalg.cond(loop) > SETTINGS.singular:
-            raise ComputationError("the nominal loop is not well posed", measured=f"I + X Y = {loop.tolist()} at "
-                                   "infinite frequency", cause="an algebraic loop of unit gain")
+            raise ComputationError(
+                "the nominal loop is not well posed",
+                measured=f"I + X Y = {loop.tolist()} at infinite frequency",
+                cause="an algebraic loop of unit gain",
+            )
         return _of_both(feedback(X.matrices, Y.matrices, sign), X, Y, X.inputs, X.outputs)
 
     def select(self, outputs: Any = None, inputs: Any = None) -> UncertainSystem:
         """The system with some of its outputs and inputs, by name or position."""
         rows, cols = positions(self.outputs, outputs, "output"), positions(self.inputs, inputs, "input")
-        return reduced(replace(self, b=self.b[:, cols], c=self.c[rows], d=self.d[np.ix_(rows, cols)],
-                                inputs=tuple(self.inputs[k] for k in cols),
-                                outputs=tuple(self.outputs[k] for k in rows)))
+        return reduced(
+            replace(
+                self,
+                b=self.b[:, cols],
+                c=self.c[rows],
+                d=self.d[np.ix_(rows, cols)],
+                inputs=tuple(self.inputs[k] for k in cols),
+                outputs=tuple(self.outputs[k] for k in rows),
+            )
+        )
 
     def __getitem__(self, key: tuple[Any, Any]) -> UncertainSystem:
         rows, cols = key
@@ -311,8 +341,7 @@ class UncertainSystem:
 
     # -- display -----------------------------------------------------------------------------
     def _rows(self) -> list[tuple[str, str]]:
-        return [(str(one), f"{n} {'copy' if n == 1 else 'copies'}") for one, n, _, _ in self._slices()
-                if one != STATES]
+        return [(str(one), f"{n} {'copy' if n == 1 else 'copies'}") for one, n, _, _ in self._slices() if one != STATES]
 
     def __repr__(self) -> str:
         what = "; ".join(f"{text}, {count}" for text, count in self._rows()) or "nothing uncertain"
@@ -322,8 +351,11 @@ class UncertainSystem:
         return f"UncertainSystem({size}: {what})"
 
     def _repr_html_(self) -> str:
-        size = (f"{count_of(self.nstates, 'state')}, {list(self.inputs)} -> {list(self.outputs)}" if self.nstates
-                else self.shape)
+        size = (
+            f"{count_of(self.nstates, 'state')}, {list(self.inputs)} -> {list(self.outputs)}"
+            if self.nstates
+            else self.shape
+        )
         return html_table(self._rows(), ("uncertain", "copies"), f"uncertain system, {size}")
 
 
@@ -356,8 +388,12 @@ def hstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
     for X in systems[1:]:
         if X.shape[0] != result.shape[0]:
             raise InputError("expected blocks of as many rows", field="matrix", value=[one.shape for one in systems])
-        parts = (la.block_diag(result.a, X.a), la.block_diag(result.b, X.b), np.hstack([result.c, X.c]),
-                 np.hstack([result.d, X.d]))
+        parts = (
+            la.block_diag(result.a, X.a),
+            la.block_diag(result.b, X.b),
+            np.hstack([result.c, X.c]),
+            np.hstack([result.d, X.d]),
+        )
         result = ordered(parts, _kinds(result, X), _clock(result, X), (), ())
     return result
 
@@ -368,8 +404,12 @@ def vstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
     for X in systems[1:]:
         if X.shape[1] != result.shape[1]:
             raise InputError("expected blocks of as many columns", field="matrix", value=[one.shape for one in systems])
-        parts = (la.block_diag(result.a, X.a), np.vstack([result.b, X.b]), la.block_diag(result.c, X.c),
-                 np.vstack([result.d, X.d]))
+        parts = (
+            la.block_diag(result.a, X.a),
+            np.vstack([result.b, X.b]),
+            la.block_diag(result.c, X.c),
+            np.vstack([result.d, X.d]),
+        )
         result = ordered(parts, _kinds(result, X), _clock(result, X), (), ())
     return result
 
@@ -385,13 +425,15 @@ def _clock(*systems: UncertainSystem) -> float:
     return clocks.pop()
 
 
-def _of_both(parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str],
-              outputs: Sequence[str]) -> UncertainSystem:
+def _of_both(
+    parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str], outputs: Sequence[str]
+) -> UncertainSystem:
     return reduced(ordered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
 
 
-def ordered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...],
-            outputs: tuple[str, ...]) -> UncertainSystem:
+def ordered(
+    parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> UncertainSystem:
     """System with the states first, then one block per element, in order of first occurrence."""
     places: dict[str, tuple[Element, list[int], list[int]]] = {}
     w = z = 0
@@ -407,8 +449,17 @@ def ordered(parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs:
     order = sorted(places, key=lambda key: key != "")
     ws, zs = [i for key in order for i in places[key][1]], [i for key in order for i in places[key][2]]
     a, b, c, d = parts
-    return UncertainSystem(a[np.ix_(zs, ws)], b[zs], c[:, ws], d, tuple(places[key][0] for key in order),
-                           tuple(len(places[key][1]) // places[key][0].rows for key in order), dt, inputs, outputs)
+    return UncertainSystem(
+        a[np.ix_(zs, ws)],
+        b[zs],
+        c[:, ws],
+        d,
+        tuple(places[key][0] for key in order),
+        tuple(len(places[key][1]) // places[key][0].rows for key in order),
+        dt,
+        inputs,
+        outputs,
+    )
 
 
 def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice, z: slice) -> UncertainSystem:
@@ -418,21 +469,34 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
     loop = np.eye(z.stop - z.start) - system.a[z, w] @ inner.d
     if np.linalg.cond(loop) > SETTINGS.singular:
         element = system.elements[place]
-        raise ComputationError("the system has no value here", measured=f"I - M Delta is singular at {element}",
-                               cause="a division by zero", next_step="choose a value inside the range")
+        raise ComputationError(
+            "the system has no value here",
+            measured=f"I - M Delta is singular at {element}",
+            cause="a division by zero",
+            next_step="choose a value inside the range",
+        )
     # All signals as functions of (i_r, i_s, u): remaining internal signals, states of `inner` and inputs.
     a, b, c, d = system.a, system.b, system.c, system.d
     n, m = len(rest_w), inner.a.shape[1]
     seen = np.linalg.solve(loop, np.hstack([a[z][:, rest_w], a[z, w] @ inner.c, b[z]]))
     fed = inner.d @ seen
-    fed[:, n:n + m] += inner.c
+    fed[:, n : n + m] += inner.c
     rest, onto = np.ix_(rest_z, rest_w), a[rest_z][:, w] @ fed
-    out = np.vstack([np.hstack([a[rest], np.zeros((len(rest_z), m)), b[rest_z]]) + onto,
-                     np.hstack([np.zeros((m, n)), inner.a, np.zeros((m, b.shape[1]))]) + inner.b @ seen])
+    out = np.vstack(
+        [
+            np.hstack([a[rest], np.zeros((len(rest_z), m)), b[rest_z]]) + onto,
+            np.hstack([np.zeros((m, n)), inner.a, np.zeros((m, b.shape[1]))]) + inner.b @ seen,
+        ]
+    )
     y = np.hstack([c[:, rest_w], np.zeros((c.shape[0], m)), d]) + c[:, w] @ fed
     kinds = [pair for k, pair in enumerate(_kinds(system)) if k != place] + _kinds(inner)
-    return ordered((out[:, :n + m], out[:, n + m:], y[:, :n + m], y[:, n + m:]), kinds, _clock(system, inner),
-                   system.inputs, system.outputs)
+    return ordered(
+        (out[:, : n + m], out[:, n + m :], y[:, : n + m], y[:, n + m :]),
+        kinds,
+        _clock(system, inner),
+        system.inputs,
+        system.outputs,
+    )
 
 
 def reduced(system: UncertainSystem) -> UncertainSystem:
@@ -442,8 +506,10 @@ def reduced(system: UncertainSystem) -> UncertainSystem:
     if not scalar:
         return system
     sizes = [slices[k][1] for k in scalar]
-    inner_w, inner_z = (np.concatenate([np.arange(s[k].start, s[k].stop) for k in scalar])
-                        for s in ([one[2] for one in slices], [one[3] for one in slices]))
+    inner_w, inner_z = (
+        np.concatenate([np.arange(s[k].start, s[k].stop) for k in scalar])
+        for s in ([one[2] for one in slices], [one[3] for one in slices])
+    )
     outer_w = np.setdiff1d(np.arange(system.a.shape[1]), inner_w)
     outer_z = np.setdiff1d(np.arange(system.a.shape[0]), inner_z)
     A = system.a[np.ix_(inner_z, inner_w)]
@@ -460,8 +526,12 @@ def reduced(system: UncertainSystem) -> UncertainSystem:
         return system
     p, q = len(outer_w), len(outer_z)
     a, b, c, _ = small
-    parts = (np.block([[D[:q, :p], c[:q]], [b[:, :p], a]]), np.vstack([D[:q, p:], b[:, p:]]),
-             np.hstack([D[q:, :p], c[q:]]), D[q:, p:])
+    parts = (
+        np.block([[D[:q, :p], c[:q]], [b[:, :p], a]]),
+        np.vstack([D[:q, p:], b[:, p:]]),
+        np.hstack([D[q:, :p], c[q:]]),
+        D[q:, p:],
+    )
     kinds = [(one, n_one) for k, (one, n_one, _, _) in enumerate(slices) if k not in scalar]
     kinds += [(slices[k][0], n_one) for k, n_one in zip(scalar, kept, strict=True) if n_one]
     return ordered(parts, kinds, system.dt, system.inputs, system.outputs)
@@ -479,6 +549,7 @@ def _same(M: Quadruple, sizes: Sequence[int], small: Quadruple, kept: Sequence[i
         a, b, c, d = parts
         values = np.repeat(delta, counts)
         return d + c @ (values[:, None] * np.linalg.solve(np.eye(len(values)) - a * values, b))
+
     for _ in range(3):
         delta = SETTINGS.inside * rng.uniform(-1, 1, len(sizes))
         one, other = value(M, sizes, delta), value(small, kept, delta)
@@ -503,4 +574,3 @@ def _random_dynamics(one: Element, rng: np.random.Generator, grid: np.ndarray, d
         # (1 - r z)/(z - r)
         return StateSpace(r * np.eye(one.cols), np.eye(one.cols), (1 - r * r) * UV, -r * UV, dt)
     return StateSpace(-corner * np.eye(one.cols), np.eye(one.cols), -2 * corner * UV, UV)
-

@@ -66,13 +66,21 @@ class UncertaintyWeight(Shown, Weight):
 
     @property
     def meaning(self) -> str:
-        return (f"{self.kind} uncertainty of {np.min(self.error):.3g} to {np.max(self.error):.3g}, covered by order "
-                f"{self.order}")
+        return (
+            f"{self.kind} uncertainty of {np.min(self.error):.3g} to {np.max(self.error):.3g}, covered by order "
+            f"{self.order}"
+        )
 
 
-def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Kind = "output",
-                       omega: np.ndarray | None = None, tolerance_dB: float = 2.0, max_order: int = 8
-                       ) -> UncertaintyWeight:
+def uncertainty_weight(
+    nominal: Any,
+    responses: Sequence[Any] | Any,
+    *,
+    kind: Kind = "output",
+    omega: np.ndarray | None = None,
+    tolerance_dB: float = 2.0,
+    max_order: int = 8,
+) -> UncertaintyWeight:
     """Filter of lowest order that covers the errors of all responses relative to a nominal one, at given frequencies.
 
     Parameters
@@ -99,8 +107,9 @@ def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Ki
     """
     every = list(responses) if isinstance(responses, (list, tuple)) else [responses]
     if not every or kind not in ("output", "input", "additive"):
-        raise InputError("expected responses, and output, input or additive", field="responses, kind",
-                         value=(len(every), kind))
+        raise InputError(
+            "expected responses, and output, input or additive", field="responses, kind", value=(len(every), kind)
+        )
     if omega is None:
         known = [frequencies_of(one) for one in (nominal, *every) if is_response(one)]
         omega = known[0] if known else plot_frequencies(nominal, 120)
@@ -111,16 +120,20 @@ def uncertainty_weight(nominal: Any, responses: Sequence[Any] | Any, *, kind: Ki
     for k, one in enumerate(every):
         difference = response_of(one, omega, f"response {k}")
         if difference.shape != G.shape:
-            raise InputError(f"expected responses of shape {G.shape[1:]}", field=f"response {k}",
-                             value=difference.shape[1:])
+            raise InputError(
+                f"expected responses of shape {G.shape[1:]}", field=f"response {k}", value=difference.shape[1:]
+            )
         difference = difference - G
         if kind != "additive":
             inverse, whole = np.linalg.pinv(G), difference
             difference = whole @ inverse if kind == "output" else inverse @ whole
             rest = whole - (difference @ G if kind == "output" else G @ difference)
             if np.linalg.norm(rest) > SETTINGS.round_off * np.linalg.norm(whole):
-                raise InputError(f"no error at the {kind} of the nominal system makes this response; expected kind "
-                                 f"additive or {'input' if kind == 'output' else 'output'}", field=f"response {k}")
+                raise InputError(
+                    f"no error at the {kind} of the nominal system makes this response; expected kind "
+                    f"additive or {'input' if kind == 'output' else 'output'}",
+                    field=f"response {k}",
+                )
         error = np.maximum(error, np.linalg.norm(difference, ord=2, axis=(1, 2)))
     if not (np.all(np.isfinite(error)) and np.max(error) > 0 and np.all(np.abs(G).max(axis=(1, 2)) > 0)):
         raise InputError("expected finite responses that differ from a nominal one that is not zero", field="nominal")

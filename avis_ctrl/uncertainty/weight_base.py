@@ -49,8 +49,15 @@ class Weight(ABC):
         return 1.0 / magnitude if self.role == "limit" else magnitude
 
 
-def smallest_cover(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, tolerance_dB: float, max_order: int,
-                   what: str, target: np.ndarray | None = None) -> Rational:
+def smallest_cover(
+    omega: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    tolerance_dB: float,
+    max_order: int,
+    what: str,
+    target: np.ndarray | None = None,
+) -> Rational:
     """The filter of lowest order with |W| >= lower and at most tolerance_dB above upper.
 
     Raises ComputationError, with the excess reached, if `max_order` is too low.
@@ -60,7 +67,9 @@ def smallest_cover(omega: np.ndarray, lower: np.ndarray, upper: np.ndarray, tole
         excess = min(excess, fit.error_max_dB)
         if fit.error_max_dB <= tolerance_dB:
             return fit.function
-    raise ComputationError(f"no filter of order {max_order} realises {what}",
-                           measured=f"{excess:.2f} dB above it, {tolerance_dB:g} dB allowed",
-                           cause="a step too steep for the order", next_step="widen the transition, allow a higher "
-                           "order or a larger tolerance")
+    raise ComputationError(
+        f"no filter of order {max_order} realises {what}",
+        measured=f"{excess:.2f} dB above it, {tolerance_dB:g} dB allowed",
+        cause="a step too steep for the order",
+        next_step="widen the transition, allow a higher order or a larger tolerance",
+    )

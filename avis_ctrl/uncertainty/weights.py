@@ -63,8 +63,11 @@ class TransmissibilityBound(Weight):
         ordered = sorted(self.bands, key=lambda band: band.low_Hz)
         for first, second in pairwise(ordered):
             if second.low_Hz < first.high_Hz:
-                raise InputError(f"bands that do not overlap; {first.low_Hz:g} to {first.high_Hz:g} Hz and "
-                                 f"{second.low_Hz:g} to {second.high_Hz:g} Hz do", field="bands")
+                raise InputError(
+                    f"bands that do not overlap; {first.low_Hz:g} to {first.high_Hz:g} Hz and "
+                    f"{second.low_Hz:g} to {second.high_Hz:g} Hz do",
+                    field="bands",
+                )
         for field in ("relaxed_below_Hz", "relaxed_above_Hz"):
             if getattr(self, field) is not None:
                 require(getattr(self, field), field)
@@ -86,7 +89,7 @@ class TransmissibilityBound(Weight):
             return Rational(10 ** (-self.overall_dB / 20))
         omega = 2 * np.pi * self._grid(120, 15)
         lower = 1.0 / self.asked(omega)
-        window = 2.0 ** self.transition_octaves
+        window = 2.0**self.transition_octaves
         first = np.searchsorted(omega, omega / window * (1 - 1e-9))
         last = np.searchsorted(omega, omega * window * (1 + 1e-9))
         upper = np.array([np.max(lower[i:j]) for i, j in zip(first, last, strict=True)])
@@ -99,8 +102,9 @@ class TransmissibilityBound(Weight):
         distance = np.abs(np.log(omega[:, None] / omega))
         target = np.exp(np.max(level - slope * distance, axis=1))
         lower = np.where(lower > 0, lower, 1e-4 * usual)
-        shape = smallest_cover(omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound",
-                               target)
+        shape = smallest_cover(
+            omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound", target
+        )
         dense = 2 * np.pi * self._grid(4000, 400)
         # 1e-4 covers violations between the dense points.
         return shape.scaled(max(1.0, float(np.max(1.0 / (self.asked(dense) * shape.magnitude(dense)))) * (1 + 1e-4)))
@@ -109,7 +113,7 @@ class TransmissibilityBound(Weight):
         """Frequencies [Hz], evenly spaced in logarithm, dense about every step and on both sides of it."""
         steps = [edge for band in self.bands for edge in (band.low_Hz, band.high_Hz)]
         steps += [f for f in (self.relaxed_below_Hz, self.relaxed_above_Hz) if f is not None]
-        window = 2.0 ** self.transition_octaves
+        window = 2.0**self.transition_octaves
         fine = [np.geomspace(f / window, f * window, fine_points) for f in steps]
         sides = [f * (1 + side) for f in steps for side in (-1e-6, 0.0, 1e-6)]
         grid = np.sort(np.concatenate([np.geomspace(min(steps) / 100, max(steps) * 100, points), *fine, sides]))
@@ -118,9 +122,12 @@ class TransmissibilityBound(Weight):
     @property
     def meaning(self) -> str:
         parts = [f"at most {band.limit_dB:+g} dB from {band.low_Hz:g} to {band.high_Hz:g} Hz" for band in self.bands]
-        return (f"transmissibility at most {self.overall_dB:+g} dB" + "".join(f", {part}" for part in parts)
-                + f"; realised with {self.shape.order} states, stricter than this bound by up to "
-                  f"{self.tolerance_dB:g} dB, and by more within {self.transition_octaves:g} octave of a stricter band")
+        return (
+            f"transmissibility at most {self.overall_dB:+g} dB"
+            + "".join(f", {part}" for part in parts)
+            + f"; realised with {self.shape.order} states, stricter than this bound by up to "
+            f"{self.tolerance_dB:g} dB, and by more within {self.transition_octaves:g} octave of a stricter band"
+        )
 
 
 @dataclass(frozen=True)
@@ -146,8 +153,11 @@ class ComplianceBound(Weight):
     def __post_init__(self) -> None:
         require(self.limit_m_per_N, "limit_m_per_N")
         if (self.static_limit_m_per_N is None) != (self.corner_Hz is None):
-            raise InputError("static_limit_m_per_N and corner_Hz belong together: give both or neither",
-                             field="corner_Hz", value=self.corner_Hz)
+            raise InputError(
+                "static_limit_m_per_N and corner_Hz belong together: give both or neither",
+                field="corner_Hz",
+                value=self.corner_Hz,
+            )
         if self.static_limit_m_per_N is not None and self.corner_Hz is not None:
             require(self.static_limit_m_per_N, "static_limit_m_per_N", self.limit_m_per_N)
             require(self.corner_Hz, "corner_Hz")
@@ -221,19 +231,26 @@ class ControlEffort(Weight):
         if self.bandwidth_Hz is None:
             return Rational(gain, real_zeros=zeros, real_poles=poles)
         wb = 2 * np.pi * self.bandwidth_Hz
-        return Rational(gain * self.reduction ** self.order, real_zeros=(*zeros, *(wb,) * self.order),
-                        real_poles=(*poles, *(self.reduction * wb,) * self.order))
+        return Rational(
+            gain * self.reduction**self.order,
+            real_zeros=(*zeros, *(wb,) * self.order),
+            real_poles=(*poles, *(self.reduction * wb,) * self.order),
+        )
 
     @property
     def meaning(self) -> str:
         text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
         if self.offset:
-            text += (f"; {np.hypot(1, self.offset):.3g} times stricter below {self.offset_corner_Hz:g} Hz, for the "
-                     "offset of the electronics")
+            text += (
+                f"; {np.hypot(1, self.offset):.3g} times stricter below {self.offset_corner_Hz:g} Hz, for the "
+                "offset of the electronics"
+            )
         if self.bandwidth_Hz is None:
             return text
-        return text + (f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a fraction "
-                       f"{self.reduction ** -self.order:.2g} of it")
+        return text + (
+            f" up to {self.bandwidth_Hz:g} Hz, falling with order {self.order} to a fraction "
+            f"{self.reduction**-self.order:.2g} of it"
+        )
 
 
 @dataclass(frozen=True)
@@ -260,13 +277,13 @@ class FlickerNoise(Weight):
 
     def asked(self, omega: np.ndarray) -> np.ndarray:
         """Noise density relative to that of the white noise, at omega > 0 [rad/s]."""
-        return np.sqrt(1 + self.flicker ** 2 / (np.asarray(omega, float) / (2 * np.pi)))
+        return np.sqrt(1 + self.flicker**2 / (np.asarray(omega, float) / (2 * np.pi)))
 
     @cached_property
     def shape(self) -> Rational:
         if not self.flicker:
             return Rational(1.0)
-        corner = self.flicker ** 2
+        corner = self.flicker**2
         # The filter must also cover far below and far above, where the weight is constant.
         omega = 2 * np.pi * np.geomspace(self.lowest_Hz / 100, 1000 * max(corner, self.lowest_Hz), 120)
         level = self.asked(np.maximum(omega, 2 * np.pi * self.lowest_Hz))
@@ -274,8 +291,10 @@ class FlickerNoise(Weight):
 
     @property
     def meaning(self) -> str:
-        return (f"1/f noise of the sensors' electronics over their white noise, corner {self.flicker ** 2:.3g} Hz; "
-                f"constant below {self.lowest_Hz:g} Hz; realised with {self.shape.order} states")
+        return (
+            f"1/f noise of the sensors' electronics over their white noise, corner {self.flicker**2:.3g} Hz; "
+            f"constant below {self.lowest_Hz:g} Hz; realised with {self.shape.order} states"
+        )
 
 
 @dataclass(frozen=True)
@@ -308,11 +327,12 @@ class NeglectedDynamics(Weight):
     def shape(self) -> Rational:
         # |W|^(2/order) with zero at a/tau and pole at b/tau: (x + a^2)/(x/b^2 + 1) = 1 with x = (tau w)^2
         a, b = self.low ** (1 / self.order), self.high ** (1 / self.order)
-        tau = np.sqrt((1 - a ** 2) / (1 - 1 / b ** 2)) / (2 * np.pi * self.crossover_Hz)
-        return Rational(self.high, real_zeros=(float(a / tau),) * self.order,
-                        real_poles=(float(b / tau),) * self.order)
+        tau = np.sqrt((1 - a**2) / (1 - 1 / b**2)) / (2 * np.pi * self.crossover_Hz)
+        return Rational(self.high, real_zeros=(float(a / tau),) * self.order, real_poles=(float(b / tau),) * self.order)
 
     @property
     def meaning(self) -> str:
-        return (f"relative uncertainty {100 * self.low:g} % at low frequency, 100 % at {self.crossover_Hz:g} Hz, "
-                f"{100 * self.high:g} % at high frequency, order {self.order}")
+        return (
+            f"relative uncertainty {100 * self.low:g} % at low frequency, 100 % at {self.crossover_Hz:g} Hz, "
+            f"{100 * self.high:g} % at high frequency, order {self.order}"
+        )

@@ -63,13 +63,23 @@ def work(task: Task, to_parent: Connection) -> None:
 
 def _work(task: Task, to_parent: Connection) -> None:
     truth = importlib.import_module(task.truth)
-    case = truth.draw_case(task.seed, kind=task.kind, effect=task.effect, strength=task.strength,
-                           duration_s=task.duration_s, **({"clutter": True} if task.clutter else {}))
+    case = truth.draw_case(
+        task.seed,
+        kind=task.kind,
+        effect=task.effect,
+        strength=task.strength,
+        duration_s=task.duration_s,
+        **({"clutter": True} if task.clutter else {}),
+    )
     to_parent.send(("drawn", described(case)))
     began = time.perf_counter()
     campaign = stripped(truth.simulate_case(case))
-    to_parent.send(("simulated", {"simulation_seconds": time.perf_counter() - began,
-                                  "relative_change": finite(truth.relative_change(case))}))
+    to_parent.send(
+        (
+            "simulated",
+            {"simulation_seconds": time.perf_counter() - began, "relative_change": finite(truth.relative_change(case))},
+        )
+    )
     finder = importlib.import_module(task.finder)
     finding = _ask(finder, campaign, load_rig("avis"), to_parent)
     if finding is not None and task.unseen:
@@ -94,20 +104,47 @@ def _ask(finder: Any, campaign: Campaign, rig: AvisTable, to_parent: Connection)
         text = {"answer": json.loads(json.dumps(finding.to_json(), allow_nan=False))}
     except Exception:
         finding, kind, text = None, "crashed", {"crash": traceback.format_exc()[-LONGEST_TEXT:]}
-    to_parent.send((kind, text | {"seconds": time.perf_counter() - began, "cpu_seconds": cpu_seconds() - cpu,
-                                  "memory_MB": memory.end_MB()}))
+    to_parent.send(
+        (
+            kind,
+            text
+            | {
+                "seconds": time.perf_counter() - began,
+                "cpu_seconds": cpu_seconds() - cpu,
+                "memory_MB": memory.end_MB(),
+            },
+        )
+    )
     return finding
 
 
 def described(case: Any) -> dict:
     """What is hidden, for the scorer."""
-    return {"kind": case.kind, "excitation": str(case.excitation), "floor_recorded": bool(case.floor_recorded),
-            "hidden": [{"name": one.name, "location": one.location, "strength": one.strength,
-                        "parameters": plain(one.parameters), "variant": getattr(one, "details", {}).get("variant")}
-                       for one in case.effects],
-            "cluttered": bool(getattr(case, "clutter", False)),
-            "traces": [{"name": one.name, "location": one.location, "parameters": plain(one.parameters),
-                        "unexplained": plain(one.details["unexplained"])} for one in getattr(case, "traces", ())]}
+    return {
+        "kind": case.kind,
+        "excitation": str(case.excitation),
+        "floor_recorded": bool(case.floor_recorded),
+        "hidden": [
+            {
+                "name": one.name,
+                "location": one.location,
+                "strength": one.strength,
+                "parameters": plain(one.parameters),
+                "variant": getattr(one, "details", {}).get("variant"),
+            }
+            for one in case.effects
+        ],
+        "cluttered": bool(getattr(case, "clutter", False)),
+        "traces": [
+            {
+                "name": one.name,
+                "location": one.location,
+                "parameters": plain(one.parameters),
+                "unexplained": plain(one.details["unexplained"]),
+            }
+            for one in getattr(case, "traces", ())
+        ],
+    }
 
 
 def plain(value: Any) -> Any:
@@ -130,16 +167,20 @@ def finite(value: Any) -> float | None:
 def stripped(campaign: Campaign) -> Campaign:
     """The samples and their headers, without the notes, source and record names that could tell what is hidden."""
     records = [record.load() for record in campaign.records]
-    return Campaign(campaign.rig, tuple(replace(record, header=replace(record.header, name=f"{k:02d}"))
-                                        for k, record in enumerate(records)))
+    return Campaign(
+        campaign.rig,
+        tuple(replace(record, header=replace(record.header, name=f"{k:02d}")) for k, record in enumerate(records)),
+    )
 
 
 def prediction_errors(finder: Any, finding: Any, campaign: Campaign) -> dict[str, float]:
     """nrmse of the baseline's and the updated model's prediction: `finder.predict` gives one pair a record."""
     measured = [record.load().y for record in campaign.records]
     pairs: Sequence[tuple[np.ndarray, np.ndarray]] = list(finder.predict(finding, campaign))
-    return {"baseline": nrmse(measured, [pair[0] for pair in pairs]),
-            "updated": nrmse(measured, [pair[1] for pair in pairs])}
+    return {
+        "baseline": nrmse(measured, [pair[0] for pair in pairs]),
+        "updated": nrmse(measured, [pair[1] for pair in pairs]),
+    }
 
 
 def nrmse(measured: Sequence[np.ndarray], predicted: Sequence[np.ndarray]) -> float:
@@ -164,6 +205,7 @@ def _end_with_parent() -> None:
     def watch() -> None:
         wait([parent.sentinel])
         os._exit(1)
+
     threading.Thread(target=watch, daemon=True).start()
 
 

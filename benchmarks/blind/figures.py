@@ -54,8 +54,13 @@ def right_names(cases: Sequence[Judged]) -> Share:
 
 def right_places(cases: Sequence[Judged]) -> Share:
     """One effect, clear or gross, whose place is a choice, named rightly: the place is right too."""
-    return Share.of([case.pairs[0].place for case in of_kind(cases, "one")
-                     if case.line.clear and case.outcome == "right" and case.pairs[0].hidden.name in PLACED])
+    return Share.of(
+        [
+            case.pairs[0].place
+            for case in of_kind(cases, "one")
+            if case.line.clear and case.outcome == "right" and case.pairs[0].hidden.name in PLACED
+        ]
+    )
 
 
 def both_right(cases: Sequence[Judged]) -> Share:
@@ -86,8 +91,11 @@ def closed(answer: Answer) -> bool:
 
 def named_answers(cases: Sequence[Judged]) -> list[Answer]:
     """Of cases with one or two effects of the library, where something is named."""
-    return [case.line.answer for case in cases
-            if case.line.kind in ("one", "two") and case.line.answer is not None and case.named]
+    return [
+        case.line.answer
+        for case in cases
+        if case.line.kind in ("one", "two") and case.line.answer is not None and case.named
+    ]
 
 
 def closed_gaps(cases: Sequence[Judged]) -> Share:
@@ -104,10 +112,18 @@ def asked_table(cases: Sequence[Judged], errors: Sequence[Error]) -> list[Asked]
         at_least("two effects: both right", both_right(cases), 0.80),
         at_most("outside the library: named as something else", misnamed_outside(cases), 0.10),
         # Asked of every campaign: one that stays apart is a miss, and how many do is printed.
-        Asked("held-out gap after naming: within 1.2 of the noise floor or down by a factor of 10", "every campaign",
-              str(closed_gaps(cases)), _all(closed_gaps(cases))),
-        Asked("parameter inside its own 95 % interval", "90 to 98 %", str(inside),
-              0.90 <= inside.value <= 0.98 if inside.trials else None),
+        Asked(
+            "held-out gap after naming: within 1.2 of the noise floor or down by a factor of 10",
+            "every campaign",
+            str(closed_gaps(cases)),
+            _all(closed_gaps(cases)),
+        ),
+        Asked(
+            "parameter inside its own 95 % interval",
+            "90 to 98 %",
+            str(inside),
+            0.90 <= inside.value <= 0.98 if inside.trials else None,
+        ),
         cost("seconds of one campaign", [case.line.seconds for case in cases], MOST_SECONDS, "s"),
         cost("peak memory", [case.line.memory_MB for case in cases], MOST_MB, "MB"),
     ]
@@ -125,5 +141,9 @@ def cost(what: str, values: Sequence[float | None], limit: float, unit: str) -> 
         return Asked(what, f"under {limit:g} {unit}", "no case", None)
     median, high, most = np.median(known), np.quantile(known, 0.95), max(known)
     text = f"median {median:.4g}, 95 % {high:.4g}, most {most:.4g} {unit}"
-    return Asked(what, f"under {limit:g} {unit}", text + (f"; {absent} without a figure" if absent else ""),
-                 bool(most < limit and not absent))
+    return Asked(
+        what,
+        f"under {limit:g} {unit}",
+        text + (f"; {absent} without a figure" if absent else ""),
+        bool(most < limit and not absent),
+    )

@@ -14,20 +14,55 @@ from avis_ctrl.rigs.instruments import Tolerances
 from benchmarks.blind.lines import Hidden, Line, Named, Trace
 
 # Effects of the contract with their places; those in PLACED have a place that can be wrong.
-PLACED = ("geophone_corner", "sensor_gain", "sensor_misalignment", "sensor_quantisation", "actuator_gain",
-          "product_of_inertia")
-LIBRARY = ("geophone_corner", "sensor_gain", "sensor_misalignment", "tilt_coupling", "mains_hum", "sensor_quantisation",
-           "actuator_gain", "actuator_lag", "actuator_saturation", "loop_delay", "contact_friction", "com_offset",
-           "product_of_inertia", "payload_flexible_mode", "attached_oscillator", "base_compliance", "mount_relaxation",
-           "structural_damping", "mount_surge", "cubic_stiffness", "leveling_loop", "cable_stiffness", "ground_motion",
-           "stiffness_drift")
+PLACED = (
+    "geophone_corner",
+    "sensor_gain",
+    "sensor_misalignment",
+    "sensor_quantisation",
+    "actuator_gain",
+    "product_of_inertia",
+)
+LIBRARY = (
+    "geophone_corner",
+    "sensor_gain",
+    "sensor_misalignment",
+    "tilt_coupling",
+    "mains_hum",
+    "sensor_quantisation",
+    "actuator_gain",
+    "actuator_lag",
+    "actuator_saturation",
+    "loop_delay",
+    "contact_friction",
+    "com_offset",
+    "product_of_inertia",
+    "payload_flexible_mode",
+    "attached_oscillator",
+    "base_compliance",
+    "mount_relaxation",
+    "structural_damping",
+    "mount_surge",
+    "cubic_stiffness",
+    "leveling_loop",
+    "cable_stiffness",
+    "ground_motion",
+    "stiffness_drift",
+)
 
 # Outcomes, the best first.
 OUTCOMES = {
     "none": ("quiet", "alarm without a name", "false name", "crash"),
     "one": ("right", "right and an extra", "refused", "missed", "wrong", "crash"),
-    "two": ("both right", "both right and an extra", "one right", "one right, one wrong", "refused", "missed", "wrong",
-            "crash"),
+    "two": (
+        "both right",
+        "both right and an extra",
+        "one right",
+        "one right, one wrong",
+        "refused",
+        "missed",
+        "wrong",
+        "crash",
+    ),
     "outside": ("refused", "missed", "named as something else", "crash"),
 }
 
@@ -70,7 +105,7 @@ def matches(hidden: Sequence[Hidden], named: Sequence[Named]) -> list[Match]:
     options = [matches(rest, named)]
     for k, candidate in enumerate(named):
         if (pair := match(first, candidate)) is not None:
-            options.append([pair, *matches(rest, [*named[:k], *named[k + 1:]])])
+            options.append([pair, *matches(rest, [*named[:k], *named[k + 1 :]])])
     return max(options, key=lambda pairs: (len(pairs), sum(p.exact for p in pairs), sum(p.place for p in pairs)))
 
 
@@ -119,12 +154,14 @@ def is_trace(named: Named, line: Line) -> bool:
 
 # Parameters of a hidden value of the rig file, what the file says, and its default tolerance.
 _T, _CORNER_Hz = Tolerances(), 4.5
-TOLERANCES = {"sensor_gain": (("gain",), 1.0, _T.sensor_gain_percent / 100),
-              "actuator_gain": (("gain",), 1.0, _T.actuator_gain_percent / 100),
-              "sensor_misalignment": (("angle_rad",), 0.0, _T.direction_rad),
-              "geophone_corner": (("corner_Hz",), _CORNER_Hz, _CORNER_Hz * _T.sensor_corner_percent / 100),
-              "com_offset": (("x_m", "y_m", "z_m"), 0.0, _T.centre_of_mass_m),
-              "product_of_inertia": (("product_kgm2",), 0.0, _T.product_of_inertia_kgm2)}
+TOLERANCES = {
+    "sensor_gain": (("gain",), 1.0, _T.sensor_gain_percent / 100),
+    "actuator_gain": (("gain",), 1.0, _T.actuator_gain_percent / 100),
+    "sensor_misalignment": (("angle_rad",), 0.0, _T.direction_rad),
+    "geophone_corner": (("corner_Hz",), _CORNER_Hz, _CORNER_Hz * _T.sensor_corner_percent / 100),
+    "com_offset": (("x_m", "y_m", "z_m"), 0.0, _T.centre_of_mass_m),
+    "product_of_inertia": (("product_kgm2",), 0.0, _T.product_of_inertia_kgm2),
+}
 # Up to so many of them a departure is within tolerance, and no missing effect.
 WITHIN = 3.0
 
@@ -156,8 +193,9 @@ def judge(line: Line) -> Judged:
     extra, quiet = len(named) - len(pairs), line.answer.verdict == "none"
     if line.kind == "none":
         only_traces = bool(line.answer.effects) and not named
-        return Judged(line, "false name" if named else "quiet" if quiet or only_traces else "alarm without a name",
-                      pairs)
+        return Judged(
+            line, "false name" if named else "quiet" if quiet or only_traces else "alarm without a name", pairs
+        )
     if line.kind == "outside":
         outcome = "named as something else" if extra else "missed" if quiet and not named else "refused"
         return Judged(line, outcome, pairs)

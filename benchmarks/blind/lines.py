@@ -230,8 +230,12 @@ def read_lines(path: str | Path) -> list[Line]:
             raise InputError("expected each seed once", file=where, field="seed", value=line.seed)
         first = next(iter(found.values()), line)
         if line.settings.campaign != first.settings.campaign:
-            raise InputError(f"expected the campaign of line 1: {first.settings.campaign}", file=where,
-                             field="settings", value=line.settings.campaign)
+            raise InputError(
+                f"expected the campaign of line 1: {first.settings.campaign}",
+                file=where,
+                field="settings",
+                value=line.settings.campaign,
+            )
         found[line.seed] = line
     if not found:
         raise InputError("expected at least one line", file=path)
@@ -251,7 +255,7 @@ def finished(path: Path) -> list[Line]:
     if not path.exists():
         return []
     content = path.read_bytes()
-    whole = content[:content.rfind(b"\n") + 1]
+    whole = content[: content.rfind(b"\n") + 1]
     if len(whole) < len(content):
         path.write_bytes(whole)
     return read_lines(path) if whole else []

@@ -42,14 +42,17 @@ class Confusion:
         wide = max((len(name) for name in self.rows), default=0)
         number = {name: str(k) for k, name in enumerate(self.columns, 1)}
         lines = [" " * wide + "".join(f"{number[name]:>4s}" for name in self.columns)]
-        lines += [f"{name:>{wide}s}" + "".join(f"{count or '.':>4}" for count in row)
-                  for name, row in zip(self.rows, self.counts, strict=True)]
+        lines += [
+            f"{name:>{wide}s}" + "".join(f"{count or '.':>4}" for count in row)
+            for name, row in zip(self.rows, self.counts, strict=True)
+        ]
         legend = [f"{k} {name}" for name, k in number.items()]
         return "\n".join([*lines, "", "columns: " + ", ".join(legend)])
 
     def draw(self, path: Path) -> None:
         """As a picture: shares of each row as shades, counts as numbers; right answers framed."""
         import matplotlib
+
         matplotlib.use("Agg")
         from matplotlib import pyplot
 
@@ -60,13 +63,22 @@ class Confusion:
         picture = axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
         for (i, j), count in np.ndenumerate(self.counts):
             if self.right(self.rows[i], self.columns[j]):
-                axes.add_patch(pyplot.Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, edgecolor="tab:green",
-                                                linewidth=1.4))
+                axes.add_patch(
+                    pyplot.Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, edgecolor="tab:green", linewidth=1.4)
+                )
             if count:
-                axes.text(j, i, str(count), ha="center", va="center", fontsize=8,
-                          color="white" if share[i, j] > 0.55 else "black")
-        axes.set_xticks(range(len(self.columns)), self.columns, rotation=60, ha="right", rotation_mode="anchor",
-                        fontsize=8)
+                axes.text(
+                    j,
+                    i,
+                    str(count),
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white" if share[i, j] > 0.55 else "black",
+                )
+        axes.set_xticks(
+            range(len(self.columns)), self.columns, rotation=60, ha="right", rotation_mode="anchor", fontsize=8
+        )
         labels = [f"{name} ({n})" for name, n in zip(self.rows, total[:, 0], strict=True)]
         axes.set_yticks(range(len(self.rows)), labels, fontsize=8)
         axes.set(xlabel="answered", ylabel="hidden (cases)", title="Hidden against answered; right answers are framed")

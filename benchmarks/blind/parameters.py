@@ -14,9 +14,29 @@ from benchmarks.blind.judge import PLACED, Judged
 QUANTILE = float(norm.ppf(0.975))
 
 # A unit at the end of a parameter's name, in SI. Per cent is one hundredth: of a departure, and of nothing else.
-UNITS = {"Hz": 1.0, "kHz": 1e3, "rad_per_s": 1 / (2 * pi), "s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 1.0, "mm": 1e-3,
-         "um": 1e-6, "N": 1.0, "mN": 1e-3, "V": 1.0, "mV": 1e-3, "rad": 1.0, "mrad": 1e-3, "deg": pi / 180,
-         "percent": 0.01, "kg": 1.0, "g": 1e-3, "N_per_m": 1.0, "kN_per_m": 1e3}
+UNITS = {
+    "Hz": 1.0,
+    "kHz": 1e3,
+    "rad_per_s": 1 / (2 * pi),
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "m": 1.0,
+    "mm": 1e-3,
+    "um": 1e-6,
+    "N": 1.0,
+    "mN": 1e-3,
+    "V": 1.0,
+    "mV": 1e-3,
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": pi / 180,
+    "percent": 0.01,
+    "kg": 1.0,
+    "g": 1e-3,
+    "N_per_m": 1.0,
+    "kN_per_m": 1e3,
+}
 
 NOMINAL_DELAY_S = 1e-3
 
@@ -48,8 +68,10 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("cubic_stiffness", "cubic_N_per_m3", "k3_N_per_m3"),
     Equivalent("contact_friction", "coulomb_N", "force_N"),
     Equivalent("stiffness_drift", "change", "relative_change"),
-    *(Equivalent(effect, "damping_ratio", "damping") for effect in ("payload_flexible_mode", "attached_oscillator",
-                                                                    "base_compliance")),
+    *(
+        Equivalent(effect, "damping_ratio", "damping")
+        for effect in ("payload_flexible_mode", "attached_oscillator", "base_compliance")
+    ),
 )
 
 
@@ -80,8 +102,9 @@ def unit_of(name: str) -> tuple[str, float | None]:
     return name, None
 
 
-def true_value(effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS,
-               beside: Collection[str] = ()) -> tuple[str, float] | None:
+def true_value(
+    effect: str, reported: str, hidden: dict, table: Sequence[Equivalent] = EQUIVALENTS, beside: Collection[str] = ()
+) -> tuple[str, float] | None:
     """The truth of a reported parameter and the name it has there; None where there is none.
 
     By the table, under the same name, or under its name with another unit. beside : all that is reported.
@@ -104,8 +127,9 @@ def is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def parameter_errors(cases: Sequence[Judged], table: Sequence[Equivalent] = EQUIVALENTS
-                     ) -> tuple[list[Error], list[str]]:
+def parameter_errors(
+    cases: Sequence[Judged], table: Sequence[Equivalent] = EQUIVALENTS
+) -> tuple[list[Error], list[str]]:
     """Errors that can be compared, and "effect.parameter" of each reported one that cannot.
 
     Counted are effects named rightly: by their own name and, where the place is a choice, at the right place. A
@@ -118,8 +142,7 @@ def parameter_errors(cases: Sequence[Judged], table: Sequence[Equivalent] = EQUI
                 continue
             seen = set()
             for name, estimate in pair.named.parameters.items():
-                truth = true_value(pair.named.name, name, pair.hidden.parameters, table,
-                                   pair.named.parameters)
+                truth = true_value(pair.named.name, name, pair.hidden.parameters, table, pair.named.parameters)
                 if truth is None or estimate.std is None:
                     unknown.append(f"{pair.named.name}.{name}")
                 elif truth[0] not in seen:

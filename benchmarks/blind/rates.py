@@ -20,8 +20,8 @@ def wilson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     if trials == 0:
         return 0.0, 1.0
     z, p = float(norm.ppf((1 + level) / 2)), hits / trials
-    middle, half = p + z ** 2 / (2 * trials), z * np.sqrt(p * (1 - p) / trials + z ** 2 / (4 * trials ** 2))
-    low, high = (middle - half) / (1 + z ** 2 / trials), (middle + half) / (1 + z ** 2 / trials)
+    middle, half = p + z**2 / (2 * trials), z * np.sqrt(p * (1 - p) / trials + z**2 / (4 * trials**2))
+    low, high = (middle - half) / (1 + z**2 / trials), (middle + half) / (1 + z**2 / trials)
     return float(max(low, 0.0)), float(min(high, 1.0))
 
 

@@ -73,16 +73,18 @@ class Pool:
         self.settings, self.limit_s, self.truth, self.finder = settings, limit_s, truth, finder
         self.running: list[_Running] = []
         available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-        self._cores = [(available[k % len(available)],) if available and settings.jobs > 1 else ()
-                       for k in range(settings.jobs)]
+        self._cores = [
+            (available[k % len(available)],) if available and settings.jobs > 1 else () for k in range(settings.jobs)
+        ]
         for name in THREADS:  # before a worker loads NumPy
             os.environ[name] = "1"
 
     def __enter__(self) -> Pool:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         for one in self.running:
             one.process.terminate()
             one.process.join()
@@ -91,8 +93,18 @@ class Pool:
         taken = {one.slot for one in self.running}
         slot = next(k for k in range(self.settings.jobs) if k not in taken)
         s, context = self.settings, get_context("spawn")
-        task = Task(seed, s.duration_s, s.kind, s.effect, s.strength, s.unseen, self.truth, self.finder,
-                    self._cores[slot], is_cluttered(seed, s.cluttered))
+        task = Task(
+            seed,
+            s.duration_s,
+            s.kind,
+            s.effect,
+            s.strength,
+            s.unseen,
+            self.truth,
+            self.finder,
+            self._cores[slot],
+            is_cluttered(seed, s.cluttered),
+        )
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=work, args=(task, theirs))
         process.start()
@@ -130,8 +142,9 @@ def line_of(seed: int, known: dict[str, Any], settings: Settings, exitcode: int 
     elif "crash" not in told:
         told["crash"] = f"the worker ended with code {exitcode} before it answered"
     told.pop("truth_failed", None)
-    absent: dict[str, Any] = dict.fromkeys(("answer", "crash", "seconds", "cpu_seconds", "memory_MB", "unseen",
-                                            "unseen_error"))
+    absent: dict[str, Any] = dict.fromkeys(
+        ("answer", "crash", "seconds", "cpu_seconds", "memory_MB", "unseen", "unseen_error")
+    )
     content = absent | told | {"seed": seed, "settings": settings.model_dump()}
     try:
         return Line.model_validate(content)
@@ -145,8 +158,17 @@ def line_of(seed: int, known: dict[str, Any], settings: Settings, exitcode: int 
         return None
 
 
-def run(settings: Settings, seeds: Iterable[int], out: Path, *, resume: bool = False, limit_s: float = 900.0,
-        truth: str = TRUTH, finder: str = FINDER, say: Callable[[str], None] = lambda text: None) -> list[int]:
+def run(
+    settings: Settings,
+    seeds: Iterable[int],
+    out: Path,
+    *,
+    resume: bool = False,
+    limit_s: float = 900.0,
+    truth: str = TRUTH,
+    finder: str = FINDER,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[int]:
     """Append the lines of all seeds to a file; returns the seeds whose truth failed, which have no line.
 
     Raises
@@ -168,8 +190,10 @@ def run(settings: Settings, seeds: Iterable[int], out: Path, *, resume: bool = F
                     failed.append(one.seed)
                     text = one.told.get("truth_failed", one.told.get("crash", "its worker was killed")).strip()
                     # In full once: if the truth is broken, every case says the same.
-                    say(f"seed {one.seed}: the truth failed, no line written: "
-                        f"{text if len(failed) == 1 else text.splitlines()[-1]}")
+                    say(
+                        f"seed {one.seed}: the truth failed, no line written: "
+                        f"{text if len(failed) == 1 else text.splitlines()[-1]}"
+                    )
                 else:
                     file.write(line.model_dump_json() + "\n")
                     file.flush()
@@ -185,8 +209,12 @@ def _done(settings: Settings, out: Path, resume: bool) -> set[int]:
         raise InputError("expected a folder to write into", file=out.parent)
     lines = finished(out)
     if lines and lines[0].settings.campaign != settings.campaign:
-        raise InputError(f"expected the campaign that the file holds: {lines[0].settings.campaign}", file=out,
-                         field="settings", value=settings.campaign)
+        raise InputError(
+            f"expected the campaign that the file holds: {lines[0].settings.campaign}",
+            file=out,
+            field="settings",
+            value=settings.campaign,
+        )
     return {line.seed for line in lines}
 
 
@@ -195,15 +223,20 @@ def progress(count: int, total: int, seconds: float, seed: int, line: Line | Non
     rate = count / seconds
     left = (total - count) / rate
     what = "no line" if line is None else "crash" if line.crash is not None else f"{line.seconds:.1f} s"
-    return (f"{count}/{total} cases, {60 * rate:.2f} a minute, {left // 3600:.0f} h {left % 3600 // 60:02.0f} min left "
-            f"(seed {seed}: {what})")
+    return (
+        f"{count}/{total} cases, {60 * rate:.2f} a minute, {left // 3600:.0f} h {left % 3600 // 60:02.0f} min left "
+        f"(seed {seed}: {what})"
+    )
 
 
 def commit() -> str:
     """Of the code, with "+" where files that are under version control differ; "" outside a repository."""
+
     def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True,
-                              check=True).stdout.strip()
+        return subprocess.run(
+            ["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
+
     try:
         return git("rev-parse", "--short", "HEAD") + "+" * bool(git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.CalledProcessError):
@@ -212,20 +245,24 @@ def commit() -> str:
 
 def check_modules(truth: str, finder: str, unseen: bool) -> None:
     """Before hours are spent: both modules load and have what is needed."""
-    for name, needed in ((truth, ("draw_case", "simulate_case", "relative_change")),
-                         (finder, ("find_gap", "GapOptions", *(["predict"] if unseen else [])))):
+    for name, needed in (
+        (truth, ("draw_case", "simulate_case", "relative_change")),
+        (finder, ("find_gap", "GapOptions", *(["predict"] if unseen else []))),
+    ):
         try:
             module = importlib.import_module(name)
         except ImportError as error:
-            raise InputError(f"expected a module that loads, from the root of the repository: {error}",
-                             field="module", value=name) from None
+            raise InputError(
+                f"expected a module that loads, from the root of the repository: {error}", field="module", value=name
+            ) from None
         if absent := [one for one in needed if not hasattr(module, one)]:
             raise InputError(f"expected {', '.join(absent)} in it", field="module", value=name)
 
 
 def arguments(words: list[str] | None = None) -> argparse.Namespace:
-    options = argparse.ArgumentParser(prog="python -m benchmarks.blind", description=__doc__,
-                                      formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = argparse.ArgumentParser(
+        prog="python -m benchmarks.blind", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     options.add_argument("--cases", type=int, default=300)
     options.add_argument("--seed", type=int, default=1, help="of the first case; the others follow it")
     options.add_argument("--jobs", type=int, default=2)
@@ -233,8 +270,13 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     options.add_argument("--out", type=Path, required=True, help="file of JSON lines")
     options.add_argument("--resume", action="store_true", help="continue the file")
     options.add_argument("--unseen", action="store_true", help="also predict a campaign that the finder never saw")
-    options.add_argument("--cluttered", type=float, default=0.0, metavar="SHARE",
-                         help="of the cases, by seed: the table is off its rig file in everything a little")
+    options.add_argument(
+        "--cluttered",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="of the cases, by seed: the table is off its rig file in everything a little",
+    )
     options.add_argument("--limit", type=float, default=900.0, help="longest that an answer may take [s]")
     options.add_argument("--kind", choices=KINDS, help="of every case; drawn otherwise")
     options.add_argument("--effect", help="of every case; drawn otherwise")
@@ -256,13 +298,28 @@ def main(words: list[str] | None = None) -> None:
     given = arguments(words)
     if str(TESTS) not in sys.path:
         sys.path.append(str(TESTS))  # workers get this list too
-    settings = Settings(duration_s=given.duration, jobs=given.jobs, kind=given.kind, effect=given.effect,
-                        strength=given.strength, unseen=given.unseen, cluttered=given.cluttered, commit=commit())
+    settings = Settings(
+        duration_s=given.duration,
+        jobs=given.jobs,
+        kind=given.kind,
+        effect=given.effect,
+        strength=given.strength,
+        unseen=given.unseen,
+        cluttered=given.cluttered,
+        commit=commit(),
+    )
     try:
         check_modules(given.truth, given.finder, given.unseen)
-        failed = run(settings, range(given.seed, given.seed + given.cases), given.out, resume=given.resume,
-                     limit_s=given.limit, truth=given.truth, finder=given.finder,
-                     say=lambda text: print(text, file=sys.stderr, flush=True))
+        failed = run(
+            settings,
+            range(given.seed, given.seed + given.cases),
+            given.out,
+            resume=given.resume,
+            limit_s=given.limit,
+            truth=given.truth,
+            finder=given.finder,
+            say=lambda text: print(text, file=sys.stderr, flush=True),
+        )
     except AvisError as error:
         print(error, file=sys.stderr)
         raise SystemExit(error.exit_code) from None

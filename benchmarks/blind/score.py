@@ -1,6 +1,6 @@
 """Score a blind campaign from its JSON lines; nothing is simulated or fitted here.
 
-    python -m benchmarks.blind.score blind.jsonl [--markdown blind.md] [--png blind.png]
+python -m benchmarks.blind.score blind.jsonl [--markdown blind.md] [--png blind.png]
 """
 
 from __future__ import annotations
@@ -36,14 +36,23 @@ class Score:
     remarks: tuple[str, ...]
 
     def text(self) -> str:
-        return "\n\n".join([*self.remarks, *(one.text() for one in self.tables),
-                            "Hidden (rows) against answered (columns); cases with two effects left out\n"
-                            + self.confusion.text()])
+        return "\n\n".join(
+            [
+                *self.remarks,
+                *(one.text() for one in self.tables),
+                "Hidden (rows) against answered (columns); cases with two effects left out\n" + self.confusion.text(),
+            ]
+        )
 
     def markdown(self, picture: str | None = None) -> str:
-        parts = ["# Blind campaign", *self.remarks, *(one.markdown() for one in self.tables),
-                 "## Hidden (rows) against answered (columns)", "Cases with two effects are left out.",
-                 f"```text\n{self.confusion.text()}\n```"]
+        parts = [
+            "# Blind campaign",
+            *self.remarks,
+            *(one.markdown() for one in self.tables),
+            "## Hidden (rows) against answered (columns)",
+            "Cases with two effects are left out.",
+            f"```text\n{self.confusion.text()}\n```",
+        ]
         return "\n\n".join([*parts, *([f"![confusion matrix]({picture})"] if picture else [])]) + "\n"
 
 
@@ -54,29 +63,47 @@ def score(lines: Sequence[Line]) -> Score:
     # The issue asks of clean tables; what the same figures are on cluttered ones stands in a table of its own.
     clean = [case for case in cases if not case.line.cluttered] or cases
     asked = asked_table(clean, parameter_errors(clean)[0])
-    found = [tables.asked_rows(asked), clutter_table(cases), tables.verdict_table(cases), *tables.outcome_tables(cases),
-             tables.effect_table(cases), tables.group_table(cases), tables.calibration_table(cases, exact=True),
-             tables.calibration_table(cases, exact=False), tables.gap_table(cases),
-             tables.parameter_table(errors, unknown), tables.excitation_table(cases), tables.cost_table(cases)]
-    return Score(tuple(cases), tuple(asked), tuple(one for one in found if one.rows), Confusion.of(cases),
-                 tuple(remarks(cases)))
+    found = [
+        tables.asked_rows(asked),
+        clutter_table(cases),
+        tables.verdict_table(cases),
+        *tables.outcome_tables(cases),
+        tables.effect_table(cases),
+        tables.group_table(cases),
+        tables.calibration_table(cases, exact=True),
+        tables.calibration_table(cases, exact=False),
+        tables.gap_table(cases),
+        tables.parameter_table(errors, unknown),
+        tables.excitation_table(cases),
+        tables.cost_table(cases),
+    ]
+    return Score(
+        tuple(cases), tuple(asked), tuple(one for one in found if one.rows), Confusion.of(cases), tuple(remarks(cases))
+    )
 
 
 def remarks(cases: Sequence[Judged]) -> list[str]:
     """What the cases are, and what in them needs a look."""
     lines = [case.line for case in cases]
     settings, commits = lines[0].settings, sorted({line.settings.commit or "unknown" for line in lines})
-    forced = [f"{key} {value}" for key, value in (("kind", settings.kind), ("effect", settings.effect),
-                                                  ("strength", settings.strength)) if value is not None]
-    found = [f"{len(lines)} cases, seeds {lines[0].seed} to {lines[-1].seed}, records of {settings.duration_s:g} s; "
-             f"code {', '.join(commits)}" + ("; several versions of the code are mixed" if len(commits) > 1 else "")]
+    forced = [
+        f"{key} {value}"
+        for key, value in (("kind", settings.kind), ("effect", settings.effect), ("strength", settings.strength))
+        if value is not None
+    ]
+    found = [
+        f"{len(lines)} cases, seeds {lines[0].seed} to {lines[-1].seed}, records of {settings.duration_s:g} s; "
+        f"code {', '.join(commits)}" + ("; several versions of the code are mixed" if len(commits) > 1 else "")
+    ]
     if forced:
         found.append(f"Not a blind draw: {', '.join(forced)} in every case.")
     cluttered = sum(line.cluttered for line in lines)
     if cluttered:
-        found.append(f"{cluttered} cases have a cluttered table: off its rig file in everything a little, with traces "
-                     "of effects besides. Clean and cluttered cases are apart in the table of both, and "
-                     + ("what is asked counts the clean ones." if cluttered < len(lines) else "no case is clean."))
+        found.append(
+            f"{cluttered} cases have a cluttered table: off its rig file in everything a little, with traces "
+            "of effects besides. Clean and cluttered cases are apart in the table of both, and "
+            + ("what is asked counts the clean ones." if cluttered < len(lines) else "no case is clean.")
+        )
     if len(lines) < 300:
         found.append(f"{len(lines)} cases are fewer than the 300 asked for.")
     crashes = [line for line in lines if line.crash is not None]
@@ -87,8 +114,10 @@ def remarks(cases: Sequence[Judged]) -> list[str]:
         found.append("Answers that contradict the contract:\n" + "\n".join(f"  seed {s}: {what}" for s, what in broken))
     unseen = [line for line in lines if line.unseen_error is not None]
     if unseen:
-        found.append("Predictions of the unseen campaign that failed:\n"
-                     + "\n".join(f"  seed {line.seed}: {_last(line.unseen_error)}" for line in unseen))
+        found.append(
+            "Predictions of the unseen campaign that failed:\n"
+            + "\n".join(f"  seed {line.seed}: {_last(line.unseen_error)}" for line in unseen)
+        )
     return found
 
 
@@ -97,8 +126,11 @@ def _last(text: str | None) -> str:
 
 
 def main(words: list[str] | None = None) -> None:
-    options = argparse.ArgumentParser(prog="python -m benchmarks.blind.score", description=__doc__,
-                                      formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = argparse.ArgumentParser(
+        prog="python -m benchmarks.blind.score",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     options.add_argument("lines", type=Path)
     options.add_argument("--markdown", type=Path, help="file to write")
     options.add_argument("--png", type=Path, help="picture of the confusion matrix; by default beside the lines")

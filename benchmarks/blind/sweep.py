@@ -61,15 +61,35 @@ def case(point: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     seed, truth, finder = given.pop("seed"), given.pop("truth", TRUTH), given.pop("finder", FINDER)
     settings = Settings(jobs=1, commit=commit(), **given)
     told = _Told()
-    work(Task(seed, settings.duration_s, settings.kind, settings.effect, settings.strength, settings.unseen, truth,
-              finder, (), is_cluttered(seed, settings.cluttered)), told)
+    work(
+        Task(
+            seed,
+            settings.duration_s,
+            settings.kind,
+            settings.effect,
+            settings.strength,
+            settings.unseen,
+            truth,
+            finder,
+            (),
+            is_cluttered(seed, settings.cluttered),
+        ),
+        told,
+    )
     line = line_of(seed, told.content, settings)
     if line is None:
-        raise InputError(f"the truth failed: {str(told.content.get('truth_failed')).strip().splitlines()[-1]}",
-                         field="seed", value=seed)
-    figures = {"truth": line.kind, "hidden": "; ".join(one.name for one in line.hidden),
-               "named": "; ".join(one.name for one in line.answer.effects) if line.answer else "crash",
-               "verdict": line.answer.verdict if line.answer else "", "finder_seconds": line.seconds}
+        raise InputError(
+            f"the truth failed: {str(told.content.get('truth_failed')).strip().splitlines()[-1]}",
+            field="seed",
+            value=seed,
+        )
+    figures = {
+        "truth": line.kind,
+        "hidden": "; ".join(one.name for one in line.hidden),
+        "named": "; ".join(one.name for one in line.answer.effects) if line.answer else "crash",
+        "verdict": line.answer.verdict if line.answer else "",
+        "finder_seconds": line.seconds,
+    }
     return figures, line.model_dump()
 
 
@@ -81,8 +101,9 @@ def lines_of(folder: Path) -> list[Line]:
         kept = [json.loads((folder / "points" / f"{name}.json").read_text(encoding="utf-8")) for name in names]
         lines = [Line.model_validate(one["details"]) for one in kept]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"expected the folder of a sweep of blind cases ({' '.join(str(error).split())})", file=folder
-                         ) from None
+        raise InputError(
+            f"expected the folder of a sweep of blind cases ({' '.join(str(error).split())})", file=folder
+        ) from None
     if len({line.settings.campaign for line in lines}) > 1 or len({line.settings.commit for line in lines}) > 1:
         raise InputError("expected one campaign and one commit", file=folder)
     return lines

@@ -58,9 +58,13 @@ at_most = 1.0
 # Bands about each table's vertical modes, and a floor that uses a decent part of the drives.
 BOTH = '["z", "phi_x"]'
 # On the granite only z is measured absolutely; rotations are measured relative to the floor, which gives no isolation.
-ASKED = {"tripod": (BOTH, -6.0, 2.0, 8.0, 2e-5), "four_vertical": (BOTH, -6.0, 3.0, 12.0, 2e-5),
-         "twelve_sensors": (BOTH, -6.0, 2.0, 10.0, 2e-5), "skewed": (BOTH, -3.0, 8.0, 20.0, 2e-5),
-         "granite": ('["z"]', -3.0, 2.0, 6.0, 2e-5)}
+ASKED = {
+    "tripod": (BOTH, -6.0, 2.0, 8.0, 2e-5),
+    "four_vertical": (BOTH, -6.0, 3.0, 12.0, 2e-5),
+    "twelve_sensors": (BOTH, -6.0, 2.0, 10.0, 2e-5),
+    "skewed": (BOTH, -3.0, 8.0, 20.0, 2e-5),
+    "granite": ('["z"]', -3.0, 2.0, 6.0, 2e-5),
+}
 COMMAND = [sys.executable, "-c", "from avis_ctrl.cli import main; main()"]
 
 
@@ -79,11 +83,13 @@ def flow(name: str, form: str, seed: int, out: Path) -> dict:
     campaign, made = out / "campaign.h5", out / "design"
     write_campaign(truth(name, seed), form, campaign, seed=seed, floor_measured=True, settings=Settings(noise_s=60.0))
     keep, band_dB, low, high, floor = ASKED[name]
-    (out / "asked.toml").write_text(DESIGN.format(name=name, rig=rig, keep=keep, band_dB=band_dB, low=low, high=high,
-                                                   floor=floor))
+    (out / "asked.toml").write_text(
+        DESIGN.format(name=name, rig=rig, keep=keep, band_dB=band_dB, low=low, high=high, floor=floor)
+    )
     row: dict = {"table": name, "form": form}
     row["identify"], row["identify_said"], row["identify_s"] = command(
-        "identify", campaign, "--rig", rig, "--design", out / "asked.toml", "--out", out / "identified")
+        "identify", campaign, "--rig", rig, "--design", out / "asked.toml", "--out", out / "identified"
+    )
     source = out / "identified" / "design.toml" if row["identify"] == 0 else out / "asked.toml"
     row["design"], row["design_said"], row["design_s"] = command("design", source, "--out", made)
     if (made / "result.json").exists():
@@ -97,8 +103,9 @@ def flow(name: str, form: str, seed: int, out: Path) -> dict:
         identified = next(one for one in result["simulation"]["plants"] if one["name"] == "nominal")
         row |= {"package_radius": identified["spectral_radius"], "package_nominal_stable": identified["stable"]}
         # A verdict "unstable" may rest on a single perturbed plant, which the true table need not resemble.
-        row["agree"] = (row["package_nominal_stable"] == row["nominal_stable"]
-                        and (row["true_stable"] or not row["says_stable"]))
+        row["agree"] = row["package_nominal_stable"] == row["nominal_stable"] and (
+            row["true_stable"] or not row["says_stable"]
+        )
     return row
 
 

@@ -42,18 +42,29 @@ def bare_and_loaded() -> tuple[Halcyonics, Halcyonics]:
 
 
 def print_table(result: SequentialResult, actual: Halcyonics, source: Mapping[str, float] | None = None) -> None:
-    print(f"{'test':>4s} {'actuators':>17s} {'':>4s} {'parameter':>10s} {'':>10s} {'initial':>10s} {'final':>10s} "
-          f"{'st. dev.':>10s} {'actual':>10s} {'source':>10s} {'to rest':>10s}")
+    print(
+        f"{'test':>4s} {'actuators':>17s} {'':>4s} {'parameter':>10s} {'':>10s} {'initial':>10s} {'final':>10s} "
+        f"{'st. dev.':>10s} {'actual':>10s} {'source':>10s} {'to rest':>10s}"
+    )
     for row in result.rows(actual, source):
-        print(f"{row.test:4d} {row.actuators:>17s} {row.displacement:>4s} {row.parameter:>10s} {row.unit:>10s} "
-              f"{row.initial:10.5g} {row.final:10.5g} {row.deviation:10.2g} {row.actual or 0:10.5g} "
-              f"{'-' if row.source is None else format(row.source, '.5g'):>10s} {result.to_rest[row.parameter]:10.2g}")
-    print(f"{'converged' if result.converged else 'not converged'} after {result.iterations} iterations; "
-          f"distance to rest shrinks by {result.spread.rate:.3g} per iteration")
+        print(
+            f"{row.test:4d} {row.actuators:>17s} {row.displacement:>4s} {row.parameter:>10s} {row.unit:>10s} "
+            f"{row.initial:10.5g} {row.final:10.5g} {row.deviation:10.2g} {row.actual or 0:10.5g} "
+            f"{'-' if row.source is None else format(row.source, '.5g'):>10s} {result.to_rest[row.parameter]:10.2g}"
+        )
+    print(
+        f"{'converged' if result.converged else 'not converged'} after {result.iterations} iterations; "
+        f"distance to rest shrinks by {result.spread.rate:.3g} per iteration"
+    )
 
 
-def at_rest(start: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTests,
-            weighting: Weighting = "equal", rounds: int = 12) -> SequentialResult:
+def at_rest(
+    start: Halcyonics,
+    tests: Sequence[TestCase],
+    measured: MeasuredTests,
+    weighting: Weighting = "equal",
+    rounds: int = 12,
+) -> SequentialResult:
     """Where the scheme comes to rest: single rounds, each followed by the extrapolation to the rest point."""
     result = sequential_fit(start, tests, measured, weighting=weighting)
     for _ in range(rounds):
@@ -75,8 +86,10 @@ def table_1(bare: Halcyonics, starts: int = 20) -> None:
         one = sequential_fit(perturbed_start(bare, UNLOADED_TESTS, seed), UNLOADED_TESTS, measured)
         iterations.append(one.iterations if one.converged else -1)
         worst = max(worst, float(np.abs(one.history[-1] / values_of(bare, one.names) - 1).max()))
-    print(f"{starts} starts and noises: iterations {sorted(iterations)} (-1: not converged), largest error of any "
-          f"parameter {100 * worst:.2g} %")
+    print(
+        f"{starts} starts and noises: iterations {sorted(iterations)} (-1: not converged), largest error of any "
+        f"parameter {100 * worst:.2g} %"
+    )
 
 
 def table_2(bare: Halcyonics, loaded: Halcyonics) -> None:
@@ -96,21 +109,26 @@ def table_2(bare: Halcyonics, loaded: Halcyonics) -> None:
     print("truth " + "".join(f"{value:11.5g}" for value in values_of(loaded, result.names)))
     for name, one in (("stop", result), ("rest", rest)):
         assert one.chi_square is not None
-        print(f"mean squared distance over variance by test, at {name}: "
-              + " ".join(f"{value:.3g}" for value in one.chi_square.values()))
+        print(
+            f"mean squared distance over variance by test, at {name}: "
+            + " ".join(f"{value:.3g}" for value in one.chi_square.values())
+        )
 
 
 def other_masses(bare: Halcyonics, loaded: Halcyonics) -> None:
     print("\nNo noise, other loads (the source does not print m_e), and with the stiffnesses that the source ended at")
-    cases: dict[str, dict[str, float]] = {f"m_e = {mass:g} kg": {"load.mass": mass}
-                                          for mass in (2.5, 5, 7.5, 10, 15, 20)}
+    cases: dict[str, dict[str, float]] = {
+        f"m_e = {mass:g} kg": {"load.mass": mass} for mass in (2.5, 5, 7.5, 10, 15, 20)
+    }
     cases["source's k_s, k_t, k_r"] = {name: LOADED_SOURCE_FINAL[name] for name in ("k_s", "k_t", "k_r")}
     for label, change in cases.items():
         truth = loaded.with_parameters(change)
         assert truth.load is not None
         result = sequential_fit(loaded_start(bare, truth.load.mass), LOADED_TESTS, simulate_tests(truth, LOADED_TESTS))
-        print(f"{label:>24s}: {result.iterations} iterations, rate {result.spread.rate:.3f}, L7 "
-              f"{result.final['L7']:.4f}, L8 {result.final['L8']:.4f}, Iyy {result.final['Iyy_total']:.4f}")
+        print(
+            f"{label:>24s}: {result.iterations} iterations, rate {result.spread.rate:.3f}, L7 "
+            f"{result.final['L7']:.4f}, L8 {result.final['L8']:.4f}, Iyy {result.final['Iyy_total']:.4f}"
+        )
 
 
 def wrong_knowledge(bare: Halcyonics, loaded: Halcyonics) -> None:
@@ -119,15 +137,16 @@ def wrong_knowledge(bare: Halcyonics, loaded: Halcyonics) -> None:
     start = loaded_start(bare, loaded.load.mass)
     exact = simulate_tests(loaded, LOADED_TESTS)
     quiet = Analyser(averages=2, accelerometer_m_s2_rtHz=0.0, floor_m_s_rtHz=0.0)
-    cases = {"nothing wrong": (start, exact),
-             "m_e 2 % high": (loaded_start(bare, 1.02 * loaded.load.mass), exact),
-             "M2 5 mm out": (start.with_parameters({"M2_arm": bare.M2_arm + 0.005}), exact),
-             "M3 5 mm out": (start.with_parameters({"M3_arm": bare.M3_arm + 0.005}), exact),
-             "e_1 2 % high": (start.with_parameters({"e1": 1.02 * bare.e[0]}), exact),
-             "all e 2 % high": (start.with_parameters({f"e{k}": 1.02 * e for k, e in enumerate(bare.e, 1)}), exact),
-             "d_3 +10 % by the load": (start, simulate_tests(loaded.with_parameters({"d3": 1.1 * bare.d3}),
-                                                             LOADED_TESTS)),
-             "0.1 Hz corner left in": (start, simulate_tests(loaded, LOADED_TESTS, replace(quiet, low_corner_Hz=0.1)))}
+    cases = {
+        "nothing wrong": (start, exact),
+        "m_e 2 % high": (loaded_start(bare, 1.02 * loaded.load.mass), exact),
+        "M2 5 mm out": (start.with_parameters({"M2_arm": bare.M2_arm + 0.005}), exact),
+        "M3 5 mm out": (start.with_parameters({"M3_arm": bare.M3_arm + 0.005}), exact),
+        "e_1 2 % high": (start.with_parameters({"e1": 1.02 * bare.e[0]}), exact),
+        "all e 2 % high": (start.with_parameters({f"e{k}": 1.02 * e for k, e in enumerate(bare.e, 1)}), exact),
+        "d_3 +10 % by the load": (start, simulate_tests(loaded.with_parameters({"d3": 1.1 * bare.d3}), LOADED_TESTS)),
+        "0.1 Hz corner left in": (start, simulate_tests(loaded, LOADED_TESTS, replace(quiet, low_corner_Hz=0.1))),
+    }
     print(f"{'':>24s}  " + "".join(f"{name:>11s}" for name in LOADED_SOURCE_FINAL))
     for label, (begin, measured) in cases.items():
         try:
@@ -153,16 +172,23 @@ def monte_carlo(truth: Halcyonics, start: Halcyonics, tests: Sequence[TestCase],
             rest = at_rest(joint.rig, tests, measured, weighting)  # type: ignore[arg-type]
             found[label].append(rest.history[-1])
             if label == "rest":
-                expected = (np.sqrt(np.diag(rest.spread.sequential)), np.sqrt(np.diag(joint.covariance)),
-                            rest.spread.conditional)
+                expected = (
+                    np.sqrt(np.diag(rest.spread.sequential)),
+                    np.sqrt(np.diag(joint.covariance)),
+                    rest.spread.conditional,
+                )
     assert expected is not None
     names = stop.names
     actual = values_of(truth, names)
     columns = ["bias", "sd"] * 4
-    print(f"\n{seeds} noises; bias and standard deviation in % of the value "
-          f"(standard error of a bias: sd/{seeds**0.5:.1f})")
-    print(f"{'':>10s} {'5 % stop':>17s} {'rest (eq. 33)':>17s} {'weighted rest':>17s} {'joint':>17s} "
-          f"{'first-order sd: rest':>21s} {'joint':>8s} {'one test':>9s}")
+    print(
+        f"\n{seeds} noises; bias and standard deviation in % of the value "
+        f"(standard error of a bias: sd/{seeds**0.5:.1f})"
+    )
+    print(
+        f"{'':>10s} {'5 % stop':>17s} {'rest (eq. 33)':>17s} {'weighted rest':>17s} {'joint':>17s} "
+        f"{'first-order sd: rest':>21s} {'joint':>8s} {'one test':>9s}"
+    )
     print(f"{'':>10s} " + "".join(f"{c:>9s}" for c in columns))
     for k, name in enumerate(names):
         cells = []

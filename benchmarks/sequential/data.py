@@ -34,10 +34,16 @@ class MeasuredTests:
 
     def __post_init__(self) -> None:
         omega = np.asarray(self.omega, float)
-        if omega.ndim != 1 or omega.size < 1 or not np.all(np.isfinite(omega)) or omega[0] <= 0 \
-                or np.any(np.diff(omega) <= 0):
-            raise InputError("expected positive, increasing frequencies in rad/s", field="omega",
-                             value=omega.tolist()[:5])
+        if (
+            omega.ndim != 1
+            or omega.size < 1
+            or not np.all(np.isfinite(omega))
+            or omega[0] <= 0
+            or np.any(np.diff(omega) <= 0)
+        ):
+            raise InputError(
+                "expected positive, increasing frequencies in rad/s", field="omega", value=omega.tolist()[:5]
+            )
         object.__setattr__(self, "omega", omega)
         for field in ("transfers", "variance"):
             given = getattr(self, field)
@@ -48,13 +54,13 @@ class MeasuredTests:
                     self._check(f"{field} of test {number}", array, field == "variance")
                 object.__setattr__(self, field, arrays)
         if self.variance is not None and (missing := set(self.transfers) - set(self.variance)):
-            raise InputError("expected a variance for each test, or for none", field="variance",
-                             value=sorted(missing))
+            raise InputError("expected a variance for each test, or for none", field="variance", value=sorted(missing))
 
     def _check(self, field: str, array: np.ndarray, positive: bool) -> None:
         if array.shape != self.omega.shape or not np.all(np.isfinite(array)):
-            raise InputError(f"expected {self.omega.size} finite numbers, one for each frequency", field=field,
-                             value=array.shape)
+            raise InputError(
+                f"expected {self.omega.size} finite numbers, one for each frequency", field=field, value=array.shape
+            )
         if positive and np.any(array <= 0):
             raise InputError("expected positive variances", field=field, value=float(array.min()))
 
@@ -67,8 +73,12 @@ class MeasuredTests:
         slack = 1e-9
         keep = (self.frequency_Hz >= low_Hz * (1 - slack)) & (self.frequency_Hz <= high_Hz * (1 + slack))
         if not np.any(keep):
-            raise InputError(f"expected lines in the band; they go from {self.frequency_Hz[0]:.4g} to "
-                             f"{self.frequency_Hz[-1]:.4g} Hz", field="band_Hz", value=(low_Hz, high_Hz))
+            raise InputError(
+                f"expected lines in the band; they go from {self.frequency_Hz[0]:.4g} to "
+                f"{self.frequency_Hz[-1]:.4g} Hz",
+                field="band_Hz",
+                value=(low_Hz, high_Hz),
+            )
         variance = None if self.variance is None else {k: v[keep] for k, v in self.variance.items()}
         return MeasuredTests(self.omega[keep], {k: t[keep] for k, t in self.transfers.items()}, variance)
 
@@ -125,7 +135,7 @@ def voltage_transfers(rig: Halcyonics, rows: np.ndarray, patterns: np.ndarray, o
     """
     eom = rig.equations_of_motion()
     w = omega[:, None, None]
-    W = np.linalg.solve(-w**2 * eom.M + 1j * w * eom.C + eom.K, eom.T @ patterns.T)
+    W = np.linalg.solve(-(w**2) * eom.M + 1j * w * eom.C + eom.K, eom.T @ patterns.T)
     return np.einsum("kj,njk->kn", rows, W)
 
 
@@ -134,8 +144,13 @@ def row_of(rig: Halcyonics, test: TestCase) -> np.ndarray:
     return point_map(place_of(rig, test))["xyz".index(test.direction)]
 
 
-def simulate_tests(rig: Halcyonics, tests: Sequence[TestCase], noise: Analyser | None = None,
-                   seed: int | np.random.Generator = 0, omega: np.ndarray | None = None) -> MeasuredTests:
+def simulate_tests(
+    rig: Halcyonics,
+    tests: Sequence[TestCase],
+    noise: Analyser | None = None,
+    seed: int | np.random.Generator = 0,
+    omega: np.ndarray | None = None,
+) -> MeasuredTests:
     """Transfer functions as an analyser would measure them on this rig.
 
     Each drive case of each test is a run of its own (the source subtracts two runs). A run draws, for each line and
@@ -169,36 +184,41 @@ def disturbance_density(rig: Halcyonics, row: np.ndarray, omega: np.ndarray, noi
     """(n,) power spectral density [m^2/Hz] of what a measured displacement, row (6,), holds beside the drive."""
     eom = rig.equations_of_motion()
     w = omega[:, None, None]
-    G = -w**2 * eom.M + 1j * w * eom.C + eom.K
+    G = -(w**2) * eom.M + 1j * w * eom.C + eom.K
     carried = np.linalg.solve(G, (1j * w * eom.C_floor + eom.K_floor)[:, :, :3])
     through = np.einsum("j,njk->nk", row, carried)
-    floor = np.sum(np.abs(through)**2, axis=1) * (noise.floor_m_s_rtHz / omega)**2
-    return floor + (noise.accelerometer_m_s2_rtHz / omega**2)**2
+    floor = np.sum(np.abs(through) ** 2, axis=1) * (noise.floor_m_s_rtHz / omega) ** 2
+    return floor + (noise.accelerometer_m_s2_rtHz / omega**2) ** 2
 
 
 def _high_pass(omega: np.ndarray, corner_Hz: float) -> np.ndarray:
-    return (1j * omega / (1j * omega + 2 * np.pi * corner_Hz))**2
+    return (1j * omega / (1j * omega + 2 * np.pi * corner_Hz)) ** 2
 
 
-def _averaged(H: np.ndarray, disturbance: np.ndarray, noise: Analyser,
-              rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _averaged(
+    H: np.ndarray, disturbance: np.ndarray, noise: Analyser, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """H1 estimate and the variance read off it, (n,) each."""
     shape = (noise.averages, H.size)
 
     def circular() -> np.ndarray:
         return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
+
     V, N = noise.drive_V_rtHz * circular(), disturbance * circular()
     X = H * V + N
-    S_vv, S_xv = np.sum(np.abs(V)**2, axis=0), np.sum(X * V.conj(), axis=0)
-    unexplained = np.sum(np.abs(X)**2, axis=0) - np.abs(S_xv)**2 / S_vv
+    S_vv, S_xv = np.sum(np.abs(V) ** 2, axis=0), np.sum(X * V.conj(), axis=0)
+    unexplained = np.sum(np.abs(X) ** 2, axis=0) - np.abs(S_xv) ** 2 / S_vv
     # Rounding only: without any disturbance the difference of equal numbers may fall below zero.
     return S_xv / S_vv, np.maximum(unexplained, 1e-30 * S_vv) / ((noise.averages - 1) * S_vv)
 
 
-def transfers_from_response(response: FrequencyResponse, tests: Sequence[TestCase],
-                            outputs: Mapping[tuple[str, str], str] | None = None,
-                            actuators: Sequence[str] = ("A1", "A2", "A3", "A4", "A5", "A6", "A7", "A8"),
-                            delay_s: float = 0.0) -> MeasuredTests:
+def transfers_from_response(
+    response: FrequencyResponse,
+    tests: Sequence[TestCase],
+    outputs: Mapping[tuple[str, str], str] | None = None,
+    actuators: Sequence[str] = ("A1", "A2", "A3", "A4", "A5", "A6", "A7", "A8"),
+    delay_s: float = 0.0,
+) -> MeasuredTests:
     """The tests' transfer functions out of one measured frequency response matrix.
 
     Parameters
@@ -214,13 +234,16 @@ def transfers_from_response(response: FrequencyResponse, tests: Sequence[TestCas
     share an experiment is dropped. Raises InputError for a missing channel or another unit.
     """
     if response.input_unit != "V" or response.output_unit not in _DERIVATIVE:
-        raise InputError(f"expected inputs in V and outputs in one of {', '.join(_DERIVATIVE)}",
-                         field="input_unit, output_unit", value=(response.input_unit, response.output_unit))
+        raise InputError(
+            f"expected inputs in V and outputs in one of {', '.join(_DERIVATIVE)}",
+            field="input_unit, output_unit",
+            value=(response.input_unit, response.output_unit),
+        )
     omega = response.omega
     if omega[0] <= 0:
         response = response.at(omega > 0)
         omega = response.omega
-    to_displacement = np.exp(1j * omega * delay_s) / (1j * omega)**_DERIVATIVE[response.output_unit]
+    to_displacement = np.exp(1j * omega * delay_s) / (1j * omega) ** _DERIVATIVE[response.output_unit]
     inverse = None if response.gram is None else np.linalg.inv(response.gram)
     if len(actuators) != 8:
         raise InputError("expected the names of A1..A8", field="actuators", value=list(actuators))
@@ -236,7 +259,7 @@ def transfers_from_response(response: FrequencyResponse, tests: Sequence[TestCas
             spread = response.variance()[:, row] @ pattern**2
         else:
             spread = np.real(np.einsum("j,nkj,k->n", pattern, inverse, pattern) * response.noise[:, row, row])
-        variance[test.number] = np.abs(to_displacement)**2 * spread
+        variance[test.number] = np.abs(to_displacement) ** 2 * spread
     return MeasuredTests(omega, transfers, variance)
 
 

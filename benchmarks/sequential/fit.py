@@ -128,12 +128,27 @@ class SequentialResult:
     def rows(self, actual: Halcyonics | None = None, source: Mapping[str, float] | None = None) -> list[TableRow]:
         """Rows as in Tables 1 and 2; `actual` the rig that was measured, where it is known."""
         truth = None if actual is None else dict(zip(self.names, values_of(actual, self.names).tolist(), strict=True))
-        start, final, deviation = dict(zip(self.names, self.history[0], strict=True)), self.final, \
-            self.standard_deviation
-        return [TableRow(test.number, test.actuators, test.displacement, name, unit_of(self.rig, name),
-                         float(start[name]), final[name], deviation[name], None if truth is None else truth[name],
-                         (source or {}).get(name))
-                for test in self.tests for name in test.parameters]
+        start, final, deviation = (
+            dict(zip(self.names, self.history[0], strict=True)),
+            self.final,
+            self.standard_deviation,
+        )
+        return [
+            TableRow(
+                test.number,
+                test.actuators,
+                test.displacement,
+                name,
+                unit_of(self.rig, name),
+                float(start[name]),
+                final[name],
+                deviation[name],
+                None if truth is None else truth[name],
+                (source or {}).get(name),
+            )
+            for test in self.tests
+            for name in test.parameters
+        ]
 
     def figure(self, number: int) -> FigureData:
         """Experiment and theory of one test over 2.5-40 Hz, as far as it was measured."""
@@ -143,8 +158,14 @@ class SequentialResult:
         problem = Problem(self.rig, [test], self.measured.between(*DRAWN_HZ))
         e_r = self.rig.e[test.reference - 1]
         measured, theory = problem.measured.transfers[number] / e_r, problem.theory(self.rig, [test])[0] / e_r
-        return FigureData(test, problem.measured.frequency_Hz, _decibel(measured), _decibel(theory),
-                          _degrees(measured), _degrees(theory))
+        return FigureData(
+            test,
+            problem.measured.frequency_Hz,
+            _decibel(measured),
+            _decibel(theory),
+            _degrees(measured),
+            _degrees(theory),
+        )
 
 
 def _decibel(transfer: np.ndarray) -> np.ndarray:
@@ -155,9 +176,16 @@ def _degrees(transfer: np.ndarray) -> np.ndarray:
     return np.rad2deg(np.unwrap(np.angle(transfer)))
 
 
-def sequential_fit(rig: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTests, *,
-                   band_Hz: tuple[float, float] = BAND_HZ, tolerance: float = 0.05, max_iterations: int = 50,
-                   weighting: Weighting = "equal") -> SequentialResult:
+def sequential_fit(
+    rig: Halcyonics,
+    tests: Sequence[TestCase],
+    measured: MeasuredTests,
+    *,
+    band_Hz: tuple[float, float] = BAND_HZ,
+    tolerance: float = 0.05,
+    max_iterations: int = 50,
+    weighting: Weighting = "equal",
+) -> SequentialResult:
     """Fit the tests' parameters one test after the other, round after round.
 
     Parameters
@@ -183,13 +211,23 @@ def sequential_fit(rig: Halcyonics, tests: Sequence[TestCase], measured: Measure
         theta = history[-1]
         for step in problem.steps:
             theta = problem.minimise(step.tests, step.parameters, theta)
-        converged = bool(np.all(np.abs(theta - history[-1])
-                                <= tolerance * np.maximum(np.abs(history[-1]), smallest)))
+        converged = bool(np.all(np.abs(theta - history[-1]) <= tolerance * np.maximum(np.abs(history[-1]), smallest)))
         history.append(theta)
     final = problem.rig_at(history[-1])
     misfit, chi_square = _quality(problem, final)
-    return SequentialResult(tuple(tests), final, problem.names, np.array(history), converged, len(history) - 1,
-                            tolerance, spread_at(problem, history[-1]), misfit, chi_square, measured)
+    return SequentialResult(
+        tuple(tests),
+        final,
+        problem.names,
+        np.array(history),
+        converged,
+        len(history) - 1,
+        tolerance,
+        spread_at(problem, history[-1]),
+        misfit,
+        chi_square,
+        measured,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +248,9 @@ class JointResult:
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
 
-def joint_fit(rig: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTests, *,
-              band_Hz: tuple[float, float] = BAND_HZ) -> JointResult:
+def joint_fit(
+    rig: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTests, *, band_Hz: tuple[float, float] = BAND_HZ
+) -> JointResult:
     """All parameters from all tests at once, weighted by the measured variances: what the sequential fit is judged by.
 
     `rig` holds the starting values: take those of a sequential fit. From the printed start of Table 2 the search ended
@@ -230,8 +269,8 @@ def _quality(problem: Problem, rig: Halcyonics) -> tuple[dict[int, float], dict[
     misfit, chi_square = {}, {}
     for test in problem.tests:
         experiment = problem.measured.transfers[test.number]
-        distance = np.abs(problem.theory(rig, [test])[0] - experiment)**2
-        misfit[test.number] = float(np.sqrt(np.sum(distance) / np.sum(np.abs(experiment)**2)))
+        distance = np.abs(problem.theory(rig, [test])[0] - experiment) ** 2
+        misfit[test.number] = float(np.sqrt(np.sum(distance) / np.sum(np.abs(experiment) ** 2)))
         if variance is not None:
             chi_square[test.number] = float(np.mean(distance / variance[test.number]))
     return misfit, None if variance is None else chi_square

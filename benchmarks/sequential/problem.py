@@ -12,13 +12,7 @@ from scipy.optimize import least_squares
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from benchmarks.sequential.data import MeasuredTests, row_of, voltage_transfers
-from benchmarks.sequential.published import (
-    SIGNED,
-    TestCase,
-    parameters_of,
-    values_of,
-    with_values,
-)
+from benchmarks.sequential.published import SIGNED, TestCase, parameters_of, values_of, with_values
 
 Weighting = Literal["equal", "variance"]
 # Unit of the search for a parameter that may vanish [m or kg m^2]; positive ones are searched by their logarithm.
@@ -49,13 +43,15 @@ class Problem:
     weighting : "equal" is eq. 33, every line alike. "variance" divides each line by its measured variance.
     """
 
-    def __init__(self, rig: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTests,
-                 weighting: Weighting = "equal"):
+    def __init__(
+        self, rig: Halcyonics, tests: Sequence[TestCase], measured: MeasuredTests, weighting: Weighting = "equal"
+    ):
         if weighting not in ("equal", "variance"):
             raise InputError("expected equal or variance", field="weighting", value=weighting)
         if weighting == "variance" and measured.variance is None:
-            raise InputError("the measured transfers carry no variance to weight with", field="weighting",
-                             value=weighting)
+            raise InputError(
+                "the measured transfers carry no variance to weight with", field="weighting", value=weighting
+            )
         self.rig, self.tests, self.measured = rig, tuple(tests), measured
         self.names, self.steps = parameters_of(tests), steps_of(tests)
         self.start = values_of(rig, self.names)
@@ -67,20 +63,24 @@ class Problem:
         self.scale = {test.number: self._scale(step, test, weighting) for step in self.steps for test in step.tests}
         self.positive = np.array([name not in SIGNED for name in self.names])
         if np.any(self.start[self.positive] <= 0):
-            wrong = [name for name, value in zip(self.names, self.start, strict=True)
-                     if name not in SIGNED and value <= 0]
+            wrong = [
+                name for name, value in zip(self.names, self.start, strict=True) if name not in SIGNED and value <= 0
+            ]
             raise InputError("expected positive starting values", field="rig", value=wrong)
         for step in self.steps:
             if 2 * measured.omega.size <= len(step.parameters):
-                raise InputError(f"expected more lines in the band for {', '.join(step.parameters)}",
-                                 field="measured", value=measured.omega.size)
+                raise InputError(
+                    f"expected more lines in the band for {', '.join(step.parameters)}",
+                    field="measured",
+                    value=measured.omega.size,
+                )
 
     def _scale(self, step: Step, test: TestCase, weighting: Weighting) -> np.ndarray:
         """Divisor of each line: makes the residual a number near one, alike within a step for eq. 33."""
         if weighting == "variance":
             assert self.measured.variance is not None
             return np.sqrt(self.measured.variance[test.number] / 2)
-        power = sum(float(np.sum(np.abs(self.measured.transfers[t.number])**2)) for t in step.tests)
+        power = sum(float(np.sum(np.abs(self.measured.transfers[t.number]) ** 2)) for t in step.tests)
         if power == 0:
             raise InputError("expected a transfer that is not zero everywhere", field=f"test {test.number}")
         return np.full(self.measured.omega.size, np.sqrt(power))
@@ -96,8 +96,10 @@ class Problem:
 
     def residual(self, tests: Sequence[TestCase], theta: np.ndarray) -> np.ndarray:
         """Real and imaginary parts of theory minus experiment over `scale`, stacked."""
-        parts = [(transfer - self.measured.transfers[test.number]) / self.scale[test.number]
-                 for test, transfer in zip(tests, self.theory(self.rig_at(theta), tests), strict=True)]
+        parts = [
+            (transfer - self.measured.transfers[test.number]) / self.scale[test.number]
+            for test, transfer in zip(tests, self.theory(self.rig_at(theta), tests), strict=True)
+        ]
         return np.concatenate([part.view(float) for part in parts])
 
     def jacobian(self, tests: Sequence[TestCase], theta: np.ndarray) -> np.ndarray:
@@ -121,6 +123,7 @@ class Problem:
             moved = theta.copy()
             moved[free] = np.where(positive, base * np.exp(np.where(positive, x, 0.0)), base + _SIGNED_UNIT * x)
             return moved
+
         refused = 10 * np.ones_like(self.residual(tests, theta)) * (1 + np.abs(self.residual(tests, theta)).max())
 
         def residual(x: np.ndarray) -> np.ndarray:
@@ -129,27 +132,32 @@ class Problem:
             except InputError:  # no positive definite mass matrix there: the search steps back
                 return refused
             return found if np.all(np.isfinite(found)) else refused
-        found = least_squares(residual, np.zeros(len(free)), jac="3-point", xtol=1e-9, ftol=1e-12, gtol=1e-14,
-                              max_nfev=200)
+
+        found = least_squares(
+            residual, np.zeros(len(free)), jac="3-point", xtol=1e-9, ftol=1e-12, gtol=1e-14, max_nfev=200
+        )
         if not found.success:
-            raise ComputationError(f"the fit of {', '.join(names)} to test {', '.join(str(t.number) for t in tests)} "
-                                   "found no minimum", measured=f"{found.nfev} evaluations, cost {found.cost:.3g}",
-                                   cause="a start far off, or transfers that do not hold these parameters",
-                                   next_step="start nearer, or look at the measured transfer of that test")
+            raise ComputationError(
+                f"the fit of {', '.join(names)} to test {', '.join(str(t.number) for t in tests)} found no minimum",
+                measured=f"{found.nfev} evaluations, cost {found.cost:.3g}",
+                cause="a start far off, or transfers that do not hold these parameters",
+                next_step="start nearer, or look at the measured transfer of that test",
+            )
         away = [name for name, up, x in zip(names, positive, found.x, strict=True) if up and abs(x) > _RUNAWAY]
         if away:
-            raise ComputationError(f"the fit to test {', '.join(str(t.number) for t in tests)} ran away",
-                                   measured=", ".join(f"{name} = {at(found.x)[self.names.index(name)]:.3g}"
-                                                      for name in away),
-                                   cause="a start too far off, or transfers that do not hold these parameters",
-                                   next_step="start nearer: for the joint fit, from the result of the sequential one")
+            raise ComputationError(
+                f"the fit to test {', '.join(str(t.number) for t in tests)} ran away",
+                measured=", ".join(f"{name} = {at(found.x)[self.names.index(name)]:.3g}" for name in away),
+                cause="a start too far off, or transfers that do not hold these parameters",
+                next_step="start nearer: for the joint fit, from the result of the sequential one",
+            )
         return at(found.x)
 
     def line_variance(self, test: TestCase, theta: np.ndarray) -> np.ndarray:
         """E|error|^2 [m^2/V^2] of each line, (n,): measured, otherwise the mean of what the fit leaves in this test."""
         if self.measured.variance is not None:
             return self.measured.variance[test.number]
-        left = np.abs(self.theory(self.rig_at(theta), [test])[0] - self.measured.transfers[test.number])**2
+        left = np.abs(self.theory(self.rig_at(theta), [test])[0] - self.measured.transfers[test.number]) ** 2
         n = self.measured.omega.size
         return np.full(n, float(np.sum(left)) / (n - len(test.parameters) / 2))
 
@@ -197,12 +205,15 @@ def spread_at(problem: Problem, theta: np.ndarray) -> Spread:
         try:
             J = problem.jacobian(step.tests, theta)
         except InputError as error:
-            raise ComputationError("the fit came to rest where the inertia is no longer that of a body",
-                                   measured=f"{', '.join(problem.names)} = {np.array2string(theta, precision=4)}",
-                                   cause="a wrong start, load mass or measured point: the scheme has such rest points",
-                                   next_step="check them, or fit all tests jointly") from error
-        half = np.concatenate([np.repeat(problem.line_variance(t, theta) / problem.scale[t.number]**2 / 2, 2)
-                               for t in step.tests])
+            raise ComputationError(
+                "the fit came to rest where the inertia is no longer that of a body",
+                measured=f"{', '.join(problem.names)} = {np.array2string(theta, precision=4)}",
+                cause="a wrong start, load mass or measured point: the scheme has such rest points",
+                next_step="check them, or fit all tests jointly",
+            ) from error
+        half = np.concatenate(
+            [np.repeat(problem.line_variance(t, theta) / problem.scale[t.number] ** 2 / 2, 2) for t in step.tests]
+        )
         A[own] = J[:, own].T @ J
         noise[np.ix_(own, own)] = J[:, own].T @ (half[:, None] * J[:, own])
         if np.all(half > 0):
@@ -212,8 +223,12 @@ def spread_at(problem: Problem, theta: np.ndarray) -> Spread:
     size = np.linalg.norm(scaled, axis=1, keepdims=True)
     condition = np.linalg.cond(scaled / size) if np.all(size > 0) else np.inf
     if not np.all(np.diag(A) > 0) or not condition < 1e12:
-        raise ComputationError("the tests do not determine their parameters", measured=f"condition {condition:.2g}",
-                               cause="a parameter that its test does not see", next_step="use another test for it")
+        raise ComputationError(
+            "the tests do not determine their parameters",
+            measured=f"condition {condition:.2g}",
+            cause="a parameter that its test does not see",
+            next_step="use another test for it",
+        )
     lower = np.zeros_like(A)
     conditional = np.zeros(p)
     before: list[int] = []

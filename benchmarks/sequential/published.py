@@ -48,8 +48,11 @@ class TestCase:
     def __post_init__(self) -> None:
         driven = (*self.plus, *self.minus)
         if not self.plus or len(set(driven)) != len(driven) or not set(driven) <= set(range(1, 9)):
-            raise InputError("expected different actuators out of 1..8, at least one in phase",
-                             field=f"test {self.number}: plus, minus", value=(self.plus, self.minus))
+            raise InputError(
+                "expected different actuators out of 1..8, at least one in phase",
+                field=f"test {self.number}: plus, minus",
+                value=(self.plus, self.minus),
+            )
         if self.direction not in ("x", "y", "z"):
             raise InputError("expected x, y or z", field=f"test {self.number}: direction", value=self.direction)
         if not self.parameters:
@@ -100,7 +103,8 @@ UNLOADED_TESTS = (
     # Printed d_7; eq. 17 has no such entry: the horizontal damping d_1.
     TestCase(10, (7,), (), "M1", "x", ("e7", "d1"), "horizontal"),
     TestCase(11, (8,), (), "M1", "x", ("e8",), "horizontal"),
-    TestCase(12, (5, 7), (), "M3", "x", ("Izz", "k_r", "d6")))
+    TestCase(12, (5, 7), (), "M3", "x", ("Izz", "k_r", "d6")),
+)
 
 LOADED_TESTS = (
     TestCase(1, (1, 3), (), "M2", "z", ("L7",)),
@@ -110,19 +114,47 @@ LOADED_TESTS = (
     TestCase(5, (1, 4), (2, 3), "M2", "z", ("Iyy_total",), figure=10),
     TestCase(6, (1, 2), (), "M2", "z", ("Ixy_load",), figure=11),
     TestCase(7, (5, 7), (), "M3", "x", ("Izz_total", "k_r"), figure=12),
-    TestCase(8, (5, 8), (), "M1", "x", ("k_t", "L9"), figure=13))
+    TestCase(8, (5, 8), (), "M1", "x", ("k_t", "L9"), figure=13),
+)
 
 # Table 2 as printed: the start, and what the source found on its hardware after four iterations.
-LOADED_START = {"L7": 0.0, "L8": 0.0, "k_s": 11300.0, "Ixx_total": 0.340, "Iyy_total": 0.259, "Ixy_load": 0.0,
-                "Izz_total": 0.500, "k_r": 1590.0, "k_t": 37600.0, "L9": 0.08}
-LOADED_SOURCE_FINAL = {"L7": -0.064, "L8": 0.048, "k_s": 12100.0, "Ixx_total": 0.433, "Iyy_total": 0.278,
-                       "Ixy_load": 0.092, "Izz_total": 0.752, "k_r": 1660.0, "k_t": 33300.0, "L9": 0.117}
+LOADED_START = {
+    "L7": 0.0,
+    "L8": 0.0,
+    "k_s": 11300.0,
+    "Ixx_total": 0.340,
+    "Iyy_total": 0.259,
+    "Ixy_load": 0.0,
+    "Izz_total": 0.500,
+    "k_r": 1590.0,
+    "k_t": 37600.0,
+    "L9": 0.08,
+}
+LOADED_SOURCE_FINAL = {
+    "L7": -0.064,
+    "L8": 0.048,
+    "k_s": 12100.0,
+    "Ixx_total": 0.433,
+    "Iyy_total": 0.278,
+    "Ixy_load": 0.092,
+    "Izz_total": 0.752,
+    "k_r": 1660.0,
+    "k_t": 33300.0,
+    "L9": 0.117,
+}
 SOURCE_ITERATIONS = 4
 
 # Parameters of Table 2 that are not parameters of the rig by the same name. The totals are plate plus the load's own
 # moment about its own centre of mass, without the terms m_e L^2 of eq. 16 (see `Load`).
-_OF_LOAD = {"L7": "load.L7", "L8": "load.L8", "L9": "load.L9", "Ixy_load": "load.Ixy",
-            "Ixx_total": "load.Ixx", "Iyy_total": "load.Iyy", "Izz_total": "load.Izz"}
+_OF_LOAD = {
+    "L7": "load.L7",
+    "L8": "load.L8",
+    "L9": "load.L9",
+    "Ixy_load": "load.Ixy",
+    "Ixx_total": "load.Ixx",
+    "Iyy_total": "load.Iyy",
+    "Izz_total": "load.Izz",
+}
 _PLATE = {"Ixx_total": "Ixx", "Iyy_total": "Iyy", "Izz_total": "Izz"}
 # Parameters that may vanish or be negative, with the size below which a change counts for nothing.
 SIGNED = {"L7": 1e-3, "L8": 1e-3, "L9": 1e-3, "L6": 1e-3, "Ixy_load": 1e-3}
@@ -159,8 +191,11 @@ def unit_of(rig: Halcyonics, name: str) -> str:
 def _rig_name(rig: Halcyonics, name: str) -> str:
     own = _OF_LOAD.get(name, name)
     if own.startswith("load.") and rig.load is None:
-        raise InputError("this parameter belongs to a load and the rig carries none; start from loaded_start()",
-                         field="parameter", value=name)
+        raise InputError(
+            "this parameter belongs to a load and the rig carries none; start from loaded_start()",
+            field="parameter",
+            value=name,
+        )
     return own
 
 
@@ -192,8 +227,9 @@ def loaded_start(unloaded: Halcyonics, load_mass: float, L9: float = LOADED_STAR
     return replace(unloaded, load=Load(load_mass, 0.0, 0.0, L9, 0.0, 0.0, 0.0))
 
 
-def perturbed_start(rig: Halcyonics, tests: Sequence[TestCase], seed: int | np.random.Generator,
-                    least: float = 0.2, most: float = 0.3) -> Halcyonics:
+def perturbed_start(
+    rig: Halcyonics, tests: Sequence[TestCase], seed: int | np.random.Generator, least: float = 0.2, most: float = 0.3
+) -> Halcyonics:
     """The rig with every parameter of the tests off by 20-30 %, up or down at random.
 
     The source does not print where its unloaded identification started; this start is ours.

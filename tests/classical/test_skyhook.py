@@ -11,7 +11,7 @@ from avis_ctrl.lti import StateSpace, gain, lft_lower
 
 MASS, NATURAL_HZ, DAMPING_RATIO = 200.0, 2.0, 0.05
 OMEGA_N = 2 * np.pi * NATURAL_HZ
-STIFFNESS, DAMPING = MASS * OMEGA_N ** 2, 2 * DAMPING_RATIO * OMEGA_N * MASS
+STIFFNESS, DAMPING = MASS * OMEGA_N**2, 2 * DAMPING_RATIO * OMEGA_N * MASS
 
 
 def table(seen: str = "seen_z_dot") -> StateSpace:
@@ -35,8 +35,9 @@ def test_transmissibility_is_that_of_the_thesis(velocity_gain):
     loops = Skyhook(("z",), (g,), 1e-4, 1e5)
     omega = 2 * np.pi * np.geomspace(0.5, 20.0, 60)
     s = 1j * omega
-    expected = (2 * DAMPING_RATIO * OMEGA_N * s + OMEGA_N ** 2) / (
-        s ** 2 + (2 * DAMPING_RATIO * OMEGA_N + g / MASS) * s + OMEGA_N ** 2)
+    expected = (2 * DAMPING_RATIO * OMEGA_N * s + OMEGA_N**2) / (
+        s**2 + (2 * DAMPING_RATIO * OMEGA_N + g / MASS) * s + OMEGA_N**2
+    )
     closed = lft_lower(table(), loops.controller()).frequency_response(omega)[:, 0, 0]
     np.testing.assert_allclose(closed, expected, rtol=1e-3)
     passive = table().select("z_dot", "floor").frequency_response(omega)[:, 0, 0]
@@ -59,8 +60,9 @@ def test_filter_is_a_first_order_pair():
     loops = Skyhook(("z",), (1.0,), 0.1, 100.0)
     s = 1j * 2 * np.pi * np.geomspace(1e-3, 1e4, 40)
     tilt, roll = 2 * np.pi * 0.1, 2 * np.pi * 100.0
-    np.testing.assert_allclose(loops.filter.frequency_response(s.imag)[:, 0, 0], s / (s + tilt) / (s / roll + 1),
-                               rtol=1e-10)
+    np.testing.assert_allclose(
+        loops.filter.frequency_response(s.imag)[:, 0, 0], s / (s + tilt) / (s / roll + 1), rtol=1e-10
+    )
     assert loops.filter.dcgain() == pytest.approx(0.0, abs=1e-14)  # gravity and drift stay outside
 
 
@@ -85,11 +87,19 @@ def test_six_loops_by_axis():
     assert loops.controller().nstates == 12
 
 
-@pytest.mark.parametrize(("gains", "tilt", "roll", "words"), [
-    ((1.0, 2.0), 0.1, 100.0, "gains"), ((1.0,), 0.0, 100.0, "tilt_corner_Hz"), ((1.0,), -1.0, 100.0, "tilt_corner_Hz"),
-    ((1.0,), 0.1, float("nan"), "roll_off_Hz"), ((1.0,), 0.1, float("inf"), "roll_off_Hz"),
-    ((1.0,), 100.0, 0.1, "below the roll-off"), ((float("nan"),), 0.1, 100.0, "gains"),
-    ((-1.0,), 0.1, 100.0, "gains")])
+@pytest.mark.parametrize(
+    ("gains", "tilt", "roll", "words"),
+    [
+        ((1.0, 2.0), 0.1, 100.0, "gains"),
+        ((1.0,), 0.0, 100.0, "tilt_corner_Hz"),
+        ((1.0,), -1.0, 100.0, "tilt_corner_Hz"),
+        ((1.0,), 0.1, float("nan"), "roll_off_Hz"),
+        ((1.0,), 0.1, float("inf"), "roll_off_Hz"),
+        ((1.0,), 100.0, 0.1, "below the roll-off"),
+        ((float("nan"),), 0.1, 100.0, "gains"),
+        ((-1.0,), 0.1, 100.0, "gains"),
+    ],
+)
 def test_what_is_refused(gains, tilt, roll, words):
     with pytest.raises(InputError, match=words):
         Skyhook(("z",), gains, tilt, roll)

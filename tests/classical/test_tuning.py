@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.classical.skyhook import Skyhook
-from avis_ctrl.classical.tuning import (
-    Merit,
-    Scenarios,
-    Search,
-    TuningRange,
-    encirclements,
-)
+from avis_ctrl.classical.tuning import Merit, Scenarios, Search, TuningRange, encirclements
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.design_file import read_design
@@ -45,8 +39,9 @@ def critical() -> tuple[float, ...]:
 
 def random_skyhook(rng: np.random.Generator, critical: tuple[float, ...], reach: float) -> Skyhook:
     factors = np.exp(rng.uniform(np.log(0.1), np.log(reach), 2))
-    return Skyhook(("z", "phi_x_edge"), tuple(factors * critical), float(rng.uniform(0.02, 1.0)),
-                   float(rng.uniform(30.0, 400.0)))
+    return Skyhook(
+        ("z", "phi_x_edge"), tuple(factors * critical), float(rng.uniform(0.02, 1.0)), float(rng.uniform(30.0, 400.0))
+    )
 
 
 def diagonal(skyhook: Skyhook, omega: np.ndarray) -> np.ndarray:
@@ -75,8 +70,9 @@ def test_complex_scenarios_close_in_either_order(plant, scenarios, critical, rng
     found = scenarios.channels().closed(diagonal(skyhook, OMEGA))
     for k, n in product(range(len(scenarios.deltas)), range(0, OMEGA.size, 7)):
         delta, M = scenarios.deltas[k, n], response[n]
-        expected = M[n_z:, n_w:] + M[n_z:, :n_w] @ delta @ np.linalg.inv(
-            np.eye(n_z) - M[:n_z, :n_w] @ delta) @ M[:n_z, n_w:]
+        expected = (
+            M[n_z:, n_w:] + M[n_z:, :n_w] @ delta @ np.linalg.inv(np.eye(n_z) - M[:n_z, :n_w] @ delta) @ M[:n_z, n_w:]
+        )
         np.testing.assert_allclose(found[k, n], expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
@@ -126,8 +122,10 @@ def test_half_turns_count_unstable_poles():
 def tuned(scenarios, critical) -> tuple[Skyhook, float]:
     limit = 10 ** (4 / 20)
     task = Search(scenarios, ("z", "phi_x_edge"), TuningRange(critical), BAND_HZ)
-    best = min((task.improved(start, limit) for start in task.best_starts(limit)),
-               key=lambda point: task.merit(point, limit).key())
+    best = min(
+        (task.improved(start, limit) for start in task.best_starts(limit)),
+        key=lambda point: task.merit(point, limit).key(),
+    )
     return task.search.skyhook(task.axes, best), limit
 
 
@@ -147,8 +145,9 @@ def test_tuning_keeps_the_peak_limit_on_its_samples(tuned, scenarios):
 def test_tuning_beats_a_grid(tuned, scenarios, critical):
     skyhook, limit = tuned
     best = np.inf
-    for a, b, tilt, roll in product(np.geomspace(0.1, 10.0, 7), np.geomspace(0.1, 10.0, 7), (0.02, 0.15, 1.0),
-                                    (30.0, 110.0, 400.0)):
+    for a, b, tilt, roll in product(
+        np.geomspace(0.1, 10.0, 7), np.geomspace(0.1, 10.0, 7), (0.02, 0.15, 1.0), (30.0, 110.0, 400.0)
+    ):
         one = Skyhook(("z", "phi_x_edge"), (a * critical[0], b * critical[1]), tilt, roll)
         if scenarios.plant.closed(one.controller()).is_stable():
             peak, band = measured(scenarios, one)
@@ -174,6 +173,7 @@ def test_slopes_of_the_search_are_those_of_the_singular_values(scenarios, critic
     def log_sigma(at):
         K = diagonal(search.search.skyhook(search.axes, at), OMEGA)
         return np.log(np.linalg.norm(scenarios.channels().closed(K), ord=2, axis=(-2, -1)))
+
     values, slopes, in_band = search._linearised(point, reach=np.inf)
     np.testing.assert_allclose(values, log_sigma(point).ravel(), rtol=1e-9)
     assert np.array_equal(in_band.reshape(-1, OMEGA.size)[0], [BAND_HZ[0] <= f <= BAND_HZ[1] for f in TUNING_HZ])
@@ -193,8 +193,13 @@ def test_tuning_is_no_worse_than_any_start(tuned, scenarios, critical):
 
 
 def test_merit_puts_the_limit_first():
-    order = [Merit(1.5, 0.5, 1.6), Merit(1.0, 0.7, 1.6), Merit(1.7, 0.1, 1.6), Merit(9.0, 0.1, 1.6),
-             Merit(1.0, 0.1, 1.6, unstable=1.0)]
+    order = [
+        Merit(1.5, 0.5, 1.6),
+        Merit(1.0, 0.7, 1.6),
+        Merit(1.7, 0.1, 1.6),
+        Merit(9.0, 0.1, 1.6),
+        Merit(1.0, 0.1, 1.6, unstable=1.0),
+    ]
     assert sorted(order[::-1], key=Merit.key) == order
 
 

@@ -33,20 +33,42 @@ def write_folder(path: Path, design_name: str, make) -> Path:
     (path / "controllers").mkdir(parents=True)
     (path / "study.json").write_bytes(as_json(study_dict(design, rig)))
     (path / "controllers" / f"{made.name}.json").write_bytes(as_json(controller_dict(made)))
-    rows = [{"axis": one.axis, "gain": one.gain, "tilt_corner_Hz": one.tilt_corner_Hz,
-             "roll_off_Hz": one.roll_off_Hz, "modulus_margin": one.modulus_margin} for one in companions.loops]
-    (path / "result.json").write_bytes(as_json({
-        "format": "avis-design", "version": 1, "stable": True, "verdict": "",
-        "controllers": [{"name": made.name, "file": f"controllers/{made.name}.json"},
-                        {"name": "passive", "file": None}],
-        "all_axes": {"companions": rows}, "provenance": design_provenance(design, source, rig, 0.0)}))
+    rows = [
+        {
+            "axis": one.axis,
+            "gain": one.gain,
+            "tilt_corner_Hz": one.tilt_corner_Hz,
+            "roll_off_Hz": one.roll_off_Hz,
+            "modulus_margin": one.modulus_margin,
+        }
+        for one in companions.loops
+    ]
+    (path / "result.json").write_bytes(
+        as_json(
+            {
+                "format": "avis-design",
+                "version": 1,
+                "stable": True,
+                "verdict": "",
+                "controllers": [
+                    {"name": made.name, "file": f"controllers/{made.name}.json"},
+                    {"name": "passive", "file": None},
+                ],
+                "all_axes": {"companions": rows},
+                "provenance": design_provenance(design, source, rig, 0.0),
+            }
+        )
+    )
     return path
 
 
 @pytest.fixture(scope="session")
 def skyhook_dir(tmp_path_factory) -> Path:
-    return write_folder(tmp_path_factory.mktemp("skyhook") / "design", "avis_z_phix",
-                        lambda design, plant, rig: classical_skyhook(plant, rig, design))
+    return write_folder(
+        tmp_path_factory.mktemp("skyhook") / "design",
+        "avis_z_phix",
+        lambda design, plant, rig: classical_skyhook(plant, rig, design),
+    )
 
 
 @pytest.fixture(scope="session")
@@ -57,9 +79,11 @@ def skyhook(skyhook_dir):
 @pytest.fixture(scope="session")
 def shipped_dir(tmp_path_factory) -> Path:
     """The shipped AVIS design with the mu controller after four D-K iterations, which takes half as long as all."""
+
     def early(design, plant, rig):
         few = design.synthesis.model_copy(update={"max_iterations": 4})
         return mu_optimal(design.model_copy(update={"synthesis": few}), plant, rig)[0]
+
     return write_folder(tmp_path_factory.mktemp("shipped") / "design", "avis_z_phix", early)
 
 

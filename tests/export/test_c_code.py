@@ -58,7 +58,7 @@ def test_test_vectors_start_reach_the_limits_and_fall_back(skyhook, gcc, arithme
     code = CompiledController(files, controller)
     y, u = vectors(controller, guard)
     assert len(y) == 2000
-    assert np.all(u[:guard.wait - 1] == 0) and np.any(u[guard.wait] != 0)
+    assert np.all(u[: guard.wait - 1] == 0) and np.any(u[guard.wait] != 0)
     able = reached(controller, guard) > 1.3
     assert np.any(able)
     for limit in (controller.limits_V, -controller.limits_V):
@@ -80,7 +80,7 @@ def test_restart_vectors_fall_back_and_restart(skyhook, gcc, arithmetic, convert
     assert [np.count_nonzero(test(y)) for test in (np.isnan, np.isinf)] == ([1, 1] if converter else [1, 2])
     assert len(rows) == 3
     for row, end in zip(rows, [*rows[1:], len(y)], strict=True):
-        assert np.any(u[row - 1] != 0) and np.all(u[row + 20:row + guard.wait] == 0) and np.any(u[end - 1] != 0)
+        assert np.any(u[row - 1] != 0) and np.all(u[row + 20 : row + guard.wait] == 0) and np.any(u[end - 1] != 0)
     assert np.max(np.abs(u) / controller.limits_V) < 1
     got = []
     for row in y:
@@ -116,8 +116,10 @@ def test_a_coefficient_that_is_off_by_a_thousandth_is_seen(skyhook, arithmetic, 
     """The arithmetic of the code with one coefficient changed, against both files; coefficients of which a thousandth
     changes the response by less than `negligible` may pass. Rounding hides some in single precision."""
     controller, guard, _ = exported(skyhook, arithmetic)
-    tests = [(y, u, agreement_V(controller, guard, y, u))
-             for y, u in (vectors(controller, guard), restarts(controller, guard))]
+    tests = [
+        (y, u, agreement_V(controller, guard, y, u))
+        for y, u in (vectors(controller, guard), restarts(controller, guard))
+    ]
     seen = []
     for size, changed in mutated(controller):
         if size > negligible:
@@ -171,12 +173,31 @@ def test_clean_under_warnings_and_sanitizers(skyhook, gcc, tmp_path, arithmetic)
     for name, text in {**files, "main.c": main}.items():
         (tmp_path / name).write_text(text)
     program = tmp_path / "program"
-    built = subprocess.run([gcc, *STRICT, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
-                            "-c", SOURCE, "-o", "controller.o"], cwd=tmp_path, capture_output=True, text=True)
+    built = subprocess.run(
+        [
+            gcc,
+            *STRICT,
+            "-g",
+            "-O1",
+            "-fsanitize=address,undefined",
+            "-fno-sanitize-recover=all",
+            "-c",
+            SOURCE,
+            "-o",
+            "controller.o",
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
     assert built.returncode == 0, built.stderr
     assert built.stderr == ""
-    subprocess.run([gcc, "-std=c99", "-fsanitize=address,undefined", "main.c", "controller.o", "-o", program, "-lm"],
-                   cwd=tmp_path, check=True, capture_output=True)
+    subprocess.run(
+        [gcc, "-std=c99", "-fsanitize=address,undefined", "main.c", "controller.o", "-o", program, "-lm"],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+    )
     done = subprocess.run([program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
@@ -222,7 +243,7 @@ def test_start_is_bumpless(skyhook, gcc):
     y = np.full(controller.system.ninputs, 0.1)
     u = np.array([code.step(y) for _ in range(6000)])
     linear = scipy.signal.dlsim((*controller.matrices().values(), controller.system.dt), np.tile(y, (6000, 1)))[1]
-    assert np.all(u[:guard.wait - 1] == 0)
+    assert np.all(u[: guard.wait - 1] == 0)
     jump_without = np.max(np.abs(linear[0]))
     assert np.max(np.abs(np.diff(u, axis=0))) < 0.02 * jump_without
     after = guard.wait + round(1 / guard.rise) + 1
@@ -242,8 +263,8 @@ def test_an_invalid_input_brings_the_drives_to_zero_and_back(skyhook, gcc, rng, 
     fall = round(1 / guard.fall)
     assert np.any(before != 0)
     assert np.all(np.isfinite(u))
-    assert np.all(u[fall + 1:500 + guard.wait - 1] == 0)
-    assert np.all(np.any(u[500 + guard.wait:1000 + guard.wait] != 0, axis=0))
+    assert np.all(u[fall + 1 : 500 + guard.wait - 1] == 0)
+    assert np.all(np.any(u[500 + guard.wait : 1000 + guard.wait] != 0, axis=0))
     assert code.state.gain == 1.0
 
 
@@ -260,7 +281,7 @@ def test_an_infinite_input_does_not_stay_in_the_states(skyhook, gcc, rng, arithm
     u = np.array([code.step(row) for row in y])
     K, y[200, 1] = controller.system, 0.0
     linear = scipy.signal.dlsim((K.A, K.B, K.C, K.D, K.dt), y)[1]
-    assert np.all(u[200 + round(1 / guard.fall):200 + guard.wait] == 0)
+    assert np.all(u[200 + round(1 / guard.fall) : 200 + guard.wait] == 0)
     assert np.max(np.abs(u[1800:] - linear[1800:])) < (1e-12 if arithmetic == "float64" else 2e-5)
 
 
@@ -276,7 +297,7 @@ def test_the_gain_has_no_rounding_error(skyhook, gcc, rate):
         code.step(np.zeros(6))
         found.append(code.state.gain)
     rising = np.arange(1, len(found) - guard.wait + 2)
-    assert np.array_equal(found[guard.wait - 1:], np.minimum(rising * guard.rise, 1.0))
+    assert np.array_equal(found[guard.wait - 1 :], np.minimum(rising * guard.rise, 1.0))
     assert np.count_nonzero(np.array(found) < 1) - guard.wait + 2 == pytest.approx(rate, abs=1)
 
 

@@ -57,12 +57,20 @@ def ratio(dB: float) -> float:
 def vertices(folder, count: int, rng) -> list[np.ndarray]:
     """Real parameters at their ends, chains of full size and any phase."""
     blocks = folder.plant.synthesis.blocks
-    return [blocks.assemble([rng.choice([-1.0, 1.0]) if block.kind == "real" else np.exp(2j * np.pi * rng.uniform())
-                             for block in blocks.blocks]) for _ in range(count)]
+    return [
+        blocks.assemble(
+            [
+                rng.choice([-1.0, 1.0]) if block.kind == "real" else np.exp(2j * np.pi * rng.uniform())
+                for block in blocks.blocks
+            ]
+        )
+        for _ in range(count)
+    ]
 
 
-def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20, accelerometers: bool = False
-                             ) -> np.ndarray:
+def sampled_transmissibility(
+    folder, stored, deltas, omega, images: int = 20, accelerometers: bool = False
+) -> np.ndarray:
     """(n_delta, n_omega) largest singular value of floor to payload, of the loop that runs the stored numbers.
 
     The design's continuous plant, its own Pade delay taken out, under hold and delay, with all images up to `images`
@@ -77,8 +85,10 @@ def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20, ac
     tau = rig.loop_delay_s + 0.5 * T
     leak = 2 * np.pi * folder.design.loop.integrator_corner_Hz
     P, blocks, n = plant.full.P, plant.full.blocks, len(kept)
-    P = P.select([*P.outputs[:blocks.n_z], *plant.velocities, *plant.full.y],
-                 [*P.inputs[:blocks.n_w], *plant.floor_velocities, *plant.full.u])
+    P = P.select(
+        [*P.outputs[: blocks.n_z], *plant.velocities, *plant.full.y],
+        [*P.inputs[: blocks.n_w], *plant.floor_velocities, *plant.full.u],
+    )
 
     @cache
     def open_plant(k):
@@ -90,14 +100,16 @@ def sampled_transmissibility(folder, stored, deltas, omega, images: int = 20, ac
         at, M = open_plant(k)
         s = 1j * at
         n_z, n_w = blocks.n_z, blocks.n_w
-        G = M[:, n_z:, n_w:] + M[:, n_z:, :n_w] @ delta @ np.linalg.solve(np.eye(n_z) - M[:, :n_z, :n_w] @ delta,
-                                                                       M[:, :n_z, n_w:])
+        G = M[:, n_z:, n_w:] + M[:, n_z:, :n_w] @ delta @ np.linalg.solve(
+            np.eye(n_z) - M[:, :n_z, :n_w] @ delta, M[:, :n_z, n_w:]
+        )
         pade = (1 - s * tau / 2 + (s * tau) ** 2 / 12) / (1 + s * tau / 2 + (s * tau) ** 2 / 12)
         held = (1 - np.exp(-s * T)) / (s * T) * np.exp(-s * stored["delay_samples"] * T) / pade
         G[:, :, n:] *= held[:, None, None]
         if accelerometers:  # what the code integrates itself
             G[:, n:] *= (s + leak)[:, None, None]
         return G
+
     z = np.exp(1j * omega * T)
     K = forces @ (C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B.astype(complex)) + D) @ volts
     found = []
@@ -119,8 +131,9 @@ def test_no_sampled_plant_exceeds_the_certificate(shipped, package, stored, rng)
     assert np.max(sigma) <= ratio(certificate["worst_case_peak_transmissibility_dB"])
     assert np.max(sigma[:, band]) <= ratio(certificate["worst_case_band_transmissibility_dB"])
     # The worst plant found is that bad: the bound is not loose.
-    at = sampled_transmissibility(shipped, stored, [package.certificate.worst.delta],
-                                  np.array([package.certificate.worst.omega]))[0, 0]
+    at = sampled_transmissibility(
+        shipped, stored, [package.certificate.worst.delta], np.array([package.certificate.worst.omega])
+    )[0, 0]
     assert at == pytest.approx(package.certificate.worst.gain, rel=5e-3)
     assert at > 0.97 * ratio(certificate["worst_case_peak_transmissibility_dB"])
 
@@ -129,8 +142,12 @@ def test_all_axes_stay_stable_with_200_plants(shipped, package, stored, rng):
     """Poles of the sampled loop of six degrees of freedom, hold and delay exact."""
     nominal = shipped_loop(shipped, parse_controller(package.contents[CONTROLLER]))
     deltas = [*random_perturbations(shipped.plant, 100, 7), *vertices(shipped, 100, rng)]
-    radii = [spectral_radius(with_delta(shipped.rig, shipped.plant, nominal, "one", delta,
-                                        2 * np.pi * 10 ** rng.uniform(0, 2))) for delta in deltas]
+    radii = [
+        spectral_radius(
+            with_delta(shipped.rig, shipped.plant, nominal, "one", delta, 2 * np.pi * 10 ** rng.uniform(0, 2))
+        )
+        for delta in deltas
+    ]
     assert max(radii) < 1
 
 
@@ -146,8 +163,11 @@ def test_figures_are_near_those_of_the_design(shipped, package):
     assert found["stable"] and found["guaranteed"]
     assert designed.worst_peak.lower <= ratio(found["worst_case_peak_transmissibility_dB"])
     between = found["between_samples"]["worst_case_gain_dB"]
-    assert found["worst_case_peak_transmissibility_dB"] <= between + 0.01 < found[
-        "worst_case_peak_transmissibility_dB"] + 0.1
+    assert (
+        found["worst_case_peak_transmissibility_dB"]
+        <= between + 0.01
+        < found["worst_case_peak_transmissibility_dB"] + 0.1
+    )
 
 
 def test_offset_at_the_inputs_costs_the_voltage_that_is_certified(shipped, package):
@@ -182,8 +202,13 @@ def test_the_replay_does_not_measure_noise(shipped, package, gcc):
     """With a tenth of the floor motion, beside which the same noise is ten times as large, the gain is the same. The
     rounding of single precision is not subtracted; it changes the gain by less than 1 %."""
     files = {name: data.decode() for name, data in package.contents.items() if name.startswith("avis_controller.")}
-    weaker = replay_worst_plant(shipped, package.certificate, package.controller, files,
-                                ReplaySettings(velocity_rms=0.1 * ReplaySettings().velocity_rms))
+    weaker = replay_worst_plant(
+        shipped,
+        package.certificate,
+        package.controller,
+        files,
+        ReplaySettings(velocity_rms=0.1 * ReplaySettings().velocity_rms),
+    )
     assert weaker.gain == pytest.approx(package.replay.gain, rel=1e-2)
 
 
@@ -205,9 +230,14 @@ def test_rounding_stays_below_its_bound(shipped, package, gcc):
     assert package.certificate.content["rounding_noise_m_per_s"] == pytest.approx(np.linalg.norm(bound), rel=1e-6)
 
 
-@pytest.mark.parametrize(("matrix", "place", "figure"), [
-    pytest.param("C", (1, 10), "mu_upper", marks=pytest.mark.slow), ("A", (12, 12), "no certificate"),
-    pytest.param("D", (0, 0), "rounding_noise", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("matrix", "place", "figure"),
+    [
+        pytest.param("C", (1, 10), "mu_upper", marks=pytest.mark.slow),
+        ("A", (12, 12), "no certificate"),
+        pytest.param("D", (0, 0), "rounding_noise", marks=pytest.mark.slow),
+    ],
+)
 def test_a_changed_coefficient_is_found_by_hash_and_by_certificate(shipped, package, tmp_path, matrix, place, figure):
     """One of the mu controller's coefficients; a pole, beyond the unit circle; one of the other axes' loops."""
     for name, content in package.contents.items():
@@ -276,8 +306,9 @@ def test_six_states_by_descent_on_mu_are_certified(shipped, package, tmp_path, r
     # Transmissibility of sampled plants, from the numbers in the file; the worst one comes near the bound.
     found, omega = made.certificate.content, 2 * np.pi * np.geomspace(0.03, 120.0, 60)
     numbers, worst = json.loads(made.contents[CONTROLLER]), made.certificate.worst
-    sigma = sampled_transmissibility(folder, numbers, [worst.delta, *vertices(folder, 40, rng)],
-                                     np.append(omega, worst.omega))
+    sigma = sampled_transmissibility(
+        folder, numbers, [worst.delta, *vertices(folder, 40, rng)], np.append(omega, worst.omega)
+    )
     low, high = folder.design.transmissibility.band_Hz
     band = np.flatnonzero((omega >= 2 * np.pi * low) & (omega <= 2 * np.pi * high))
     assert 0.97 * ratio(found["worst_case_peak_transmissibility_dB"]) < np.max(sigma)
@@ -314,9 +345,12 @@ def test_a_proof_that_cannot_succeed_ends_before_the_bounds_that_take_minutes(sh
         bounds(SampledAxes.of(folder, folder.sampled("direct")), True)
     monkeypatch.setattr("avis_ctrl.export.certificate.rounding_noise", lambda *arguments: np.zeros(6))
     monkeypatch.setattr("avis_ctrl.export.package.choose_anti_windup", None)
-    with pytest.raises(ComputationError, match=r"'direct' is not proved stable; nothing was written; measured: "
-                                               r"nominal, gain 10%: spectral radius 1\.0.*; and 27 more of the 30 "
-                                               r"loops; next: try a larger --order"):
+    with pytest.raises(
+        ComputationError,
+        match=r"'direct' is not proved stable; nothing was written; measured: "
+        r"nominal, gain 10%: spectral radius 1\.0.*; and 27 more of the 30 "
+        r"loops; next: try a larger --order",
+    ):
         make_package(folder, "direct")
 
 
@@ -324,7 +358,7 @@ def test_no_plant_exceeds_the_bound_of_the_gain_above_half_the_sample_rate(shipp
     """Near half the rate, where the loop gain is largest, the bound is within 3 % of what an ascent reaches."""
     axes, plant = SampledAxes.of(shipped, package.controller), shipped.plant.full
     P, blocks = plant.P, plant.blocks
-    part = P.select([*P.outputs[:blocks.n_z], *plant.y], [*P.inputs[:blocks.n_w], *plant.u])
+    part = P.select([*P.outputs[: blocks.n_z], *plant.y], [*P.inputs[: blocks.n_w], *plant.u])
     omega = axes.half_rate * np.geomspace(1.0, 15.0, 12)
     reached = worst_gain(part.frequency_response(omega), blocks, count=10).gain
     bound = axes.force_to_seen(omega)
@@ -336,8 +370,9 @@ def recoveries(folder, package, law, speeds, inside: bool = False) -> np.ndarray
     nonlinear table: with the compiled code, or with the controller in the simulation."""
     controller, found = package.controller, []
     loop = replace(shipped_loop(folder, controller), anti_windup=law)
-    loop = replace(loop, sensors=replace(loop.sensors, converter=None, noise_rms_V=np.zeros(1),
-                                         flicker_rms_V=np.zeros(1)))
+    loop = replace(
+        loop, sensors=replace(loop.sensors, converter=None, noise_rms_V=np.zeros(1), flicker_rms_V=np.zeros(1))
+    )
     guard = protection(controller, folder.rig, law)
     guard = replace(guard, input_limit_V=np.full(controller.system.ninputs, 1e6))
     kept = [COORDINATES.index(name) for name in folder.design.keep]
@@ -372,8 +407,11 @@ def test_recovery_is_never_slower_than_without_anti_windup(shipped, package, gcc
 @pytest.mark.slow
 def test_anti_windup_of_the_halcyonics_design_shortens_the_recovery(make_folder, tmp_path, gcc):
     """Here it is exported. Drives reach their limits from 30 mm/s on."""
-    folder = open_design(make_folder(tmp_path / "design", "halcyonics_z_phix",
-                                     lambda design, plant, rig: mu_optimal(design, plant, rig)[0]))
+    folder = open_design(
+        make_folder(
+            tmp_path / "design", "halcyonics_z_phix", lambda design, plant, rig: mu_optimal(design, plant, rig)[0]
+        )
+    )
     made = make_package(folder, "mu")
     speeds, law = (40e-3, 80e-3, 120e-3), made.anti_windup.law
     without, with_it = (recoveries(folder, made, one, speeds) for one in (NO_ANTI_WINDUP, law))
@@ -394,14 +432,18 @@ def test_folding_of_accelerometers_is_in_the_certificate(make_folder, tmp_path, 
     if not filtered:
         source = re.sub(r"(?m)^anti_alias_.*$", "", source)
     (tmp_path / "one.toml").write_text(source)
-    folder = open_design(make_folder(tmp_path / "design", str(tmp_path / "one"),
-                                     lambda design, plant, rig: mu_optimal(design, plant, rig)[0]))
+    folder = open_design(
+        make_folder(
+            tmp_path / "design", str(tmp_path / "one"), lambda design, plant, rig: mu_optimal(design, plant, rig)[0]
+        )
+    )
     controller = folder.sampled("mu", "float32")
     found = certify(folder, controller)
     stored = json.loads(controller.as_bytes())
     worst = [found.worst.delta], np.array([found.worst.omega])
-    without, folded = (sampled_transmissibility(folder, stored, *worst, images=k, accelerometers=True)[0, 0]
-                       for k in (0, 30))
+    without, folded = (
+        sampled_transmissibility(folder, stored, *worst, images=k, accelerometers=True)[0, 0] for k in (0, 30)
+    )
     assert without == pytest.approx(found.worst.gain, rel=5e-3)
     assert (found.content["mu_upper"] < 1) == filtered
     assert folded < 1.01 * without if filtered else folded > 1.02 * without

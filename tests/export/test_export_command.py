@@ -26,17 +26,55 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import digital_controller
 
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
-CERTIFICATE_KEYS = {"format", "version", "controller_sha256", "mu_upper", "mu_lower", "guaranteed", "stable",
-                    "worst_case_peak_transmissibility_dB", "worst_case_band_transmissibility_dB",
-                    "rounding_noise_m_per_s", "step_time_us", "between_samples", "at_rest", "anti_windup", "files",
-                    "test_vectors", "restart_vectors", "design_inputs_sha256", "content_sha256"}
-CONTROLLER_KEYS = {"format", "version", "name", "sample_rate_Hz", "arithmetic", "A", "B", "C", "D", "inputs", "outputs",
-                   "input_units", "output_units", "limits_V", "delay_samples"}
+CERTIFICATE_KEYS = {
+    "format",
+    "version",
+    "controller_sha256",
+    "mu_upper",
+    "mu_lower",
+    "guaranteed",
+    "stable",
+    "worst_case_peak_transmissibility_dB",
+    "worst_case_band_transmissibility_dB",
+    "rounding_noise_m_per_s",
+    "step_time_us",
+    "between_samples",
+    "at_rest",
+    "anti_windup",
+    "files",
+    "test_vectors",
+    "restart_vectors",
+    "design_inputs_sha256",
+    "content_sha256",
+}
+CONTROLLER_KEYS = {
+    "format",
+    "version",
+    "name",
+    "sample_rate_Hz",
+    "arithmetic",
+    "A",
+    "B",
+    "C",
+    "D",
+    "inputs",
+    "outputs",
+    "input_units",
+    "output_units",
+    "limits_V",
+    "delay_samples",
+}
 
 
 def avis(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
-                          capture_output=True, text=True, timeout=600, env=ENVIRONMENT, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env=ENVIRONMENT,
+        check=False,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +137,12 @@ def test_exported_numbers_are_those_of_the_simulated_controller(skyhook, out):
 def test_a_controller_above_the_required_mu_is_reported_before_the_descent(skyhook, monkeypatch):
     K = skyhook.controller("skyhook_classical")
     shorter = StateSpace(np.zeros((0, 0)), np.zeros((0, K.ninputs)), np.zeros((K.noutputs, 0)), K.D)
-    for name, value in (("gain_limit", lambda *known: np.inf), ("Task", lambda *known, **more: None),
-                        ("_order_and_mu", lambda P, K: (K.nstates, 1.2)),
-                        ("fixed_order", lambda *known: iter([SimpleNamespace(K=shorter)]))):
+    for name, value in (
+        ("gain_limit", lambda *known: np.inf),
+        ("Task", lambda *known, **more: None),
+        ("_order_and_mu", lambda P, K: (K.nstates, 1.2)),
+        ("fixed_order", lambda *known: iter([SimpleNamespace(K=shorter)])),
+    ):
         monkeypatch.setattr(fewer_states, name, value)
     told = []
     folder, name = fewer_states.with_fewer_states(skyhook, "skyhook_classical", 2, told.append)
@@ -109,9 +150,14 @@ def test_a_controller_above_the_required_mu_is_reported_before_the_descent(skyho
     assert told[0].startswith("mu of 'skyhook_classical' itself is at most 1.2, above the 1 that the design requires")
 
 
-@pytest.mark.parametrize(("file", "words"), [
-    ("controller.mat", "controller.mat is missing"), ("avis_controller.h", "avis_controller.h is missing"),
-    ("test_vectors.csv", "test_vectors.csv is missing")])
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("controller.mat", "controller.mat is missing"),
+        ("avis_controller.h", "avis_controller.h is missing"),
+        ("test_vectors.csv", "test_vectors.csv is missing"),
+    ],
+)
 def test_a_deleted_file_is_named_before_anything_is_computed(skyhook, out, tmp_path, file, words, monkeypatch):
     monkeypatch.setattr(package, "certify", None)  # would be called otherwise
     folder = shutil.copytree(out, tmp_path / "out")
@@ -138,13 +184,17 @@ def test_the_hash_comes_before_what_is_wrong_in_the_file(skyhook, out, tmp_path)
     assert "D: expected float32 values" in second
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    (lambda c: c["test_vectors"].update(tolerance_V=1.0), "test_vectors.tolerance_V: 1 in certificate.json"),
-    (lambda c: c["restart_vectors"].update(tolerance_V=1e-9), "restart_vectors.tolerance_V: 1e-09"),
-    (lambda c: c["test_vectors"].update(samples=1999), "test_vectors.samples: 1999"),
-    (lambda c: c["anti_windup"].update(corner_Hz=2.0, gain=0.5), "the outputs in test_vectors.csv are not those"),
-    (lambda c: c.pop("test_vectors"), "no samples and tolerance_V of test_vectors.csv"),
-    (lambda c: c["files"].pop("controller.mat"), "controller.mat is not listed")])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: c["test_vectors"].update(tolerance_V=1.0), "test_vectors.tolerance_V: 1 in certificate.json"),
+        (lambda c: c["restart_vectors"].update(tolerance_V=1e-9), "restart_vectors.tolerance_V: 1e-09"),
+        (lambda c: c["test_vectors"].update(samples=1999), "test_vectors.samples: 1999"),
+        (lambda c: c["anti_windup"].update(corner_Hz=2.0, gain=0.5), "the outputs in test_vectors.csv are not those"),
+        (lambda c: c.pop("test_vectors"), "no samples and tolerance_V of test_vectors.csv"),
+        (lambda c: c["files"].pop("controller.mat"), "controller.mat is not listed"),
+    ],
+)
 def test_a_field_of_the_certificate_that_was_edited_is_named(skyhook, out, tmp_path, change, words, monkeypatch):
     """Within seconds, even if its own hash is made to fit."""
     monkeypatch.setattr(package, "certify", None)  # would be called otherwise
@@ -172,7 +222,8 @@ def test_a_figure_that_is_not_computed_again_is_protected_by_the_hash(skyhook, o
     told = []
     assert check_package(skyhook, folder, told.append) == []
     assert [line for line in told if "controller.c" in line] == [
-        "Note: certificate.json does not list controller.c; not checked"]
+        "Note: certificate.json does not list controller.c; not checked"
+    ]
     folder = shutil.copytree(out, tmp_path / "out")
     (folder / "certificate.json").write_text(json.dumps({**stored, "step_time_us": 0.1}))
     assert check_package(skyhook, folder) == ["certificate.json is not as it was written: its content_sha256 differs"]
@@ -187,10 +238,11 @@ def test_the_check_is_of_the_controller_that_is_asked_for(skyhook_dir, out):
 def test_folders_that_are_no_export_or_swapped(skyhook_dir, out, tmp_path):
     (tmp_path / "empty").mkdir()
     for design, export, words in (
-            (skyhook_dir, tmp_path / "empty", "certificate.json is missing in it"),
-            (skyhook_dir, tmp_path / "none", "there is no such folder"),
-            (skyhook_dir, skyhook_dir, "certificate.json is missing in it; this is a folder of avis design"),
-            (out, skyhook_dir, "result.json is missing in it; this is a folder of avis export: are DESIGN_DIR and")):
+        (skyhook_dir, tmp_path / "empty", "certificate.json is missing in it"),
+        (skyhook_dir, tmp_path / "none", "there is no such folder"),
+        (skyhook_dir, skyhook_dir, "certificate.json is missing in it; this is a folder of avis design"),
+        (out, skyhook_dir, "result.json is missing in it; this is a folder of avis export: are DESIGN_DIR and"),
+    ):
         done = avis("export", design, "--out", export, "--check")
         assert done.returncode == 2 and words in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
@@ -202,10 +254,30 @@ def test_the_program_of_the_contract_compares_the_files(out, gcc, tmp_path):
     (folder / "main.c").write_text(re.search(r"```c\n(.*?)```", page, re.DOTALL)[1])
 
     def results() -> list[int]:
-        subprocess.run([gcc, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "main.c",
-                        "avis_controller.c", "-o", "compare"], cwd=folder, check=True)
-        return [subprocess.run(["./compare", f"{name}.csv", str(certificate[name]["tolerance_V"])], cwd=folder,
-                               check=False).returncode for name in ("test_vectors", "restart_vectors")]
+        subprocess.run(
+            [
+                gcc,
+                "-std=c99",
+                "-Wall",
+                "-Wextra",
+                "-Wpedantic",
+                "-Wconversion",
+                "-Werror",
+                "main.c",
+                "avis_controller.c",
+                "-o",
+                "compare",
+            ],
+            cwd=folder,
+            check=True,
+        )
+        return [
+            subprocess.run(
+                ["./compare", f"{name}.csv", str(certificate[name]["tolerance_V"])], cwd=folder, check=False
+            ).returncode
+            for name in ("test_vectors", "restart_vectors")
+        ]
+
     certificate = json.loads((out / "certificate.json").read_text())
     assert results() == [0, 0]
     source = folder / "avis_controller.c"
@@ -226,6 +298,7 @@ def test_every_field_is_in_the_contract(out):
         if isinstance(value, dict):
             for key, one in value.items():
                 yield from [key, *keys(one)]
+
     for name in ("controller.json", "certificate.json"):
         for key in keys(json.loads((out / name).read_text())):
             assert f"`{key}`" in page or key in ("format", "version"), key
@@ -238,27 +311,36 @@ def test_header_says_where_it_comes_from(out):
         assert words in text
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (("MISSING", "--out", "OUT"), "expected a folder that avis design wrote"),
-    (("DESIGN", "--controller", "mu2", "--out", "OUT"), "skyhook_classical"),
-    (("DESIGN", "--controller", "passive", "--out", "OUT"), "skyhook_classical"),
-    (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--format", "c,fortran"), "c,mat,json"),
-    (("DESIGN", "--controller", "skyhook_classical", "--out", "FILE"), "--out"),
-    (("DESIGN", "--controller", "skyhook_classical", "--out", "/proc/nothing"), "--out"),
-    (("DESIGN", "--controller", "skyhook_classical", "--order", "4", "--out", "OUT"), "expected 1 to 3"),
-    (("DESIGN", "--controller", "skyhook_classical", "--order", "999", "--out", "OUT"), "expected 1 to 3"),
-    (("MISSING", "--order", "0", "--out", "OUT"), "--order = 0: expected a whole number, 1 or more"),
-    (("MISSING", "--order", "-2", "--out", "OUT"), "--order = -2: expected a whole number, 1 or more"),
-    (("DESIGN", "--out", "OUT", "--check", "--float32"), "either --check or --float32"),
-    (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "together with --order"),
-    (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "either --check or --order"),
-    (("EMPTY", "--out", "OUT"), "result.json"),
-    (("DESIGN", "--out", "OUT", "--check"), "there is no such folder")])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("MISSING", "--out", "OUT"), "expected a folder that avis design wrote"),
+        (("DESIGN", "--controller", "mu2", "--out", "OUT"), "skyhook_classical"),
+        (("DESIGN", "--controller", "passive", "--out", "OUT"), "skyhook_classical"),
+        (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--format", "c,fortran"), "c,mat,json"),
+        (("DESIGN", "--controller", "skyhook_classical", "--out", "FILE"), "--out"),
+        (("DESIGN", "--controller", "skyhook_classical", "--out", "/proc/nothing"), "--out"),
+        (("DESIGN", "--controller", "skyhook_classical", "--order", "4", "--out", "OUT"), "expected 1 to 3"),
+        (("DESIGN", "--controller", "skyhook_classical", "--order", "999", "--out", "OUT"), "expected 1 to 3"),
+        (("MISSING", "--order", "0", "--out", "OUT"), "--order = 0: expected a whole number, 1 or more"),
+        (("MISSING", "--order", "-2", "--out", "OUT"), "--order = -2: expected a whole number, 1 or more"),
+        (("DESIGN", "--out", "OUT", "--check", "--float32"), "either --check or --float32"),
+        (("DESIGN", "--controller", "skyhook_classical", "--out", "OUT", "--mu-at-most", "2"), "together with --order"),
+        (("DESIGN", "--out", "OUT", "--check", "--order", "3"), "either --check or --order"),
+        (("EMPTY", "--out", "OUT"), "result.json"),
+        (("DESIGN", "--out", "OUT", "--check"), "there is no such folder"),
+    ],
+)
 def test_wrong_input_is_one_line_and_writes_nothing(skyhook_dir, tmp_path, arguments, words):
     (tmp_path / "file").write_text("")
     (tmp_path / "empty").mkdir()
-    places = {"MISSING": tmp_path / "missing", "DESIGN": skyhook_dir, "OUT": tmp_path / "out",
-              "FILE": tmp_path / "file", "EMPTY": tmp_path / "empty"}
+    places = {
+        "MISSING": tmp_path / "missing",
+        "DESIGN": skyhook_dir,
+        "OUT": tmp_path / "out",
+        "FILE": tmp_path / "file",
+        "EMPTY": tmp_path / "empty",
+    }
     done = avis("export", *(places.get(one, one) for one in arguments))
     assert done.returncode == 2
     assert words in done.stderr
@@ -266,14 +348,18 @@ def test_wrong_input_is_one_line_and_writes_nothing(skyhook_dir, tmp_path, argum
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("file", "change", "words"), [
-    ("result.json", {"stable": False, "verdict": "phi_y is unstable"}, "phi_y is unstable"),
-    ("result.json", {"format": "avis-plant"}, "format"),
-    ("study.json", {"rig": "name = 1"}, "study.json"),
-    ("study.json", {"design": {}}, "study.json"),
-    ("study.json", None, "study.json"),
-    ("controllers/skyhook_classical.json", {"A": [[1.0]]}, "skyhook_classical.json"),
-    ("controllers/skyhook_classical.json", {"A": "x"}, "skyhook_classical.json")])
+@pytest.mark.parametrize(
+    ("file", "change", "words"),
+    [
+        ("result.json", {"stable": False, "verdict": "phi_y is unstable"}, "phi_y is unstable"),
+        ("result.json", {"format": "avis-plant"}, "format"),
+        ("study.json", {"rig": "name = 1"}, "study.json"),
+        ("study.json", {"design": {}}, "study.json"),
+        ("study.json", None, "study.json"),
+        ("controllers/skyhook_classical.json", {"A": [[1.0]]}, "skyhook_classical.json"),
+        ("controllers/skyhook_classical.json", {"A": "x"}, "skyhook_classical.json"),
+    ],
+)
 def test_a_damaged_design_folder(skyhook_dir, tmp_path, file, change, words):
     folder = shutil.copytree(skyhook_dir, tmp_path / "design")
     if change is None:

@@ -39,6 +39,7 @@ def test_bound_of_a_difference_that_nearly_cancels(rng, dt):
 
     def true(w):
         return scalar(w)[:, None, None] * one.frequency_response(w) - other.frequency_response(w)
+
     factor = roots_jet(zeros, poles, 1.0, CENTRE, HALF) * (delay_jet(tau, CENTRE) * sinc_jet(T, CENTRE))
     difference = factor * system_jet(one, CENTRE, HALF) - system_jet(other, CENTRE, HALF)
     value, slope = (np.linalg.norm(part, ord=2, axis=(1, 2)) for part in (difference.value, difference.slope))
@@ -65,10 +66,15 @@ def test_bound_relative_to_a_controller_of_unlike_gains(rng, least):
     def true(w):
         response = K.frequency_response(w)
         below = np.broadcast_to(least * np.eye(2), response.shape)
-        return (0.02 * (1j * w + 3) / (1j * w + 40))[:, None, None] * response @ np.linalg.pinv(
-            np.concatenate([response, below], axis=1))
-    largest = np.max([np.linalg.norm(true(CENTRE + t * half), ord=2, axis=(1, 2)) for t in np.linspace(-1, 1, 21)],
-                     axis=0)
+        return (
+            (0.02 * (1j * w + 3) / (1j * w + 40))[:, None, None]
+            * response
+            @ np.linalg.pinv(np.concatenate([response, below], axis=1))
+        )
+
+    largest = np.max(
+        [np.linalg.norm(true(CENTRE + t * half), ord=2, axis=(1, 2)) for t in np.linspace(-1, 1, 21)], axis=0
+    )
     assert np.all(bound >= largest * (1 - 1e-9))
     assert np.median(bound / largest) < 1.05
     assert np.all((remainder >= 0) & (remainder < bound))
@@ -85,8 +91,11 @@ def test_an_interval_divided_is_covered():
 def test_slopes_are_derivatives():
     """Central differences."""
     step = 1e-6 * CENTRE
-    for make in (lambda w: delay_jet(2e-3, w), lambda w: sinc_jet(1e-3, w),
-                 lambda w: roots_jet((-1.0,), (-5.0 + 2j, -5.0 - 2j), 3.0, w, HALF)):
+    for make in (
+        lambda w: delay_jet(2e-3, w),
+        lambda w: sinc_jet(1e-3, w),
+        lambda w: roots_jet((-1.0,), (-5.0 + 2j, -5.0 - 2j), 3.0, w, HALF),
+    ):
         numeric = (make(CENTRE + step).value - make(CENTRE - step).value) / (2 * step)
         jet = make(CENTRE)
         assert np.max(np.abs(jet.slope - numeric)) < 1e-5 * np.max(np.abs(numeric))

@@ -47,7 +47,7 @@ def test_start_on_a_moving_table_is_bumpless(parts, gcc):
     soft, hard = compiled(parts), compiled(parts)
     hard.state.gain, hard.state.wait = 1.0, 0  # as after the start
     started, jumped = (simulate(loop, 8.0, 1, settle_s=0.0, initial=swing, code=code.step) for code in (soft, hard))
-    assert np.all(started.demanded[:guard.wait - 1] == 0)
+    assert np.all(started.demanded[: guard.wait - 1] == 0)
     steps = [np.max(np.abs(np.diff(record.demanded, axis=0, prepend=0))) for record in (started, jumped)]
     assert steps[0] < 0.1 * steps[1]
     assert soft.state.gain == 1.0
@@ -94,11 +94,12 @@ def test_a_sensor_that_fails_for_a_second(parts, gcc, fault):
             y = y.copy()
             y[1] = fault
         return code.step(y)
+
     record = simulate(loop, 8.0, 1, settle_s=0.0, code=faulty)
     fall = round(1 / guard.fall)
     assert not record.diverged
     assert np.any(record.demanded[1900:2000] != 0)
-    assert np.all(record.demanded[2000 + fall + 1:3000 + guard.wait - 1] == 0)
+    assert np.all(record.demanded[2000 + fall + 1 : 3000 + guard.wait - 1] == 0)
     assert np.max(np.abs(record.demanded[2000:])) <= np.max(controller.limits_V)
     assert code.state.gain == 1.0
     quiet = np.max(np.abs(record.q_dot[:2000, 2]))

@@ -25,7 +25,7 @@ class Assembly:
     def row(self, own=(), **added):
         """A row over z: the payload's part, and e0=.. e1=.. for the first, second .. added coordinate."""
         found = np.zeros(self.n)
-        found[:len(own)] = own
+        found[: len(own)] = own
         for name, value in added.items():
             found[6 + int(name[1:])] = value
         return found
@@ -51,7 +51,7 @@ class Assembly:
         found = []
         for s in 2j * np.pi * np.asarray(f):
             force = np.hstack([self.T, self.K_w / s + self.C_w])
-            found.append(self.R @ np.linalg.solve(s ** 2 * self.M + s * self.C + self.K, force))
+            found.append(self.R @ np.linalg.solve(s**2 * self.M + s * self.C + self.K, force))
         return np.array(found)
 
 
@@ -59,7 +59,7 @@ def chain(rig, f):
     """(n,) V per m/s: geophone, compensation to the lower corner, preamplifier."""
     s, g = 2j * np.pi * np.asarray(f), rig.geophones
     w, z = 2 * np.pi * g.compensated_Hz, g.compensated_damping
-    return g.sensitivity_Vs_per_m[0] * g.preamplifier_gain * s ** 2 / (s ** 2 + 2 * z * w * s + w ** 2)
+    return g.sensitivity_Vs_per_m[0] * g.preamplifier_gain * s**2 / (s**2 + 2 * z * w * s + w**2)
 
 
 __all__ = ["Assembly", "chain", "mount_map"]

@@ -15,7 +15,7 @@ from avis_ctrl.rigs import load_rig
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "identification"))
 from exact import _run, discrete_avis, floor_velocity, multisine
 
-FS, LSB = 1000.0, 20.0 / 2 ** 14
+FS, LSB = 1000.0, 20.0 / 2**14
 LEVELS = (0.1, 0.1, 0.25, 0.25, 0.5, 0.5)
 
 
@@ -56,7 +56,7 @@ def power_law_floor(rng: np.random.Generator, samples: int, rms: float, slope: f
     V = shape * (rng.normal(size=(len(f), 3)) + 1j * rng.normal(size=(len(f), 3)))
     v = np.fft.irfft(V, samples, axis=0)
     # The scale is that of the ensemble, not of the draw.
-    return v * rms / np.sqrt(np.sum(4 * shape ** 2) / samples ** 2)
+    return v * rms / np.sqrt(np.sum(4 * shape**2) / samples**2)
 
 
 def hum(samples: int, f0: float, amplitudes: dict[tuple[int, int], float], rng: np.random.Generator) -> np.ndarray:
@@ -67,9 +67,21 @@ def hum(samples: int, f0: float, amplitudes: dict[tuple[int, int], float], rng: 
     return y
 
 
-def draw(seed: int, kind: str = "multisine", levels=LEVELS, samples: int = 60_000, *, slope: float | None = 0.0,
-         floor_rms: float = 2e-6, noise_V=1e-3, added=None, distort=None, adc=convert, filtered_floor: bool = False,
-         floor_known: bool = False) -> tuple[Campaign, dict[str, np.ndarray]]:
+def draw(
+    seed: int,
+    kind: str = "multisine",
+    levels=LEVELS,
+    samples: int = 60_000,
+    *,
+    slope: float | None = 0.0,
+    floor_rms: float = 2e-6,
+    noise_V=1e-3,
+    added=None,
+    distort=None,
+    adc=convert,
+    filtered_floor: bool = False,
+    floor_known: bool = False,
+) -> tuple[Campaign, dict[str, np.ndarray]]:
     """A campaign and the noise-free prediction of each record from u (and the floor, where it is known).
 
     added(samples, rng) : (samples, 6) V before the converter; distort(y0, u) : replaces the driven part of y.
@@ -84,8 +96,11 @@ def draw(seed: int, kind: str = "multisine", levels=LEVELS, samples: int = 60_00
             u = multisine(rng, level, periods=samples // 10_000)
         else:
             u = noise_drive(rng, level, samples)
-        floor = (floor_velocity(rng, samples, floor_rms) if filtered_floor
-                 else power_law_floor(rng, samples, floor_rms, slope or 0.0))
+        floor = (
+            floor_velocity(rng, samples, floor_rms)
+            if filtered_floor
+            else power_law_floor(rng, samples, floor_rms, slope or 0.0)
+        )
         driven = response(u)
         moved = response(np.zeros_like(u), floor)
         y = (driven if distort is None else distort(driven, u)) + moved
@@ -93,9 +108,18 @@ def draw(seed: int, kind: str = "multisine", levels=LEVELS, samples: int = 60_00
         if added is not None:
             y = y + added(samples, rng)
         name = f"{k:02d}"
-        header = RecordHeader(name, FS, samples, tuple(m.name for m in rig().motors), rig().geophones.names,
-                              excitation, level, 70.0 * k, 10.0 if excitation == "multisine" else None,
-                              floor_names=("vx", "vy", "vz") if floor_known else ())
+        header = RecordHeader(
+            name,
+            FS,
+            samples,
+            tuple(m.name for m in rig().motors),
+            rig().geophones.names,
+            excitation,
+            level,
+            70.0 * k,
+            10.0 if excitation == "multisine" else None,
+            floor_names=("vx", "vy", "vz") if floor_known else (),
+        )
         records.append(Record(header, u, adc(y), floor if floor_known else None))
         predicted[name] = driven + (moved if floor_known else 0.0)
     return Campaign("avis", tuple(records)), predicted

@@ -1,6 +1,6 @@
 """An AVIS with effects as a plain differential equation, integrated by Runge-Kutta: shares nothing with `gap`.
 
-    x' = A x + B u(t) + E f(d, d', t),    x = (q, q', chain states of each sensor, states of effects)
+x' = A x + B u(t) + E f(d, d', t),    x = (q, q', chain states of each sensor, states of effects)
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class Table:
         A[:6, 6:12] = np.eye(6)
         A[6:12, :6], A[6:12, 6:12], E[6:12] = -Mi @ self.K, -Mi @ self.C, Mi
         if self.lag_s:
-            A[n - n_u:, n - n_u:] = -np.eye(n_u) / self.lag_s
-            B[n - n_u:] = np.eye(n_u) / self.lag_s
-            A[6:12, n - n_u:] = Mi @ self.T
+            A[n - n_u :, n - n_u :] = -np.eye(n_u) / self.lag_s
+            B[n - n_u :] = np.eye(n_u) / self.lag_s
+            A[6:12, n - n_u :] = Mi @ self.T
         else:
             B[6:12] = Mi @ self.T
         w, z = 2 * np.pi * g.compensated_Hz, g.compensated_damping
@@ -71,20 +71,33 @@ class Table:
         at = 24
         for row, own, into, force in self.extra:
             m = len(own)
-            A[at:at + m, at:at + m] = own
-            A[at:at + m, :6], A[at:at + m, 6:12] = np.outer(into[:, 0], row), np.outer(into[:, 1], row)
+            A[at : at + m, at : at + m] = own
+            A[at : at + m, :6], A[at : at + m, 6:12] = np.outer(into[:, 0], row), np.outer(into[:, 1], row)
             push = np.outer(Mi @ row, force)
             A[6:12, :6] += np.outer(push[:, 0], row)
             A[6:12, 6:12] += np.outer(push[:, 1], row)
-            A[6:12, at:at + m] += push[:, 2:]
+            A[6:12, at : at + m] += push[:, 2:]
             at += m
         return A, B, E, C
 
     def run(self, u, fs, delay_substeps=SUBSTEPS, cubic=0.0, drift=(0.0, 0.0, 1.0), friction=(0.0, 1.0)):
         """y (n, 6), deflection (n, 12) for held volts; drift: change, start and length of the campaign [s]."""
         A, B, E, C = self.system()
-        x = integrate(A, B, E, np.ascontiguousarray(u), 1 / fs, SUBSTEPS, delay_substeps, self.rows, self.stiffness,
-                      cubic, np.array(drift, float), np.array(friction, float), self.motor_rows)
+        x = integrate(
+            A,
+            B,
+            E,
+            np.ascontiguousarray(u),
+            1 / fs,
+            SUBSTEPS,
+            delay_substeps,
+            self.rows,
+            self.stiffness,
+            cubic,
+            np.array(drift, float),
+            np.array(friction, float),
+            self.motor_rows,
+        )
         return x @ C.T, x[:, :6] @ self.rows.T
 
 

@@ -34,6 +34,7 @@ def value(effect):
 
 # --- oscillator
 
+
 def oscillator(extra, seed, n=24_576, noise=1e-3, drive=lambda u: u):
     """u and y of y''/w^2 + 2 zeta y'/w + y + extra(y, y') = drive(u), w = 2 pi 60, zeta 5 %, by Runge-Kutta in steps of
     a sixteenth sample with the band-limited u at every half step; the level swells and falls twice."""
@@ -47,18 +48,19 @@ def oscillator(extra, seed, n=24_576, noise=1e-3, drive=lambda u: u):
 
     def a(y, v, u):
         return (drive(u) - 0.1 / w * v - y - extra(y, v)) * w * w
+
     y = v = 0.0
     found = np.empty(n)
     for i in range(n * over):
         if i % over == 0:
             found[i // over] = y
-        u0, um, u1 = fine[2 * i:2 * i + 3]
+        u0, um, u1 = fine[2 * i : 2 * i + 3]
         a1 = a(y, v, u0)
         a2 = a(y + h / 2 * v, v + h / 2 * a1, um)
         a3 = a(y + h / 2 * (v + h / 2 * a1), v + h / 2 * a2, um)
         a4 = a(y + h * (v + h / 2 * a2), v + h * a3, u1)
         y, v = y + h * v + h * h / 6 * (a1 + a2 + a3), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-    return np.array(fine[:2 * over * n:2 * over]), found + noise * found.std() * rng.standard_normal(n)
+    return np.array(fine[: 2 * over * n : 2 * over]), found + noise * found.std() * rng.standard_normal(n)
 
 
 def searched(extra, seed, own=(), **how):
@@ -75,12 +77,16 @@ def stops(y, v):
     return 0.5 * math.copysign(max(abs(y) - 3.0, 0.0), y)
 
 
-@pytest.mark.parametrize(("name", "extra", "true"), [
-    ("cubic_stiffness", lambda y, v: 0.01 * y ** 3, 0.01),
-    ("quadratic_stiffness", lambda y, v: 0.02 * y * y, 0.02),
-    ("quadratic_damping", lambda y, v: 2e-6 * abs(v) * v, 2e-6),
-    ("coulomb_friction", lambda y, v: 0.1 * math.tanh(v / 5), 0.1),
-    ("end_stops", stops, 0.5)])
+@pytest.mark.parametrize(
+    ("name", "extra", "true"),
+    [
+        ("cubic_stiffness", lambda y, v: 0.01 * y**3, 0.01),
+        ("quadratic_stiffness", lambda y, v: 0.02 * y * y, 0.02),
+        ("quadratic_damping", lambda y, v: 2e-6 * abs(v) * v, 2e-6),
+        ("coulomb_friction", lambda y, v: 0.1 * math.tanh(v / 5), 0.1),
+        ("end_stops", stops, 0.5),
+    ],
+)
 def test_the_right_force_is_named(name, extra, true):
     gap = searched(extra, 1)
     assert names(gap) == [name] and gap.verdict == "explained"
@@ -96,7 +102,7 @@ def test_end_stops_begin_behind_their_gap():
 
 
 def test_two_effects_are_named_both():
-    gap = searched(lambda y, v: 0.01 * y ** 3 + 2e-6 * abs(v) * v, 2)
+    gap = searched(lambda y, v: 0.01 * y**3 + 2e-6 * abs(v) * v, 2)
     found = {one.name: value(one) for one in (*gap.effects, *gap.traces)}
     assert set(found) == {"cubic_stiffness", "quadratic_damping"} and gap.verdict == "explained"
     assert found["cubic_stiffness"] == pytest.approx(0.01, rel=0.02)
@@ -112,15 +118,20 @@ def test_nothing_is_named_where_nothing_is_missing(seed, noise):
 
 @pytest.mark.slow
 def test_false_alarms_are_few():
-    verdicts = [searched(lambda y, v: 0.0, seed, n=16_384, noise=10 ** -(1 + seed % 3)).verdict
-                for seed in range(100, 130)]
+    verdicts = [
+        searched(lambda y, v: 0.0, seed, n=16_384, noise=10 ** -(1 + seed % 3)).verdict for seed in range(100, 130)
+    ]
     assert verdicts.count("none") >= 29, verdicts
 
 
-@pytest.mark.parametrize("extra", [
-    lambda y, v: 0.03 * y ** 3 / (1 + 0.05 * y * y),  # stiffens and gives way: near a cubic spring, and near stops
-    pytest.param(lambda y, v: 0.3 * math.sin(2 * y), marks=pytest.mark.slow),  # a periodic force: near no law
-], ids=["giving way", "periodic"])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        lambda y, v: 0.03 * y**3 / (1 + 0.05 * y * y),  # stiffens and gives way: near a cubic spring, and near stops
+        pytest.param(lambda y, v: 0.3 * math.sin(2 * y), marks=pytest.mark.slow),  # a periodic force: near no law
+    ],
+    ids=["giving way", "periodic"],
+)
 def test_outside_the_library_nothing_is_named(extra):
     gap = searched(extra, 3)
     assert gap.verdict == "unexplained" and not gap.effects
@@ -129,8 +140,14 @@ def test_outside_the_library_nothing_is_named(extra):
 
 
 def test_an_own_effect_is_one_object():
-    mine = Effect("wave", "oscillator", "a force that is periodic in the position", (Parameter("F", "{F}"),),
-                  shapes=(lambda m: np.sin(2 * m.q),), variable="position")
+    mine = Effect(
+        "wave",
+        "oscillator",
+        "a force that is periodic in the position",
+        (Parameter("F", "{F}"),),
+        shapes=(lambda m: np.sin(2 * m.q),),
+        variable="position",
+    )
     gap = searched(lambda y, v: 0.3 * math.sin(2 * y), 1, own=[mine])
     assert names(gap) == ["wave"] and value(gap.effects[0]) == pytest.approx(0.3, rel=0.01)
     for wrong in (Effect("cubic_stiffness", "oscillator", "again", (Parameter("k", "1"),)), Effect("", "", "", ())):
@@ -145,10 +162,11 @@ def test_a_drive_that_saturates():
 
 
 def test_the_same_data_give_the_same_numbers_and_held_out_is_held_out():
-    u, y = oscillator(lambda y, v: 0.01 * y ** 3, 3, n=16_384)
+    u, y = oscillator(lambda y, v: 0.01 * y**3, 3, n=16_384)
 
     def found(y):
         return find_axis_gap("oscillator", records=[Signals("a", u, y)], rate=RATE, band_Hz=(2.0, 180.0))
+
     gaps = [found(y), found(y)]
     assert gaps[0].to_json()["effects"] == gaps[1].to_json()["effects"]
     # Noise in the middle of the second sixth, which is held out, spoils the score and not the fit.
@@ -160,6 +178,7 @@ def test_the_same_data_give_the_same_numbers_and_held_out_is_held_out():
 
 
 # --- drive
+
 
 def drive(friction, seed=0, duration=24.0, noise=0.3):
     """Closed loop along a chain of moves forth and back, in time; 20 kg, 60 N s/m and friction(v)."""
@@ -177,8 +196,12 @@ def drive(friction, seed=0, duration=24.0, noise=0.3):
             position[i // over], force[i // over] = q, F
         v += (F - 60 * v - friction(v)) / 20 / (rate * over)
         q += v / (rate * over)
-    return {"time": np.arange(n) / rate, "position": position + 1e-7 * rng.standard_normal(n),
-            "force": force + noise * rng.standard_normal(n), "reference": reference[::over]}
+    return {
+        "time": np.arange(n) / rate,
+        "position": position + 1e-7 * rng.standard_normal(n),
+        "force": force + noise * rng.standard_normal(n),
+        "reference": reference[::over],
+    }
 
 
 def coulomb(v):
@@ -191,8 +214,10 @@ def joint(seed, Fc=12.0, offset=9.0, duration=20.0):
     n = int(duration * rate)
     t = np.arange(n * over) / (rate * over)
     phases = rng.uniform(0, 2 * np.pi, 4)
-    path = sum(a * np.sin(2 * np.pi * f * t + p) for a, f, p in
-               zip((0.5, 0.2, 0.08, 0.03), (0.1, 0.25, 0.55, 1.3), phases, strict=True))
+    path = sum(
+        a * np.sin(2 * np.pi * f * t + p)
+        for a, f, p in zip((0.5, 0.2, 0.08, 0.03), (0.1, 0.25, 0.55, 1.3), phases, strict=True)
+    )
     wanted, slope = path.tolist(), np.gradient(path, t).tolist()
     q, v, angle, moment = wanted[0], slope[0], np.empty(n), np.empty(n)
     for i in range(n * over):
@@ -201,8 +226,11 @@ def joint(seed, Fc=12.0, offset=9.0, duration=20.0):
             angle[i // over], moment[i // over] = q, M
         v += (M - 4 * v - Fc * math.tanh(v / 2e-3) - offset) / 2.4 / (rate * over)
         q += v / (rate * over)
-    return {"time": np.arange(n) / rate, "position": angle + 2e-6 * rng.standard_normal(n),
-            "force": moment + 0.8 * rng.standard_normal(n)}
+    return {
+        "time": np.arange(n) / rate,
+        "position": angle + 2e-6 * rng.standard_normal(n),
+        "force": moment + 0.8 * rng.standard_normal(n),
+    }
 
 
 def friction_gap(data, rate=1000.0, **options):
@@ -275,7 +303,7 @@ def test_exchanged_columns_and_a_flipped_sign_are_refused():
         friction_gap({"force": data["position"], "position": data["force"]})
     with pytest.raises(InputError, match="flipped"):
         friction_gap(data | {"force": -data["force"]})
-    u, y = oscillator(lambda y, v: 0.01 * y ** 3, 1, n=8192)
+    u, y = oscillator(lambda y, v: 0.01 * y**3, 1, n=8192)
     for columns, said in (((y, u), "exchanged"), ((-u, y), "flipped")):
         with pytest.raises(InputError, match=said):
             find_axis_gap("oscillator", records=[Signals("a", *columns)], rate=RATE, band_Hz=(2.0, 180.0))
@@ -283,22 +311,27 @@ def test_exchanged_columns_and_a_flipped_sign_are_refused():
 
 # --- seismometer
 
+
 def seismometer(factor, scatter=3e-4, seed=0):
     """Coil and laser of a mass of 0.5 Hz, damping 0.7; `factor` on the laser."""
     rng = np.random.default_rng(seed)
     f = np.geomspace(0.1, 12, 18)
     s = 2j * np.pi * f
-    D = s ** 2 + 2 * 0.7 * np.pi * s + np.pi ** 2
+    D = s**2 + 2 * 0.7 * np.pi * s + np.pi**2
     H = {"coil": 4.0 * s / D, "displacement": 0.02 / D * factor(s)}
     H = {kind: h * (1 + scatter * (rng.standard_normal(18) + 1j * rng.standard_normal(18))) for kind, h in H.items()}
-    return {"responses": Responses(f, H, {kind: 2 * scatter ** 2 * np.abs(h) ** 2 for kind, h in H.items()})}
+    return {"responses": Responses(f, H, {kind: 2 * scatter**2 * np.abs(h) ** 2 for kind, h in H.items()})}
 
 
-@pytest.mark.parametrize(("name", "factor", "true"), [
-    ("delay", lambda s: np.exp(-2.4e-3 * s), 2.4e-3),
-    ("first_order_lag", lambda s: 1 / (1 + 2.4e-3 * s), 2.4e-3),
-    ("mechanical_mode", lambda s: 1 / (1 + 2 * 0.05 * s / (2 * np.pi * 30) + (s / (2 * np.pi * 30)) ** 2), 30.0),
-    ("highpass", lambda s: s / (s + 2 * np.pi * 0.02), 0.02)])
+@pytest.mark.parametrize(
+    ("name", "factor", "true"),
+    [
+        ("delay", lambda s: np.exp(-2.4e-3 * s), 2.4e-3),
+        ("first_order_lag", lambda s: 1 / (1 + 2.4e-3 * s), 2.4e-3),
+        ("mechanical_mode", lambda s: 1 / (1 + 2 * 0.05 * s / (2 * np.pi * 30) + (s / (2 * np.pi * 30)) ** 2), 30.0),
+        ("highpass", lambda s: s / (s + 2 * np.pi * 0.02), 0.02),
+    ],
+)
 def test_seismometer_channel(name, factor, true):
     gap = find_axis_gap("seismometer", **seismometer(factor))
     assert [(e.name, e.location) for e in gap.effects] == [(name, "displacement")]
@@ -321,6 +354,7 @@ def test_seismometer_without_a_gap():
 
 # --- levels
 
+
 def two_levels(gain, seed=0):
     """6 experiments of 2 inputs at each of two levels, two periods; `gain` is the static law before a mode at 40 Hz."""
     rng, n, rate, records = np.random.default_rng(seed), 2000, 500.0, []
@@ -332,22 +366,24 @@ def two_levels(gain, seed=0):
             u = np.fft.irfft(U, n)
             u *= level / u.std()
             x = np.tile(gain(u), (1, 6))  # four periods to settle
-            y = signal.lfilter(b, a, x)[:, 4 * n:] + 1e-4 * rng.standard_normal((2, 2 * n))
+            y = signal.lfilter(b, a, x)[:, 4 * n :] + 1e-4 * rng.standard_normal((2, 2 * n))
             y = np.array([[1.0, 0.3], [0.2, 1.0]]) @ y
-            header = RecordHeader(f"{level:g}_{k}", rate, 2 * n, ("u1", "u2"), ("y1", "y2"), "multisine", level,
-                                  period_s=n / rate)
+            header = RecordHeader(
+                f"{level:g}_{k}", rate, 2 * n, ("u1", "u2"), ("y1", "y2"), "multisine", level, period_s=n / rate
+            )
             records.append(Record(header, np.tile(u, (1, 2)).T, y.T))
     return Campaign("two levels", tuple(records))
 
 
 def test_a_linear_system_is_the_same_at_all_levels():
-    verdicts = [find_axis_gap("levels", campaign=two_levels(lambda u: u, seed), transient="none").verdict
-                for seed in range(10)]
+    verdicts = [
+        find_axis_gap("levels", campaign=two_levels(lambda u: u, seed), transient="none").verdict for seed in range(10)
+    ]
     assert verdicts.count("none") >= 9, verdicts
 
 
 def test_a_saturating_drive_is_told_from_a_gain_by_level():
-    gap = find_axis_gap("levels", campaign=two_levels(lambda u: u / (1 + 2 * u ** 2)), transient="none")
+    gap = find_axis_gap("levels", campaign=two_levels(lambda u: u / (1 + 2 * u**2)), transient="none")
     # Bussgang (1952): under a Gaussian input of r.m.s. sigma, the best linear gain of a static law is the mean slope.
     x, w = np.polynomial.hermite_e.hermegauss(80)
     slope = [float(np.sum(w * (1 - 2 * (s * x) ** 2) / (1 + 2 * (s * x) ** 2) ** 2) / np.sum(w)) for s in (0.1, 0.3)]
@@ -367,23 +403,29 @@ def of(force, position):
     return {"records": [Signals("a", np.asarray(force, float), np.asarray(position, float))], "rate": 1000.0}
 
 
-@pytest.mark.parametrize(("kind", "data", "said"), [
-    ("table", {}, "expected one of drive, oscillator, seismometer, levels"),
-    ("oscillator", {}, r"expected for kind oscillator the data records, rate, \[band_Hz\]"),
-    ("oscillator", of(WAVE.force, np.zeros(3)), "4000 finite"),
-    ("oscillator", of(WAVE.force, np.full(4000, np.nan)), "finite"),
-    ("oscillator", {"records": [WAVE], "rate": -1.0}, "sample rate"),
-    ("oscillator", {"records": [], "rate": 600.0}, "at least one record"),
-    ("oscillator", {"records": [WAVE], "rate": 600.0, "band_Hz": (300.0, 20.0)}, "low < high"),
-    ("oscillator", of(np.zeros(400), np.zeros(400)), "changes"),
-    ("drive", of(np.zeros(10), np.zeros(10)), "64 samples"),
-    ("drive", of(np.ones(9999), np.zeros(9999)), "changes"),
-    ("drive", of(np.ones(9999), np.zeros(3)), "9999 finite"),
-    ("drive", of(np.sin(np.arange(100.0)), np.arange(100.0)), "a longer record"),
-    ("drive", of(*(drive(coulomb, duration=2.0)[name] for name in ("force", "position"))) | {"cutoff_Hz": 600.0},
-     "cutoff between 0 and 500 Hz"),
-    ("levels", {"campaign": Campaign("one", two_levels(lambda u: u).records[:6])}, "two levels"),
-])
+@pytest.mark.parametrize(
+    ("kind", "data", "said"),
+    [
+        ("table", {}, "expected one of drive, oscillator, seismometer, levels"),
+        ("oscillator", {}, r"expected for kind oscillator the data records, rate, \[band_Hz\]"),
+        ("oscillator", of(WAVE.force, np.zeros(3)), "4000 finite"),
+        ("oscillator", of(WAVE.force, np.full(4000, np.nan)), "finite"),
+        ("oscillator", {"records": [WAVE], "rate": -1.0}, "sample rate"),
+        ("oscillator", {"records": [], "rate": 600.0}, "at least one record"),
+        ("oscillator", {"records": [WAVE], "rate": 600.0, "band_Hz": (300.0, 20.0)}, "low < high"),
+        ("oscillator", of(np.zeros(400), np.zeros(400)), "changes"),
+        ("drive", of(np.zeros(10), np.zeros(10)), "64 samples"),
+        ("drive", of(np.ones(9999), np.zeros(9999)), "changes"),
+        ("drive", of(np.ones(9999), np.zeros(3)), "9999 finite"),
+        ("drive", of(np.sin(np.arange(100.0)), np.arange(100.0)), "a longer record"),
+        (
+            "drive",
+            of(*(drive(coulomb, duration=2.0)[name] for name in ("force", "position"))) | {"cutoff_Hz": 600.0},
+            "cutoff between 0 and 500 Hz",
+        ),
+        ("levels", {"campaign": Campaign("one", two_levels(lambda u: u).records[:6])}, "two levels"),
+    ],
+)
 def test_wrong_data_are_refused_in_one_line(kind, data, said):
     with pytest.raises(InputError, match=said) as caught:
         find_axis_gap(kind, **data)
@@ -399,8 +441,13 @@ def test_an_odd_last_frequency_is_left_out_with_a_note():
 
 def test_a_range_ends_within_the_record(tmp_path):
     x = np.arange(1000.0)
-    np.savetxt(tmp_path / "a.csv", np.column_stack([x / 1000, np.sin(x), np.cos(x)]), delimiter=",", header="t,F,q",
-               comments="")
+    np.savetxt(
+        tmp_path / "a.csv",
+        np.column_stack([x / 1000, np.sin(x), np.cos(x)]),
+        delimiter=",",
+        header="t,F,q",
+        comments="",
+    )
     columns = {"t": "t", "force": "F", "position": "q"}
     (record,), _ = signals_in("drive", [tmp_path / "a.csv"], Reading(columns, {}, range_s=(0.5, 1.0)))
     assert len(record.force) == 500
@@ -410,12 +457,13 @@ def test_a_range_ends_within_the_record(tmp_path):
 
 def test_effects_that_are_lost_with_a_failed_fit_are_reported(monkeypatch):
     """One of two effects is refused, and no fit without it succeeds."""
-    u, y = oscillator(lambda y, v: 0.01 * y ** 3, 1, n=4096)
+    u, y = oscillator(lambda y, v: 0.01 * y**3, 1, n=4096)
     (first, second) = ("cubic_stiffness", "quadratic_damping")
 
     def both(base, explored, effects, progress):
         chosen = [next(one for one in effects if one.name == name) for name in (first, second)]
         return explored.with_effects(base, [(one, np.zeros(len(one.parameters))) for one in chosen])
+
     monkeypatch.setattr(analysis, "search", both)
     monkeypatch.setattr(analysis, "_refusal", lambda *known: "it is refused")
     monkeypatch.setattr(Explored, "without", lambda *known: None)
@@ -450,19 +498,30 @@ def test_wrong_folders_of_levels_are_refused(tmp_path):
         find_axis_gap_in("levels", tmp_path, {"u": "a"})
 
 
-@pytest.mark.parametrize(("columns", "scale", "said"), [
-    ({"force": "F"}, None, "a column for position"), ({"force": "F", "positon": "q"}, None, "expected one of"),
-    ({"force": "F", "position": "q", "t": "t"}, {"force": 0.0}, "finite factor")])
+@pytest.mark.parametrize(
+    ("columns", "scale", "said"),
+    [
+        ({"force": "F"}, None, "a column for position"),
+        ({"force": "F", "positon": "q"}, None, "expected one of"),
+        ({"force": "F", "position": "q", "t": "t"}, {"force": 0.0}, "finite factor"),
+    ],
+)
 def test_wrong_columns_are_refused(tmp_path, columns, scale, said):
     with pytest.raises(InputError, match=said):
         find_axis_gap_in("drive", tmp_path / "x.csv", columns, scale=scale)
 
 
-@pytest.mark.parametrize("library", [
-    drive_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0, (50.0,))),
-    oscillator_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0)),
-    sensor_effects(np.geomspace(0.1, 10, 12), ("coil", "displacement")), level_effects(True), level_effects(False)],
-    ids=["drive", "oscillator", "seismometer", "static law", "level"])
+@pytest.mark.parametrize(
+    "library",
+    [
+        drive_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0, (50.0,))),
+        oscillator_effects(Scale(2.0, 1.0, 1.0, 1.0, 1.0, 60.0)),
+        sensor_effects(np.geomspace(0.1, 10, 12), ("coil", "displacement")),
+        level_effects(True),
+        level_effects(False),
+    ],
+    ids=["drive", "oscillator", "seismometer", "static law", "level"],
+)
 def test_effects_say_what_they_are(library):
     labels = [one.label for one in library]
     assert len(labels) == len(set(labels))

@@ -20,7 +20,7 @@ from avis_ctrl.report import rendered
 from avis_ctrl.report.gap.axis import document
 from avis_ctrl.study.gap_axis import write_axis_gap, write_axis_predictions
 
-SILVERBOX_RATE = 1e7 / 2 ** 14
+SILVERBOX_RATE = 1e7 / 2**14
 MICROVOLT = 1e-6
 EMPS = {"force": "vir", "position": "qm", "reference": "qg", "t": "t"}
 
@@ -83,8 +83,9 @@ def test_emps_has_no_delay_and_no_lag(emps):
 def test_emps_first_half_alone_says_the_same(data):
     mat = {k: v.ravel() for k, v in scipy.io.loadmat(folder(data, "emps/DATA_EMPS.mat")).items() if k[0] != "_"}
     half = slice(None, len(mat["t"]) // 2)
-    gap = find_axis_gap("drive", records=[Signals("half", (mat["vir"] * mat["gtau"])[half], mat["qm"][half])],
-                        rate=1000.0)
+    gap = find_axis_gap(
+        "drive", records=[Signals("half", (mat["vir"] * mat["gtau"])[half], mat["qm"][half])], rate=1000.0
+    )
     assert {("coulomb_friction", "drive"), ("viscous_asymmetry", "drive")} <= set(named(gap))
     # Beside Stribeck friction, which a half of the motion does not tell from rounding.
     Fc, deviation = size(gap, "coulomb_friction", "Fc")
@@ -96,8 +97,9 @@ def test_emps_first_half_alone_says_the_same(data):
 def test_emps_with_pulses_has_a_pure_delay_at_every_cutoff(data, cutoff):
     """The phase of force over acceleration is a straight line to 190 Hz, 0.77 ms; the pulses do not repeat."""
     options = {} if cutoff is None else {"cutoff_Hz": cutoff}
-    gap = find_axis_gap_in("drive", folder(data, "emps/DATA_EMPS_PULSES.mat"), EMPS, scale={"force": 35.15065188},
-                           **options)
+    gap = find_axis_gap_in(
+        "drive", folder(data, "emps/DATA_EMPS_PULSES.mat"), EMPS, scale={"force": 35.15065188}, **options
+    )
     assert {name for name, _ in named(gap)} == {"coulomb_friction", "viscous_asymmetry", "delay"}
     late = next(e for e in gap.effects if e.name == "delay")
     p = late.parameters["delay_s"]
@@ -115,8 +117,16 @@ def silverbox(data):
 @pytest.fixture(scope="module")
 def silverbox_gap(data):
     # The first half of the random middle.
-    return plain(find_axis_gap_in("oscillator", folder(data, "silverbox/Schroeder80mV.mat"), {"u": "V1", "y": "V2"},
-                                  sample_rate_Hz=SILVERBOX_RATE, band_Hz=(1.0, 200.0), range_s=(37.0, 115.0)))
+    return plain(
+        find_axis_gap_in(
+            "oscillator",
+            folder(data, "silverbox/Schroeder80mV.mat"),
+            {"u": "V1", "y": "V2"},
+            sample_rate_Hz=SILVERBOX_RATE,
+            band_Hz=(1.0, 200.0),
+            range_s=(37.0, 115.0),
+        )
+    )
 
 
 def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
@@ -137,15 +147,19 @@ def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
 
 def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_path):
     path = folder(data, "silverbox/Schroeder80mV.mat")
-    (record,), rate = signals_in("oscillator", [path], Reading({"u": "V1", "y": "V2"}, {}, range_s=(130.0, 140.0),
-                                                               sample_rate_Hz=SILVERBOX_RATE))
-    left = [np.std((predicted(silverbox_gap.model, which, record, rate) - record.position)[500:-100])
-            / np.std(record.position) for which in ("baseline", "updated")]
+    (record,), rate = signals_in(
+        "oscillator", [path], Reading({"u": "V1", "y": "V2"}, {}, range_s=(130.0, 140.0), sample_rate_Hz=SILVERBOX_RATE)
+    )
+    left = [
+        np.std((predicted(silverbox_gap.model, which, record, rate) - record.position)[500:-100])
+        / np.std(record.position)
+        for which in ("baseline", "updated")
+    ]
     assert left[1] < 0.01 < 0.1 < left[0]
     files = write_axis_gap(tmp_path, silverbox_gap, path.name, {}, lambda *told: rendered(document(*told)))
     assert set(files) == {"gap.json", "gap.html", "gap.pdf", "axis_model.json"}
     assert json.loads((tmp_path / "gap.json").read_text())["effects"][0]["name"] == "cubic_stiffness"
-    (_, baseline, updated), = write_axis_predictions(tmp_path, [path], tmp_path / "p.h5")
+    ((_, baseline, updated),) = write_axis_predictions(tmp_path, [path], tmp_path / "p.h5")
     assert updated < 0.1 * baseline
 
 
@@ -164,7 +178,8 @@ def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap
         x, v, found = float(y[0]), float((y[1] - y[0]) * SILVERBOX_RATE), []
 
         def a(x, v, force):
-            return (force - d * v - k * x - k3 * x ** 3 - k2 * x * x - d2 * abs(v) * v) / m
+            return (force - d * v - k * x - k3 * x**3 - k2 * x * x - d2 * abs(v) * v) / m
+
         for i in range(over * (len(u) - 1)):
             if i % over == 0:
                 found.append(x)
@@ -175,10 +190,12 @@ def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap
             a4 = a(x + h * (v + h / 2 * a2), v + h * a3, f2)
             x, v = x + h * v + h * h / 6 * (a1 + a2 + a3), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
         return np.array(found)
+
     settled = slice(1000, 3900)  # the start is not known, and the interpolated input ends
 
     def left(y_hat):  # the input's own offset of 6 mV lies outside the band that was fitted
         return np.std((y_hat - y[:-1])[settled]) / np.std(y[settled])
+
     assert left(simulated(extra["k3"], extra["k2"], extra["d2"])) < 0.01  # measured: 0.78 %
     assert left(simulated(0.0, 0.0, 0.0)) > 0.3
 
@@ -230,7 +247,10 @@ def test_mirror_softens_and_more_is_missing(mirror):
     assert mirror.verdict == "partly explained" and named(mirror)[0] == ("softening", "mode")
     assert all(720 < mirror.where[0][end] < 920 for end in ("from_Hz", "to_Hz"))
     # A frequency that falls by 0.96 % is a stiffness that falls by 1.92 %, in softening and hysteresis together.
-    lost = sum(e.parameters["stiffness_lost"].value for e in (*mirror.effects, *mirror.traces)
-               if "stiffness_lost" in e.parameters)
+    lost = sum(
+        e.parameters["stiffness_lost"].value
+        for e in (*mirror.effects, *mirror.traces)
+        if "stiffness_lost" in e.parameters
+    )
     assert lost == pytest.approx(0.0192, rel=0.03)
     assert mirror.stages[-1].nrmse < 0.1 * mirror.stages[0].nrmse

@@ -20,7 +20,7 @@ from benchmarks.blind.lines import Settings, read_lines  # noqa: E402
 from benchmarks.blind.run import main, run  # noqa: E402
 
 # Even seeds hide an effect; what the finder sees is only the first sample, which says what it is to do.
-TRUTH = '''
+TRUTH = """
 from types import SimpleNamespace as Thing
 import numpy as np
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
@@ -41,8 +41,8 @@ def simulate_case(case, unseen=False):
 
 def relative_change(case):
     return 0.1
-'''
-FINDER = '''
+"""
+FINDER = """
 import os, time
 from dataclasses import dataclass
 
@@ -75,7 +75,7 @@ def find_gap(campaign, rig, options):
 def predict(finding, campaign):
     for record in campaign.records:
         yield 0 * record.y, record.y
-'''
+"""
 
 
 @pytest.fixture
@@ -99,8 +99,13 @@ def test_every_way_to_fail_is_a_line(modules, tmp_path):
     lines = {line.seed: line for line in read_lines(out)}
     assert sorted(lines) == [1, 2, 3, 4, 5, 6]
     assert lines[1].crash is None and lines[1].answer.verdict == "none" and lines[1].hidden == []
-    for seed, text in ((2, "ValueError: a reason"), (3, "code 7"), (4, "not JSON compliant"), (5, "contract"),
-                       (6, "no answer within 4 s")):
+    for seed, text in (
+        (2, "ValueError: a reason"),
+        (3, "code 7"),
+        (4, "not JSON compliant"),
+        (5, "contract"),
+        (6, "no answer within 4 s"),
+    ):
         assert lines[seed].answer is None and text in lines[seed].crash, seed
     assert lines[2].hidden[0].parameters == {"gain": 1.05}
     assert lines[2].seconds > 0 and lines[3].seconds is None
@@ -133,18 +138,35 @@ def test_resume_skips_what_is_done_and_cuts_what_is_not(modules, tmp_path):
 def test_unseen_campaigns_are_predicted(modules, tmp_path):
     """Records are a spike beside ones: the updated model is perfect, the baseline says zero."""
     run(settings(unseen=True), [1], tmp_path / "b.jsonl", **modules)
-    line, = read_lines(tmp_path / "b.jsonl")
+    (line,) = read_lines(tmp_path / "b.jsonl")
     y = np.ones(100)
     y[:2] = 1, -1
-    assert line.unseen.baseline == pytest.approx(np.sqrt(np.mean(y ** 2) / y.var()))
+    assert line.unseen.baseline == pytest.approx(np.sqrt(np.mean(y**2) / y.var()))
     assert line.unseen.updated == 0.0 and line.unseen_error is None
 
 
 def command(tmp_path, *words):
     where = os.environ | {"PYTHONPATH": str(tmp_path)}
-    return subprocess.Popen([sys.executable, "-m", "benchmarks.blind", "--truth", "standin_truth", "--finder",
-                             "standin_finder", "--duration", "0.1", "--out", str(tmp_path / "b.jsonl"), *words],
-                            cwd=ROOT, env=where, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "benchmarks.blind",
+            "--truth",
+            "standin_truth",
+            "--finder",
+            "standin_finder",
+            "--duration",
+            "0.1",
+            "--out",
+            str(tmp_path / "b.jsonl"),
+            *words,
+        ],
+        cwd=ROOT,
+        env=where,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds workers in /proc")
@@ -181,9 +203,11 @@ def alive(pid: int) -> bool:
 
 
 def test_modules_are_checked_before_hours_are_spent(modules, tmp_path, capsys):
-    for words, said in ((["--truth", "absent_module"], "expected a module that loads"),
-                        (["--truth", "standin_finder"], "expected draw_case, simulate_case, relative_change"),
-                        (["--truth", "standin_truth", "--out", str(tmp_path / "no" / "b.jsonl")], "a folder")):
+    for words, said in (
+        (["--truth", "absent_module"], "expected a module that loads"),
+        (["--truth", "standin_finder"], "expected draw_case, simulate_case, relative_change"),
+        (["--truth", "standin_truth", "--out", str(tmp_path / "no" / "b.jsonl")], "a folder"),
+    ):
         with pytest.raises(SystemExit) as caught:
             main(["--finder", "standin_finder", "--out", str(tmp_path / "b.jsonl"), *words])
         error = capsys.readouterr().err
@@ -203,14 +227,18 @@ def test_a_campaign_is_stripped_of_all_words():
 def test_nrmse_weighs_channels_alike():
     """Errors of 1 % and 2 % of the deviation in channels of very different size: the root of the mean square."""
     y = np.outer([1.0, -1.0, 1.0, -1.0], [1.0, 1000.0])
-    assert nrmse([y], [y * [1.01, 1.02]]) == pytest.approx(np.sqrt((0.01 ** 2 + 0.02 ** 2) / 2))
+    assert nrmse([y], [y * [1.01, 1.02]]) == pytest.approx(np.sqrt((0.01**2 + 0.02**2) / 2))
     with pytest.raises(ValueError, match="shape"):
         nrmse([y], [y[:2]])
 
 
 def test_truths_are_written_as_json_has_them():
     assert plain({"a": np.arange(2), "b": np.float64(0.5), "c": (np.bool_(True), None), "d": float("inf")}) == {
-        "a": [0, 1], "b": 0.5, "c": [True, None], "d": "inf"}
+        "a": [0, 1],
+        "b": 0.5,
+        "c": [True, None],
+        "d": "inf",
+    }
 
 
 HOLDER = """
@@ -249,9 +277,16 @@ def test_cases_as_points_of_a_sweep(modules, tmp_path, capsys):
     out = tmp_path / "out"
     (out / "points").mkdir(parents=True)
     (tmp_path / "blind.toml").write_text(
-        f'kind = "function"\nbase = "{ROOT}/benchmarks/blind/sweep.py:case"\n' + "".join(
-            f'[[vary]]\nkey = "{key}"\nvalues = {values!r}\n' for key, values in {
-                "seed": [1, 2, 8, 90], "duration_s": [0.1], **{name: [one] for name, one in modules.items()}}.items()))
+        f'kind = "function"\nbase = "{ROOT}/benchmarks/blind/sweep.py:case"\n'
+        + "".join(
+            f'[[vary]]\nkey = "{key}"\nvalues = {values!r}\n'
+            for key, values in {
+                "seed": [1, 2, 8, 90],
+                "duration_s": [0.1],
+                **{name: [one] for name, one in modules.items()},
+            }.items()
+        )
+    )
     found = run_sweep(plan_sweep(tmp_path / "blind.toml", out), lambda tasks: on_this_machine(tasks, 1))
     write_sweep(found, out)
     assert [row.status for row in found.rows] == ["done", "done", "done", "failed"]
@@ -260,8 +295,10 @@ def test_cases_as_points_of_a_sweep(modules, tmp_path, capsys):
     sweep.main([str(out), "--out", str(tmp_path / "swept.jsonl")])
     measured = {"seconds", "cpu_seconds", "memory_MB", "simulation_seconds", "crash", "settings"}
     run(settings(jobs=1), [1, 2, 8], tmp_path / "run.jsonl", **modules)
-    both = [[line.model_dump(exclude=measured) for line in read_lines(tmp_path / name)]
-            for name in ("swept.jsonl", "run.jsonl")]
+    both = [
+        [line.model_dump(exclude=measured) for line in read_lines(tmp_path / name)]
+        for name in ("swept.jsonl", "run.jsonl")
+    ]
     assert sorted(both[0], key=lambda line: line["seed"]) == sorted(both[1], key=lambda line: line["seed"])
     with pytest.raises(SystemExit) as stopped:
         sweep.main([str(tmp_path), "--out", str(tmp_path / "none.jsonl")])

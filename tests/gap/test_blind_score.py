@@ -27,25 +27,58 @@ def hidden(name, location="payload", strength="clear", **parameters):
 
 
 def named(name, location="payload", probability=0.99, group=(), **parameters):
-    return {"name": name, "location": location, "probability": probability, "indistinguishable_from": list(group),
-            "parameters": {key: {"value": value, "std": std, "unit": ""} for key, (value, std) in parameters.items()}}
+    return {
+        "name": name,
+        "location": location,
+        "probability": probability,
+        "indistinguishable_from": list(group),
+        "parameters": {key: {"value": value, "std": std, "unit": ""} for key, (value, std) in parameters.items()},
+    }
 
 
 def answer(verdict, *effects, nrmse=(0.2, 0.01), chi2=1.0):
-    return {"format": "avis-gap", "version": 1, "verdict": verdict, "effects": list(effects), "where": [],
-            "gap": [{"stage": "nominal", "nrmse": 0.5, "chi2_per_dof": 900.0},
-                    {"stage": "re-identified", "nrmse": nrmse[0], "chi2_per_dof": 140.0},
-                    {"stage": "last", "nrmse": nrmse[1], "chi2_per_dof": chi2}],
-            "next_experiment": None, "seconds": 20.0}
+    return {
+        "format": "avis-gap",
+        "version": 1,
+        "verdict": verdict,
+        "effects": list(effects),
+        "where": [],
+        "gap": [
+            {"stage": "nominal", "nrmse": 0.5, "chi2_per_dof": 900.0},
+            {"stage": "re-identified", "nrmse": nrmse[0], "chi2_per_dof": 140.0},
+            {"stage": "last", "nrmse": nrmse[1], "chi2_per_dof": chi2},
+        ],
+        "next_experiment": None,
+        "seconds": 20.0,
+    }
 
 
 def table(seed, kind, truths, given, **changed):
-    return {"seed": seed, "kind": kind, "hidden": truths, "excitation": "multisine", "floor_recorded": False,
-            "relative_change": 0.1, "answer": given if isinstance(given, dict) else None,
-            "crash": given if isinstance(given, str) else None, "seconds": 10.0, "cpu_seconds": 12.0,
-            "memory_MB": 500.0, "simulation_seconds": 3.0, "unseen": None, "unseen_error": None,
-            "settings": {"duration_s": 60.0, "jobs": 2, "kind": None, "effect": None, "strength": None,
-                         "unseen": False, "commit": "abc"}} | changed
+    return {
+        "seed": seed,
+        "kind": kind,
+        "hidden": truths,
+        "excitation": "multisine",
+        "floor_recorded": False,
+        "relative_change": 0.1,
+        "answer": given if isinstance(given, dict) else None,
+        "crash": given if isinstance(given, str) else None,
+        "seconds": 10.0,
+        "cpu_seconds": 12.0,
+        "memory_MB": 500.0,
+        "simulation_seconds": 3.0,
+        "unseen": None,
+        "unseen_error": None,
+        "settings": {
+            "duration_s": 60.0,
+            "jobs": 2,
+            "kind": None,
+            "effect": None,
+            "strength": None,
+            "unseen": False,
+            "commit": "abc",
+        },
+    } | changed
 
 
 def line(*content, **changed):
@@ -55,48 +88,69 @@ def line(*content, **changed):
 LAG, GAIN = hidden("actuator_lag", "actuators"), hidden("sensor_gain", "Sz2")
 
 
-@pytest.mark.parametrize(("kind", "truths", "given", "outcome"), [
-    ("none", [], answer("none"), "quiet"),
-    ("none", [], answer("unexplained"), "alarm without a name"),
-    ("none", [], answer("explained", named("com_offset")), "false name"),
-    ("none", [], "Error: x", "crash"),
-    ("one", [LAG], answer("explained", named("actuator_lag", "actuators")), "right"),
-    ("one", [LAG], answer("explained", named("loop_delay", "loop", group=["actuator_lag"])), "right"),
-    ("one", [LAG], answer("explained", named("loop_delay", "loop")), "wrong"),
-    ("one", [LAG], answer("explained", named("actuator_lag", "actuators"), named("com_offset")), "right and an extra"),
-    ("one", [LAG], answer("unexplained"), "refused"),
-    ("one", [LAG], answer("none"), "missed"),
-    ("two", [LAG, GAIN], answer("explained", named("sensor_gain", "Sz2"), named("actuator_lag")), "both right"),
-    ("two", [LAG, GAIN], answer("partly explained", named("sensor_gain", "Sz2")), "one right"),
-    # 1 % is the tolerance: no missing effect below three of it, nor a false name.
-    ("one", [hidden("sensor_gain", "Sz2", gain=1.02)], answer("none"), "quiet"),
-    ("one", [hidden("sensor_gain", "Sz2", gain=1.02)], answer("explained", named("sensor_gain", "Sz2")), "quiet"),
-    ("one", [hidden("sensor_gain", "Sz2", gain=0.96)], answer("none"), "missed"),
-    ("two", [LAG, hidden("com_offset", x_m=1e-3, y_m=-2e-3, z_m=0.0)],
-     answer("explained", named("actuator_lag", "actuators")), "right"),
-    ("two", [LAG, GAIN], answer("explained", named("sensor_gain"), named("com_offset")), "one right, one wrong"),
-    ("two", [LAG, GAIN], answer("explained", named("com_offset")), "wrong"),
-    # One named effect cannot stand for two hidden ones, nor two named ones for one.
-    ("two", [GAIN, GAIN], answer("explained", named("sensor_gain", "Sz2")), "one right"),
-    ("one", [GAIN], answer("explained", named("sensor_gain", "Sz2"), named("sensor_gain", "Sz1")),
-     "right and an extra"),
-    ("outside", [hidden("backlash")], answer("unexplained"), "refused"),
-    ("outside", [hidden("backlash")], answer("none"), "missed"),
-    ("outside", [hidden("backlash")], answer("partly explained"), "refused"),
-    ("outside", [hidden("backlash")], answer("explained", named("contact_friction")), "named as something else"),
-])
+@pytest.mark.parametrize(
+    ("kind", "truths", "given", "outcome"),
+    [
+        ("none", [], answer("none"), "quiet"),
+        ("none", [], answer("unexplained"), "alarm without a name"),
+        ("none", [], answer("explained", named("com_offset")), "false name"),
+        ("none", [], "Error: x", "crash"),
+        ("one", [LAG], answer("explained", named("actuator_lag", "actuators")), "right"),
+        ("one", [LAG], answer("explained", named("loop_delay", "loop", group=["actuator_lag"])), "right"),
+        ("one", [LAG], answer("explained", named("loop_delay", "loop")), "wrong"),
+        (
+            "one",
+            [LAG],
+            answer("explained", named("actuator_lag", "actuators"), named("com_offset")),
+            "right and an extra",
+        ),
+        ("one", [LAG], answer("unexplained"), "refused"),
+        ("one", [LAG], answer("none"), "missed"),
+        ("two", [LAG, GAIN], answer("explained", named("sensor_gain", "Sz2"), named("actuator_lag")), "both right"),
+        ("two", [LAG, GAIN], answer("partly explained", named("sensor_gain", "Sz2")), "one right"),
+        # 1 % is the tolerance: no missing effect below three of it, nor a false name.
+        ("one", [hidden("sensor_gain", "Sz2", gain=1.02)], answer("none"), "quiet"),
+        ("one", [hidden("sensor_gain", "Sz2", gain=1.02)], answer("explained", named("sensor_gain", "Sz2")), "quiet"),
+        ("one", [hidden("sensor_gain", "Sz2", gain=0.96)], answer("none"), "missed"),
+        (
+            "two",
+            [LAG, hidden("com_offset", x_m=1e-3, y_m=-2e-3, z_m=0.0)],
+            answer("explained", named("actuator_lag", "actuators")),
+            "right",
+        ),
+        ("two", [LAG, GAIN], answer("explained", named("sensor_gain"), named("com_offset")), "one right, one wrong"),
+        ("two", [LAG, GAIN], answer("explained", named("com_offset")), "wrong"),
+        # One named effect cannot stand for two hidden ones, nor two named ones for one.
+        ("two", [GAIN, GAIN], answer("explained", named("sensor_gain", "Sz2")), "one right"),
+        (
+            "one",
+            [GAIN],
+            answer("explained", named("sensor_gain", "Sz2"), named("sensor_gain", "Sz1")),
+            "right and an extra",
+        ),
+        ("outside", [hidden("backlash")], answer("unexplained"), "refused"),
+        ("outside", [hidden("backlash")], answer("none"), "missed"),
+        ("outside", [hidden("backlash")], answer("partly explained"), "refused"),
+        ("outside", [hidden("backlash")], answer("explained", named("contact_friction")), "named as something else"),
+    ],
+)
 def test_outcomes(kind, truths, given, outcome):
     assert judge(line(1, kind, truths, given)).outcome == outcome
 
 
 def test_pairs_are_chosen_together():
     """A group that fits the first hidden effect must not take it from the one that fits nothing else."""
-    given = answer("explained", named("loop_delay", "loop", group=["actuator_lag", "sensor_gain"]),
-                   named("actuator_lag", "actuators"))
+    given = answer(
+        "explained",
+        named("loop_delay", "loop", group=["actuator_lag", "sensor_gain"]),
+        named("actuator_lag", "actuators"),
+    )
     case = judge(line(1, "two", [LAG, GAIN], given))
     assert case.outcome == "both right"
     assert [(one.hidden.name, one.named.name, one.exact) for one in case.pairs] == [
-        ("actuator_lag", "actuator_lag", True), ("sensor_gain", "loop_delay", False)]
+        ("actuator_lag", "actuator_lag", True),
+        ("sensor_gain", "loop_delay", False),
+    ]
 
 
 def test_two_of_one_name_are_paired_by_place():
@@ -105,9 +159,15 @@ def test_two_of_one_name_are_paired_by_place():
     assert all(one.place for one in case.pairs)
 
 
-@pytest.mark.parametrize(("entry", "parts"), [
-    ("sensor_gain", ("sensor_gain", None)), ("sensor_gain at Sz2", ("sensor_gain", "Sz2")),
-    ("sensor_gain@Sz2", ("sensor_gain", "Sz2")), ("mount_surge (isolators z)", ("mount_surge", "isolators z"))])
+@pytest.mark.parametrize(
+    ("entry", "parts"),
+    [
+        ("sensor_gain", ("sensor_gain", None)),
+        ("sensor_gain at Sz2", ("sensor_gain", "Sz2")),
+        ("sensor_gain@Sz2", ("sensor_gain", "Sz2")),
+        ("mount_surge (isolators z)", ("mount_surge", "isolators z")),
+    ],
+)
 def test_entries_of_groups(entry, parts):
     assert split_name(entry) == parts
 
@@ -121,8 +181,12 @@ def test_a_place_of_a_group_counts():
 
 def test_wilsons_interval_as_published():
     """Newcombe, Statistics in Medicine 17 (1998), p. 857, table I: 81/263, 15/148, 0/20, 1/29."""
-    for hits, trials, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611),
-                                    (1, 29, 0.0061, 0.1718)):
+    for hits, trials, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ):
         assert wilson(hits, trials) == pytest.approx((low, high), abs=5e-5)
     assert wilson(0, 0) == (0.0, 1.0)
     assert wilson(20, 20)[1] == 1.0
@@ -139,7 +203,10 @@ def test_scores_of_probabilities_by_hand():
 def test_reliability_bins():
     bins = reliability([0.49, 0.5, 0.7, 0.99, 1.0], [True, False, True, True, False])
     assert [(one.low, one.high, one.right) for one in bins] == [
-        (0.0, 0.5, Share(1, 1)), (0.5, 0.8, Share(1, 2)), (0.99, 1.0, Share(1, 2))]
+        (0.0, 0.5, Share(1, 1)),
+        (0.5, 0.8, Share(1, 2)),
+        (0.99, 1.0, Share(1, 2)),
+    ]
     assert bins[1].mean == pytest.approx(0.6)
 
 
@@ -151,13 +218,25 @@ def campaign():
         line(1, "none", [], answer("none")),
         line(2, "none", [], answer("unexplained")),
         line(3, "one", [corner], answer("explained", named("geophone_corner", "Sz2", 1.0, corner_Hz=(5.1, 0.1)))),
-        line(4, "one", [corner], answer("explained", named("geophone_corner", "Sz1", 0.8, corner_Hz=(5.1, 0.1)),
-                                        nrmse=(0.2, 0.15), chi2=9.0)),
+        line(
+            4,
+            "one",
+            [corner],
+            answer(
+                "explained", named("geophone_corner", "Sz1", 0.8, corner_Hz=(5.1, 0.1)), nrmse=(0.2, 0.15), chi2=9.0
+            ),
+        ),
         line(5, "one", [lag], answer("explained", named("loop_delay", "loop", 0.5, ["actuator_lag"]))),
         line(6, "one", [lag], answer("explained", named("com_offset", probability=0.6))),
         line(7, "one", [faint], answer("none")),
-        line(8, "two", [lag, corner], answer("explained", named("actuator_lag", "actuators"),
-                                             named("geophone_corner", "Sz2", corner_Hz=(5.0, 0.01)))),
+        line(
+            8,
+            "two",
+            [lag, corner],
+            answer(
+                "explained", named("actuator_lag", "actuators"), named("geophone_corner", "Sz2", corner_Hz=(5.0, 0.01))
+            ),
+        ),
         line(9, "two", [lag, corner], "Traceback\nValueError: no", seconds=70.0),
         line(10, "outside", [hidden("backlash")], answer("unexplained"), memory_MB=900.0),
         line(11, "outside", [hidden("backlash")], answer("explained", named("contact_friction")), excitation="noise"),
@@ -168,10 +247,15 @@ def test_asked_figures_by_hand():
     cases = [judge(one) for one in campaign()]
     errors, _ = parameter_errors(cases)
     found = {one.what.split(":")[0]: one for one in asked_table(cases, errors)}
-    shares = {"no effect": "(1/2;", "one effect, clear or gross": "(3/4;",
-              "right place, where the effect has one and its name is right": "(1/2;", "two effects": "(1/2;",
-              "outside the library": "(1/2;", "held-out gap after naming": "(4/5;",
-              "parameter inside its own 95 % interval": "(2/2;"}
+    shares = {
+        "no effect": "(1/2;",
+        "one effect, clear or gross": "(3/4;",
+        "right place, where the effect has one and its name is right": "(1/2;",
+        "two effects": "(1/2;",
+        "outside the library": "(1/2;",
+        "held-out gap after naming": "(4/5;",
+        "parameter inside its own 95 % interval": "(2/2;",
+    }
     for what, share in shares.items():
         assert share in found[what].measured, what
         assert found[what].word == "missed", what
@@ -181,10 +265,12 @@ def test_asked_figures_by_hand():
 
 
 def test_a_good_campaign_meets_what_is_asked():
-    lines = [line(1, "none", [], answer("none")),
-             line(2, "one", [GAIN], answer("explained", named("sensor_gain", "Sz2"))),
-             line(3, "two", [LAG, GAIN], answer("explained", named("sensor_gain", "Sz2"), named("actuator_lag"))),
-             line(4, "outside", [hidden("backlash")], answer("unexplained"))]
+    lines = [
+        line(1, "none", [], answer("none")),
+        line(2, "one", [GAIN], answer("explained", named("sensor_gain", "Sz2"))),
+        line(3, "two", [LAG, GAIN], answer("explained", named("sensor_gain", "Sz2"), named("actuator_lag"))),
+        line(4, "outside", [hidden("backlash")], answer("unexplained")),
+    ]
     words = [one.word for one in score(lines).asked]
     assert words == ["met"] * 6 + ["not measured"] + ["met"] * 2
 
@@ -195,8 +281,10 @@ def test_a_cost_that_a_killed_worker_did_not_give_is_no_success():
     assert cost("time", [60.0], 60.0, "s").word == "missed"
 
 
-@pytest.mark.parametrize(("nrmse", "chi2", "good"), [((0.2, 0.19), 1.43, True), ((0.2, 0.19), 1.45, False),
-                                                     ((0.2, 0.0199), 99.0, True), ((0.2, 0.021), 99.0, False)])
+@pytest.mark.parametrize(
+    ("nrmse", "chi2", "good"),
+    [((0.2, 0.19), 1.43, True), ((0.2, 0.19), 1.45, False), ((0.2, 0.0199), 99.0, True), ((0.2, 0.021), 99.0, False)],
+)
 def test_closed_gaps(nrmse, chi2, good):
     assert closed(Answer.model_validate(answer("explained", nrmse=nrmse, chi2=chi2))) is good
 
@@ -242,12 +330,22 @@ def test_confusion_matrix():
     """Seed 5 is right through its group: it stands under the hidden name."""
     found = Confusion.of([judge(one) for one in campaign()])
     assert found.rows == ("geophone_corner", "actuator_lag", "com_offset", "outside: backlash", "none")
-    counts = {(row, column): int(n) for row, numbers in zip(found.rows, found.counts, strict=True)
-              for column, n in zip(found.columns, numbers, strict=True) if n}
-    assert counts == {("geophone_corner", "geophone_corner"): 2, ("actuator_lag", "actuator_lag"): 1,
-                      ("actuator_lag", "com_offset"): 1, ("com_offset", "none"): 1, ("none", "none"): 1,
-                      ("none", "unexplained"): 1, ("outside: backlash", "unexplained"): 1,
-                      ("outside: backlash", "contact_friction"): 1}
+    counts = {
+        (row, column): int(n)
+        for row, numbers in zip(found.rows, found.counts, strict=True)
+        for column, n in zip(found.columns, numbers, strict=True)
+        if n
+    }
+    assert counts == {
+        ("geophone_corner", "geophone_corner"): 2,
+        ("actuator_lag", "actuator_lag"): 1,
+        ("actuator_lag", "com_offset"): 1,
+        ("com_offset", "none"): 1,
+        ("none", "none"): 1,
+        ("none", "unexplained"): 1,
+        ("outside: backlash", "unexplained"): 1,
+        ("outside: backlash", "contact_friction"): 1,
+    }
     assert len({len(text) for text in found.text().splitlines()[:6]}) == 1  # columns stand below each other
 
 
@@ -284,16 +382,24 @@ def test_files_to_text_markdown_and_picture(tmp_path, capsys):
 
 def test_the_brier_score_of_the_text():
     """Named: 1.0, 0.8, 0.5, 0.6, 0.99 twice, 0.99; by own name right are the first two and the two of seed 8."""
-    squares = [0.0, 0.04, 0.25, 0.36, 1e-4, 1e-4, 0.99 ** 2]
+    squares = [0.0, 0.04, 0.25, 0.36, 1e-4, 1e-4, 0.99**2]
     note = next(one.note for one in score(campaign()).tables if one.title.endswith("own name"))
     assert f"Brier score {sum(squares) / 7:.4f}" in note
 
 
 def test_unseen_campaigns():
     asked = table(1, "none", [], answer("none"))["settings"] | {"unseen": True}
-    lines = [line(1, "one", [GAIN], answer("explained", named("sensor_gain", "Sz2")), settings=asked,
-                  unseen={"baseline": 0.2, "updated": 0.02}),
-             line(2, "none", [], answer("none"), settings=asked, unseen_error="Traceback\nValueError: shapes")]
+    lines = [
+        line(
+            1,
+            "one",
+            [GAIN],
+            answer("explained", named("sensor_gain", "Sz2")),
+            settings=asked,
+            unseen={"baseline": 0.2, "updated": 0.02},
+        ),
+        line(2, "none", [], answer("none"), settings=asked, unseen_error="Traceback\nValueError: shapes"),
+    ]
     text = score(lines).text()
     assert "seed 2: ValueError: shapes" in text
     assert "unseen campaign, named: updated over baseline, median and most" in text and "0.1, 0.1" in text
@@ -306,27 +412,34 @@ def test_markdown_of_a_bar():
 GOOD = table(1, "none", [], answer("none"))
 
 
-@pytest.mark.parametrize(("content", "said"), [
-    ("", "at least one line"),
-    ("{", "line 1: expected one JSON object"),
-    ("[]\n", "line 1"),
-    ("[" * 100000 + "\n", "nested too deeply"),
-    (json.dumps(GOOD) + "\n" + json.dumps(GOOD)[:80], "line 2: expected one JSON object"),
-    (json.dumps(GOOD) + "\n" + json.dumps(GOOD) + "\n", "line 2: seed = 1: expected each seed once"),
-    (json.dumps(GOOD | {"kind": "three"}), "kind"),
-    (json.dumps(GOOD | {"kind": "two"}), "2 hidden effects"),
-    (json.dumps(GOOD | {"kind": "outside"}), "at least one hidden effect"),
-    (json.dumps(GOOD | {"crash": "x"}), "an answer or a crash"),
-    (json.dumps(GOOD | {"answer": None}), "an answer or a crash"),
-    (json.dumps(GOOD | {"seconds": float("nan")}), "seconds"),
-    (json.dumps(GOOD | {"seconds": -1.0}), "seconds"),
-    (json.dumps(GOOD | {"colour": 1}), "colour"),
-    (json.dumps({key: value for key, value in GOOD.items() if key != "answer"}), "answer"),
-    (json.dumps(GOOD | {"answer": answer("explained", named("com_offset", probability=1.5))}), "probability"),
-    (json.dumps(GOOD | {"answer": answer("sure")}), "verdict"),
-    (json.dumps(GOOD) + "\n" + json.dumps(GOOD | {"seed": 2, "settings": GOOD["settings"] | {"duration_s": 30.0}}),
-     "expected the campaign of line 1"),
-])
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "at least one line"),
+        ("{", "line 1: expected one JSON object"),
+        ("[]\n", "line 1"),
+        ("[" * 100000 + "\n", "nested too deeply"),
+        (json.dumps(GOOD) + "\n" + json.dumps(GOOD)[:80], "line 2: expected one JSON object"),
+        (json.dumps(GOOD) + "\n" + json.dumps(GOOD) + "\n", "line 2: seed = 1: expected each seed once"),
+        (json.dumps(GOOD | {"kind": "three"}), "kind"),
+        (json.dumps(GOOD | {"kind": "two"}), "2 hidden effects"),
+        (json.dumps(GOOD | {"kind": "outside"}), "at least one hidden effect"),
+        (json.dumps(GOOD | {"crash": "x"}), "an answer or a crash"),
+        (json.dumps(GOOD | {"answer": None}), "an answer or a crash"),
+        (json.dumps(GOOD | {"seconds": float("nan")}), "seconds"),
+        (json.dumps(GOOD | {"seconds": -1.0}), "seconds"),
+        (json.dumps(GOOD | {"colour": 1}), "colour"),
+        (json.dumps({key: value for key, value in GOOD.items() if key != "answer"}), "answer"),
+        (json.dumps(GOOD | {"answer": answer("explained", named("com_offset", probability=1.5))}), "probability"),
+        (json.dumps(GOOD | {"answer": answer("sure")}), "verdict"),
+        (
+            json.dumps(GOOD)
+            + "\n"
+            + json.dumps(GOOD | {"seed": 2, "settings": GOOD["settings"] | {"duration_s": 30.0}}),
+            "expected the campaign of line 1",
+        ),
+    ],
+)
 def test_hostile_lines(tmp_path, content, said):
     path = tmp_path / "b.jsonl"
     path.write_text(content)

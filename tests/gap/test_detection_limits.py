@@ -36,14 +36,15 @@ def test_limits_are_five_deviations_of_a_fit_with_the_effect():
         added = model.with_effect(effect(name, place, None, model))
         found = fitted(added, blocks, 0)
         whole = np.linalg.inv(found.information.relative) * np.outer(*[found.information.scale] * 2)
-        std = np.sqrt(np.diag(whole)[-len(found.model.effects[-1].parameters):])
+        std = np.sqrt(np.diag(whole)[-len(found.model.effects[-1].parameters) :])
         for parameter, own in zip(found.model.effects[-1].parameters, std, strict=True):
             row = rows[name, shown, parameter.name]
             assert row.value == pytest.approx(5 * own, rel=1e-2)
             assert row.unit == parameter.unit
     # Of two laws of one effect one row, at the place that is reported.
-    assert [key for key in rows if key[0] == "structural_damping"] == [("structural_damping", "isolators",
-                                                                       "loss_factor")]
+    assert [key for key in rows if key[0] == "structural_damping"] == [
+        ("structural_damping", "isolators", "loss_factor")
+    ]
 
 
 def test_what_lies_well_above_its_limit_is_seen():

@@ -38,6 +38,7 @@ def with_effect(name, place, values, model=BARE):
 
 # --- the contract
 
+
 @pytest.fixture
 def contract(shared):
     """Location by name, from the table of the contract."""
@@ -92,6 +93,7 @@ def test_effects_that_a_rig_has_no_place_for_have_none():
 
 # --- the model itself
 
+
 @pytest.mark.parametrize("name", ["avis", "halcyonics", "halcyonics_loaded"])
 def test_without_effects_the_table_is_the_response_model(name):
     rig = load_rig(name)
@@ -110,8 +112,9 @@ NONE_ELSEWHERE = {"base_compliance", "mount_surge", "actuator_saturation"}  # no
 @pytest.mark.parametrize(("name", "place"), [pair for pair in EVERYWHERE if pair[0] not in NONE_ELSEWHERE])
 def test_without_strength_nothing_changes(name, place):
     model = with_effect(name, place, None, MOVING)
-    np.testing.assert_allclose(model.answer(BLOCK, derivative=False).Y, MOVING.answer(BLOCK, derivative=False).Y,
-                               rtol=1e-10, atol=0)
+    np.testing.assert_allclose(
+        model.answer(BLOCK, derivative=False).Y, MOVING.answer(BLOCK, derivative=False).Y, rtol=1e-10, atol=0
+    )
 
 
 def test_a_surge_of_no_mass_is_none():
@@ -125,9 +128,15 @@ def test_unequal_contacts_push_as_each_alone():
     record, own = MOVING.motion["00"], OWN["contact_friction"]
     equal = dict(zip(("stiffness_N_per_m", "slip_m"), values[:2], strict=True))
     shares = np.array([*values[2:], -sum(values[2:])])
-    alone = [own.force(replace(record, driven_rows=record.driven_rows[k:k + 1]), "actuators", equal) for k in range(8)]
-    np.testing.assert_allclose(own.force(record, "actuators", model.effects[-1].by_name),
-                               sum((1 + s) * one for s, one in zip(shares, alone, strict=True)), rtol=1e-12, atol=1e-15)
+    alone = [
+        own.force(replace(record, driven_rows=record.driven_rows[k : k + 1]), "actuators", equal) for k in range(8)
+    ]
+    np.testing.assert_allclose(
+        own.force(record, "actuators", model.effects[-1].by_name),
+        sum((1 + s) * one for s, one in zip(shares, alone, strict=True)),
+        rtol=1e-12,
+        atol=1e-15,
+    )
 
 
 @pytest.mark.parametrize(("name", "place"), EVERYWHERE)
@@ -146,6 +155,7 @@ def test_what_is_reported_is_finite_at_every_bound(name, place):
 
 # --- sensors
 
+
 def by_ratio(model, sensor):
     """(n,) what an effect makes of one sensor, the same from every input; the other sensors are as they were."""
     ratio = model.response(OMEGA) / ANALOGUE.response(OMEGA)
@@ -162,11 +172,14 @@ def test_bare_sensors_are_the_chain_times_velocity():
 
 def test_geophone_corner():
     s, g = 2j * np.pi * F, RIG.geophones
+
     def suspension(f, z):
-        return s ** 2 / (s ** 2 + 2 * z * 2 * np.pi * f * s + (2 * np.pi * f) ** 2)
+        return s**2 / (s**2 + 2 * z * 2 * np.pi * f * s + (2 * np.pi * f) ** 2)
+
     ratio = by_ratio(with_effect("geophone_corner", "Sz2", [5.1, 0.62], ANALOGUE), "Sz2")
-    np.testing.assert_allclose(ratio, suspension(5.1, 0.62) / suspension(g.suspension_Hz, g.suspension_damping),
-                               rtol=1e-9)
+    np.testing.assert_allclose(
+        ratio, suspension(5.1, 0.62) / suspension(g.suspension_Hz, g.suspension_damping), rtol=1e-9
+    )
 
 
 def test_gains_are_one_real_factor():
@@ -193,8 +206,10 @@ def test_tilt_reads_g_times_the_tilt_as_acceleration():
     table, g = Assembly(RIG).mounts(), 9.80665
     q = np.linalg.solve(table.K, table.T)  # static: what remains at low frequency
     f = np.array([1e-3])
-    found = (with_effect("tilt_coupling", "horizontal geophones", [g], ANALOGUE).response(2 * np.pi * f)
-             - ANALOGUE.response(2 * np.pi * f))[0, :, :8]
+    found = (
+        with_effect("tilt_coupling", "horizontal geophones", [g], ANALOGUE).response(2 * np.pi * f)
+        - ANALOGUE.response(2 * np.pi * f)
+    )[0, :, :8]
     s = 2j * np.pi * f[0]
     acceleration = {"x": -g * q[4], "y": g * q[3], "z": 0 * q[3]}
     true = np.array([acceleration[axis] for axis in RIG.geophones.axis]) * chain(RIG, f)[0] / s
@@ -209,6 +224,7 @@ def test_tilt_reads_g_times_the_tilt_as_acceleration():
 
 # --- drives
 
+
 def sampled(rig, f, delay_s, tau=0.0, aliases=2000):
     """(n, 6, 8) by samples of held and delayed volts: the sum over what sampling folds."""
     n = np.arange(-aliases, aliases + 1)
@@ -222,9 +238,14 @@ def sampled(rig, f, delay_s, tau=0.0, aliases=2000):
     return np.array(found)
 
 
-@pytest.mark.parametrize(("name", "place", "value", "delay_s", "tau"), [
-    ("actuator_lag", "actuators", 1.7e-3, 1e-3, 1.7e-3), ("loop_delay", "loop", 0.4e-3, 1.4e-3, 0.0),
-    ("loop_delay", "loop", 3e-3, 4e-3, 0.0)])
+@pytest.mark.parametrize(
+    ("name", "place", "value", "delay_s", "tau"),
+    [
+        ("actuator_lag", "actuators", 1.7e-3, 1e-3, 1.7e-3),
+        ("loop_delay", "loop", 0.4e-3, 1.4e-3, 0.0),
+        ("loop_delay", "loop", 3e-3, 4e-3, 0.0),
+    ],
+)
 def test_lag_and_delay_of_held_volts(name, place, value, delay_s, tau):
     f = np.array([1.0, 12.0, 60.0, 150.0])
     found = with_effect(name, place, [value]).response(2 * np.pi * f)[:, :, :8]
@@ -240,11 +261,13 @@ def test_two_lags_in_series():
     known = replace(BARE, base=replace(BARE.base, amplifier_corner_Hz=200.0))
     f = np.array([3.0, 30.0])
     ratio = with_effect("actuator_lag", "actuators", [2e-3], known).response(2 * np.pi * f) / known.response(
-        2 * np.pi * f)
+        2 * np.pi * f
+    )
     np.testing.assert_allclose(ratio[:, 1, 1], 1 / (1 + 2j * np.pi * f * 2e-3), rtol=2e-3)
 
 
 # --- amplitude and time
+
 
 def motion(deflection, volts=None, start_s=0.0, campaign_s=(0.0, 10.0)):
     volts = np.zeros((len(deflection), 8)) if volts is None else volts
@@ -262,7 +285,7 @@ def test_cubic_stiffness_by_harmonic_balance():
     A, k3, t = 2e-5, 1e12, np.arange(5000) / 1000
     record = motion(only(5, A * np.sin(2 * np.pi * 2.0 * t)))
     force = OWN["cubic_stiffness"].force(record, "isolators z", {"k3_N_per_m3": k3})
-    true = -k3 * A ** 3 * (0.75 * np.sin(2 * np.pi * 2.0 * t) - 0.25 * np.sin(2 * np.pi * 6.0 * t))
+    true = -k3 * A**3 * (0.75 * np.sin(2 * np.pi * 2.0 * t) - 0.25 * np.sin(2 * np.pi * 6.0 * t))
     x, y, _ = RIG.isolators[1].position
     np.testing.assert_allclose(force, true[:, None] * [0, 0, 1, y, -x, 0], atol=1e-12)
     assert not np.any(OWN["cubic_stiffness"].force(motion(only(4, t)), "isolators z", {"k3_N_per_m3": k3}))
@@ -274,16 +297,16 @@ def test_a_polynomial_stiffness_by_harmonic_balance():
     record = motion(only(5, A * np.sin(x)))
     values = {"k3_N_per_m3": 0.0, "k2_N_per_m2": k2, "k5_N_per_m5": k5}
     force = OWN["cubic_stiffness"].force(record, "isolators z/polynomial", values)
-    true = -k2 * A ** 2 / 2 * (1 - np.cos(2 * x)) - k5 * A ** 5 / 16 * (10 * np.sin(x) - 5 * np.sin(3 * x)
-                                                                        + np.sin(5 * x))
+    true = -k2 * A**2 / 2 * (1 - np.cos(2 * x)) - k5 * A**5 / 16 * (10 * np.sin(x) - 5 * np.sin(3 * x) + np.sin(5 * x))
     np.testing.assert_allclose(force[:, 2], true, atol=1e-12)
 
 
 def friction_on_Ay1(amplitude, slip, stiffness=1e4, f=1.0):
     """Displacement of Ay1's contact over three cycles, and the force along it."""
     d = amplitude * np.sin(2 * np.pi * f * np.arange(3000) / 1000)
-    force = OWN["contact_friction"].force(motion(only(1, d)), "actuators",
-                                          {"stiffness_N_per_m": stiffness, "slip_m": slip})
+    force = OWN["contact_friction"].force(
+        motion(only(1, d)), "actuators", {"stiffness_N_per_m": stiffness, "slip_m": slip}
+    )
     return d, force[:, 1]
 
 
@@ -305,13 +328,14 @@ def test_friction_is_coulombs_far_above_the_slip():
 def test_friction_never_gives_energy():
     rng = np.random.default_rng(5)
     d = np.cumsum(rng.standard_normal(4000)) * 1e-7
-    force = OWN["contact_friction"].force(motion(only(1, d)), "actuators",
-                                          {"stiffness_N_per_m": 1e4, "slip_m": 3e-7})[:, 1]
+    force = OWN["contact_friction"].force(motion(only(1, d)), "actuators", {"stiffness_N_per_m": 1e4, "slip_m": 3e-7})[
+        :, 1
+    ]
     step = np.diff(d, prepend=0.0)
     mean = (force + np.concatenate([[0.0], force[:-1]])) / 2
     taken = np.cumsum(-mean * step)
     assert np.min(taken) > -1e-18
-    assert taken[-1] > 10 * 1e4 * 3e-7 ** 2
+    assert taken[-1] > 10 * 1e4 * 3e-7**2
 
 
 def test_drift_is_a_spring_that_grows_with_time():
@@ -370,13 +394,15 @@ def test_drives_clip_each_at_its_own_limit_about_the_mean():
 
 # --- derivatives
 
+
 def _moving():
     """A model with one record of motion in time, and its block."""
     rng = np.random.default_rng(4)
     u = rng.standard_normal((2000, 8))
     d = 1e-5 * np.cumsum(rng.standard_normal((2000, 12)), axis=0) / 40
-    header = RecordHeader("00", 1000.0, 2000, BARE.actuators, BARE.sensors.names, "noise", 1.0,
-                          floor_names=("vx", "vy", "vz"))
+    header = RecordHeader(
+        "00", 1000.0, 2000, BARE.actuators, BARE.sensors.names, "noise", 1.0, floor_names=("vx", "vy", "vz")
+    )
     record = Record(header, u, rng.standard_normal((2000, 6)), 1e-5 * rng.standard_normal((2000, 3)))
     block = record_block(record, BARE.base, (0.5, 80.0)).lines(np.arange(0, 159, 7))
     return replace(BARE, motion={"00": motion(d, u)}), block
@@ -384,18 +410,29 @@ def _moving():
 
 MOVING, BLOCK = _moving()
 UNEVEN = 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07
-VALUES = {"geophone_corner": [4.8, 0.5], "sensor_gain": [1.05], "sensor_misalignment": [2.0, -3.0],
-          "tilt_coupling": [9.8], "actuator_gain": [0.95], "actuator_lag": [2e-3, *UNEVEN], "loop_delay": [0.7e-3],
-          "actuator_saturation": [1.0, *UNEVEN], "mount_relaxation": [0.3, 3.0], "structural_damping": [0.06],
-          "mount_surge": [30.0, 0.45, 0.02, 0.01, -0.02, 0.03], "leveling_loop": [0.04, 0.5, -0.2],
-          "cubic_stiffness": [1e13, 0.0, 0.0, 0.0], "stiffness_drift": [0.03, 3.0],
-          "contact_friction": [3e3, 1e-5, *UNEVEN],
-          "base_compliance": [1000.0, 0.05, 9.0, 10.0, 14.0, 20.0, 25.0, 30.0, 0.4, 0.5, 0.6, -0.4, -0.1],
-          "com_offset": [0.01, -0.02, 0.03],
-          "product_of_inertia": [2.0], "payload_flexible_mode": [
-              x for f in (30.0, 42.0, 55.0) for x in (f, 0.02, *np.linspace(-0.02, f / 1000, 12))],
-          "attached_oscillator": [2.0, 1.0, -2.0, 12.0, 0.05, 0.3, 0.2, 0.1],
-          "cable_stiffness": [500.0, 400.0, 300.0, 1e-3, 0.3, 0.2, 0.1]}
+VALUES = {
+    "geophone_corner": [4.8, 0.5],
+    "sensor_gain": [1.05],
+    "sensor_misalignment": [2.0, -3.0],
+    "tilt_coupling": [9.8],
+    "actuator_gain": [0.95],
+    "actuator_lag": [2e-3, *UNEVEN],
+    "loop_delay": [0.7e-3],
+    "actuator_saturation": [1.0, *UNEVEN],
+    "mount_relaxation": [0.3, 3.0],
+    "structural_damping": [0.06],
+    "mount_surge": [30.0, 0.45, 0.02, 0.01, -0.02, 0.03],
+    "leveling_loop": [0.04, 0.5, -0.2],
+    "cubic_stiffness": [1e13, 0.0, 0.0, 0.0],
+    "stiffness_drift": [0.03, 3.0],
+    "contact_friction": [3e3, 1e-5, *UNEVEN],
+    "base_compliance": [1000.0, 0.05, 9.0, 10.0, 14.0, 20.0, 25.0, 30.0, 0.4, 0.5, 0.6, -0.4, -0.1],
+    "com_offset": [0.01, -0.02, 0.03],
+    "product_of_inertia": [2.0],
+    "payload_flexible_mode": [x for f in (30.0, 42.0, 55.0) for x in (f, 0.02, *np.linspace(-0.02, f / 1000, 12))],
+    "attached_oscillator": [2.0, 1.0, -2.0, 12.0, 0.05, 0.3, 0.2, 0.1],
+    "cable_stiffness": [500.0, 400.0, 300.0, 1e-3, 0.3, 0.2, 0.1],
+}
 
 
 def values_at(name, place):
@@ -406,7 +443,7 @@ def values_at(name, place):
         values = [10.0, 12.0, 9.0, 15.0, *values[4:], 0.2, -0.1, 0.3]
     if name == "cubic_stiffness" and place.endswith("polynomial"):
         values = [values[0], 1e8, 1e22, *values[1:]]
-    return values[:len(parameters)]
+    return values[: len(parameters)]
 
 
 @pytest.mark.parametrize(("name", "place"), [pair for pair in EVERYWHERE if OWN[pair[0]].holds_states])
@@ -416,8 +453,7 @@ def test_the_gradient_of_a_fit_knows_what_the_states_inside_start_with(name, pla
     rng = np.random.default_rng(4)
     inner = 1e-4 * rng.standard_normal(model.inner_transients(OMEGA[:1]).shape[2])
     U = rng.standard_normal((len(OMEGA), len(model.inputs), 1)) * np.r_[np.ones(8), np.full(3, 1e-4)][:, None]
-    block = SpectralBlock("one", OMEGA, U, np.zeros((len(OMEGA), len(model.sensors.names), 1), complex),
-                          transient=True)
+    block = SpectralBlock("one", OMEGA, U, np.zeros((len(OMEGA), len(model.sensors.names), 1), complex), transient=True)
     Y = model.at(1.02 * model.values).answer(block, None, False, inner).Y
     Y = Y + 1e-2 * np.abs(Y) * rng.standard_normal(Y.shape)
     power = np.mean(np.abs(Y[..., 0]) ** 2, axis=1)
@@ -427,6 +463,7 @@ def test_the_gradient_of_a_fit_knows_what_the_states_inside_start_with(name, pla
     def chi2(theta):
         e, _, _ = block_residual(model.at(theta), block, L, derivative=False)
         return e @ e
+
     e, J, _ = block_residual(model, block, L, derivative=True)
     for row in [*range(0, len(BARE.names), 2), *range(len(BARE.names), len(model.values))]:
         h = 1e-4 * max(abs(model.values[row]), 1e-3 * model.scales()[row]) * np.eye(len(model.values))[row]
@@ -435,8 +472,10 @@ def test_the_gradient_of_a_fit_knows_what_the_states_inside_start_with(name, pla
         assert found == pytest.approx(slope, abs=1e-5 * most), model.names[row]
 
 
-@pytest.mark.parametrize(("name", "place"), [
-    pair for k, pair in enumerate(EVERYWHERE) if k == 0 or EVERYWHERE[k - 1][0] != pair[0] or "/" in pair[1]])
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [pair for k, pair in enumerate(EVERYWHERE) if k == 0 or EVERYWHERE[k - 1][0] != pair[0] or "/" in pair[1]],
+)
 def test_derivatives_by_central_differences(name, place):
     """By all parameters of rig and effect: differences of the answer as a whole, of two steps (Richardson)."""
     model = with_effect(name, place, values_at(name, place), MOVING)
@@ -446,8 +485,10 @@ def test_derivatives_by_central_differences(name, place):
         size = model.scales()[row] if row < len(BARE.names) else max(abs(theta[row]), 1e-3 * model.scales()[row])
         step, slopes = 1e-3 * size, []
         for h in (step, step / 2):
-            sides = [model.at(theta + sign * h * np.eye(len(theta))[row]).answer(BLOCK, derivative=False).Y
-                     for sign in (1, -1)]
+            sides = [
+                model.at(theta + sign * h * np.eye(len(theta))[row]).answer(BLOCK, derivative=False).Y
+                for sign in (1, -1)
+            ]
             slopes.append((sides[0] - sides[1]) / (2 * h))
         true = (4 * slopes[1] - slopes[0]) / 3
         # By the rig analytic; by effects a difference of step 1e-4 of a parameter's size. Clipped volts have kinks: a

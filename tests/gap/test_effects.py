@@ -54,6 +54,7 @@ def test_bare_table():
 
 # --- sensors
 
+
 def test_what_a_geophone_rings_with_is_found_with_its_transient():
     """Both states of its suspension, and what another corner or damping makes of them; of its own channel only."""
     volts = TableModel(ResponseModel.of(RIG, (), sampled=False))
@@ -65,14 +66,15 @@ def test_what_a_geophone_rings_with_is_found_with_its_transient():
         columns = columns[:, np.any(columns, axis=0)]
         A, b = (np.concatenate([x.real, x.imag]) for x in (columns / np.linalg.norm(columns, axis=0), y))
         return np.linalg.norm(b - A @ np.linalg.lstsq(A, b, rcond=None)[0]) / np.linalg.norm(b)
+
     s, w = 1j * OMEGA, 2 * np.pi * 6.0
-    poles = s ** 2 + 2 * 0.5 * w * s + w ** 2
-    for ringing in (1 / poles, s / poles, 1 / poles ** 2, s ** 3 / poles ** 2):
+    poles = s**2 + 2 * 0.5 * w * s + w**2
+    for ringing in (1 / poles, s / poles, 1 / poles**2, s**3 / poles**2):
         assert left_of(ringing) < 1e-9
-    elsewhere = 1 / (s ** 2 + 2 * 0.5 * 2 * w * s + (2 * w) ** 2)
+    elsewhere = 1 / (s**2 + 2 * 0.5 * 2 * w * s + (2 * w) ** 2)
     assert left_of(elsewhere) > 1e-2
     plain = volts.sensor_transients(OMEGA)
-    added = model.sensor_transients(OMEGA)[:, :, plain.shape[2]:]
+    added = model.sensor_transients(OMEGA)[:, :, plain.shape[2] :]
     assert added.shape[2] == 4 and not np.any(np.delete(added, k, axis=1))
     # A fit counts its unknowns on one line.
     assert model.sensor_transients(OMEGA[:1]).shape[2] == plain.shape[2] + 4
@@ -90,10 +92,10 @@ def test_a_record_that_begins_driven_does_not_move_a_geophone_s_corner():
     Y = truth.answer(made, None, False).Y
     noise = 1e-4 * np.sqrt(np.mean(np.abs(Y[:, k]) ** 2))
     s = 1j * omega
-    ringing = (s + 20.0) / (s ** 2 + 2 * 0.5 * 2 * np.pi * 6.0 * s + (2 * np.pi * 6.0) ** 2)
+    ringing = (s + 20.0) / (s**2 + 2 * 0.5 * 2 * np.pi * 6.0 * s + (2 * np.pi * 6.0) ** 2)
     Y[:, k, 0] += 300 * noise * ringing / np.abs(ringing).max()
     Y = Y + noise / np.sqrt(2) * (rng.standard_normal(Y.shape) + 1j * rng.standard_normal(Y.shape))
-    block = replace(made, Y=Y).with_noise(np.broadcast_to(noise ** 2 * np.eye(6), (200, 6, 6)).astype(complex))
+    block = replace(made, Y=Y).with_noise(np.broadcast_to(noise**2 * np.eye(6), (200, 6, 6)).astype(complex))
     found = fitted(with_effect("geophone_corner", "Sy1", [5.5, 0.55], free), [block])
     assert found.chi2_per_dof == pytest.approx(1.0, abs=0.1)
     told = reported(found)
@@ -101,6 +103,7 @@ def test_a_record_that_begins_driven_does_not_move_a_geophone_s_corner():
 
 
 # --- mounts
+
 
 @pytest.mark.parametrize(("ratio", "corner"), [(0.1, 0.5), (1.0, 3.0), (5.0, 40.0)])
 def test_relaxation_is_a_spring_with_a_damper_in_series(ratio, corner):
@@ -133,15 +136,17 @@ def test_structural_loss(eta):
     assert np.angle(causal[1]) == pytest.approx(np.pi / 2 * slope, rel=1e-9)
 
 
-@pytest.mark.parametrize(("frequency", "share", "zeta", "uneven"), [
-    (20.0, 0.5, 0.0, (0.0, 0.0, 0.0)), (45.0, 0.3, 0.02, (0.0, 0.0, 0.0)), (12.0, 0.7, 0.3, (0.03, -0.02, 0.01))])
+@pytest.mark.parametrize(
+    ("frequency", "share", "zeta", "uneven"),
+    [(20.0, 0.5, 0.0, (0.0, 0.0, 0.0)), (45.0, 0.3, 0.02, (0.0, 0.0, 0.0)), (12.0, 0.7, 0.3, (0.03, -0.02, 0.01))],
+)
 def test_surge_is_a_mass_between_two_springs(frequency, share, zeta, uneven):
     table = Assembly(RIG, 4).mounts(without="z")
     offsets = (*uneven, -sum(uneven))
     for i, (G, one) in enumerate(zip(table.maps, RIG.isolators, strict=True)):
         k, c, z = one.stiffness[2], one.damping[2], np.array([0, 0, 1])
         upper, lower, w = k / share, k / (1 - share), 2 * np.pi * frequency * (1 + offsets[i])
-        mass = (upper + lower) / w ** 2
+        mass = (upper + lower) / w**2
         damper = 2 * zeta * np.sqrt((upper + lower) * mass)
         table.spring(table.row(G[2], **{f"e{i}": -1.0}), upper, damper * upper / (upper + lower))
         table.spring(table.row(**{f"e{i}": 1.0}), lower, damper * lower / (upper + lower), z)
@@ -151,8 +156,15 @@ def test_surge_is_a_mass_between_two_springs(frequency, share, zeta, uneven):
 
 
 def test_surge_keeps_the_static_stiffness_and_resonates_where_it_says():
-    quiet = replace(BARE, base=replace(BARE.base, rig=RIG.with_parameters(
-        {f"isolator{i}.c_z": 1e-3 for i in range(1, 5)} | {f"isolator{i}.k_z": 4e4 for i in range(1, 5)})))
+    quiet = replace(
+        BARE,
+        base=replace(
+            BARE.base,
+            rig=RIG.with_parameters(
+                {f"isolator{i}.c_z": 1e-3 for i in range(1, 5)} | {f"isolator{i}.k_z": 4e4 for i in range(1, 5)}
+            ),
+        ),
+    )
     f0, share = 18.4, 0.4
     values = [f0, share, 1e-3, 0.0, 0.0, 0.0]
     assert added_stiffness("mount_surge", "isolators z", values, 1e-4, quiet)[0, 2, 2] == pytest.approx(0, abs=1e-2)
@@ -161,17 +173,23 @@ def test_surge_keeps_the_static_stiffness_and_resonates_where_it_says():
     assert f[np.argmax(peak)] == pytest.approx(f0, rel=1e-4)
     model = with_effect("mount_surge", "isolators z", values, quiet)
     names = [one.name for one in library()["mount_surge"].parameters(model, "isolators z")]
-    told = library()["mount_surge"].reported(model, "isolators z", dict(zip(names, values, strict=True)),
-                                             np.diag([0.1 ** 2, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    told = library()["mount_surge"].reported(
+        model, "isolators z", dict(zip(names, values, strict=True)), np.diag([0.1**2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    )
     assert told["frequency_Hz"].value == f0
     mass = 4e4 * (1 / share + 1 / (1 - share)) / (2 * np.pi * f0) ** 2
     assert told["mass_kg"].value == pytest.approx(mass)
     assert told["mass_kg"].std == pytest.approx(mass * 2 * 0.1 / f0)  # m goes as f^-2
 
 
-@pytest.mark.parametrize(("law", "values", "valve", "each"), [
-    ("plain", [0.1], None, [1.0, 1.0, 1.0]), ("lag", [0.1, 0.4], 0.4, [1.0, 1.0, 1.0]),
-    ("each", [0.1, 0.3, -0.2], None, [1.3, 0.8, 0.9])])
+@pytest.mark.parametrize(
+    ("law", "values", "valve", "each"),
+    [
+        ("plain", [0.1], None, [1.0, 1.0, 1.0]),
+        ("lag", [0.1, 0.4], 0.4, [1.0, 1.0, 1.0]),
+        ("each", [0.1, 0.3, -0.2], None, [1.3, 0.8, 0.9]),
+    ],
+)
 def test_leveling_integrates_the_deflection_of_three_mounts(law, values, valve, each):
     rate = 0.1
     model = with_effect("leveling_loop", f"isolators 1-3 z/{law}", values)
@@ -195,9 +213,21 @@ def test_an_integrator_feeds_energy_in():
 
 # --- chassis
 
-CHASSIS = {"mass_kg": 900.0, "damping": 0.05, "x_Hz": 9.0, "y_Hz": 11.0, "z_Hz": 14.0, "rx_Hz": 10.0, "ry_Hz": 12.0,
-           "rz_Hz": 13.0, "gyration_x_m": 0.4, "gyration_y_m": 0.5, "gyration_z_m": 0.6, "centre_z_m": -0.45,
-           "base_z_m": -0.2}
+CHASSIS = {
+    "mass_kg": 900.0,
+    "damping": 0.05,
+    "x_Hz": 9.0,
+    "y_Hz": 11.0,
+    "z_Hz": 14.0,
+    "rx_Hz": 10.0,
+    "ry_Hz": 12.0,
+    "rz_Hz": 13.0,
+    "gyration_x_m": 0.4,
+    "gyration_y_m": 0.5,
+    "gyration_z_m": 0.6,
+    "centre_z_m": -0.45,
+    "base_z_m": -0.2,
+}
 
 
 def on_chassis(place, **changes):
@@ -220,11 +250,11 @@ def test_base_compliance_is_a_second_body(place):
         m, w = v["mass_kg"], 2 * np.pi * v[f"{axis}_Hz"]
         at_centre, at_base = (np.concatenate([np.zeros(6), mount_map(p)[a]]) for p in (centre, below))
         table.mass(at_centre, m)
-        table.spring(at_base, m * w ** 2, 2 * v["damping"] * w * m, np.eye(3)[a])
+        table.spring(at_base, m * w**2, 2 * v["damping"] * w * m, np.eye(3)[a])
         J, w = m * v[f"gyration_{axis}_m"] ** 2, 2 * np.pi * v[f"r{axis}_Hz"]
         turned = table.row(**{f"e{3 + a}": 1.0})
         table.mass(turned, J)
-        table.spring(turned, J * w ** 2, 2 * v["damping"] * w * J)
+        table.spring(turned, J * w**2, 2 * v["damping"] * w * J)
     agree(on_chassis(place), table)
 
 
@@ -247,6 +277,7 @@ def test_a_heavy_chassis_is_a_stiff_floor():
 
 
 # --- payload
+
 
 def test_centre_of_mass_by_the_parallel_axis_theorem():
     c = np.array([0.03, -0.02, 0.05])
@@ -273,7 +304,7 @@ def test_oscillator_is_a_mass_on_a_spring(axes):
     table, w = Assembly(RIG, len(axes)).mounts(), 2 * np.pi * f
     for k, axis in enumerate(axes):
         table.mass(table.row(**{f"e{k}": 1.0}), m)
-        table.spring(table.row(mount_map(place)["xyz".index(axis)], **{f"e{k}": -1.0}), m * w ** 2, 2 * zeta * w * m)
+        table.spring(table.row(mount_map(place)["xyz".index(axis)], **{f"e{k}": -1.0}), m * w**2, 2 * zeta * w * m)
     values = [m, f, zeta, *(x for x, name in zip(place, "xyz", strict=True) if axes == "xyz" or name != axes)]
     agree(with_effect("attached_oscillator", f"payload/{axes}", values), table)
 
@@ -293,7 +324,7 @@ def test_flexible_mode_is_a_coordinate_of_unit_mass():
         for a in range(3):
             table.spring(table.row(G[a], e0=shape[3 * i + a]), one.stiffness[a], one.damping[a], np.eye(3)[a])
     table.mass(table.row(e0=1.0), 1.0)
-    table.spring(table.row(e0=1.0), w ** 2, 2 * zeta * w)
+    table.spring(table.row(e0=1.0), w**2, 2 * zeta * w)
     for k, motor in enumerate(RIG.motors):
         table.T[6, k] = motor.constant_N_per_V * shape[3 * (motor.isolator - 1) + "xyz".index(motor.axis)]
     g = RIG.geophones
@@ -304,8 +335,9 @@ def test_flexible_mode_is_a_coordinate_of_unit_mass():
 def test_cable_along_the_axes_and_oblique():
     place, d = np.array([0.3, 0.2, -0.1]), np.array([0.6, 0.0, 0.8])
     for along, K, values in (
-            ("axes", np.diag([800.0, 300.0, 1500.0]), [800.0, 300.0, 1500.0]),
-            ("oblique", 2000.0 * np.outer(d, d), list(np.sqrt(2000.0) * d))):
+        ("axes", np.diag([800.0, 300.0, 1500.0]), [800.0, 300.0, 1500.0]),
+        ("oblique", 2000.0 * np.outer(d, d), list(np.sqrt(2000.0) * d)),
+    ):
         table, k = Assembly(RIG).mounts(), np.zeros((6, 6))
         G = mount_map(place)
         k[:6, :6] = G.T @ K @ G
@@ -314,29 +346,40 @@ def test_cable_along_the_axes_and_oblique():
         agree(with_effect("cable_stiffness", f"payload/{along}", [*values, 2e-3, *place]), table)
 
 
-@pytest.mark.parametrize(("name", "place", "values"), [
-    ("mount_relaxation", "isolators z", [0.5, 2.0]),
-    ("structural_damping", "isolators/causal", [0.1]),
-    ("structural_damping", "isolators/complex", [0.1]),
-    ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
-    ("cable_stiffness", "payload/axes", [500.0, 500.0, 500.0, 1e-3, 0.3, 0.2, 0.1]),
-    ("mount_surge", "isolators z", [20.0, 0.4, 0.03, 0.02, 0.01, -0.01])])
+@pytest.mark.parametrize(
+    ("name", "place", "values"),
+    [
+        ("mount_relaxation", "isolators z", [0.5, 2.0]),
+        ("structural_damping", "isolators/causal", [0.1]),
+        ("structural_damping", "isolators/complex", [0.1]),
+        ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
+        ("cable_stiffness", "payload/axes", [500.0, 500.0, 500.0, 1e-3, 0.3, 0.2, 0.1]),
+        ("mount_surge", "isolators z", [20.0, 0.4, 0.03, 0.02, 0.01, -0.01]),
+    ],
+)
 def test_passive_at_every_frequency(name, place, values):
     """Power taken by a motion, w/2 q^H Im(Z) q, is never negative: of the effect itself, or of the mounts with it."""
-    Z = added_stiffness(name, place, values, F) if name != "mount_surge" else dynamic_stiffness(
-        with_effect(name, place, values), F)
+    Z = (
+        added_stiffness(name, place, values, F)
+        if name != "mount_surge"
+        else dynamic_stiffness(with_effect(name, place, values), F)
+    )
     loss = np.linalg.eigvalsh((Z - np.conj(np.swapaxes(Z, 1, 2))) / 2j)
     assert np.all(loss[:, 0] > -1e-9 * np.abs(Z).max(axis=(1, 2)))
     assert np.all(loss[:, -1] > 0)
 
 
-@pytest.mark.parametrize(("name", "place", "values"), [
-    ("mount_relaxation", "isolators z", [0.5, 2.0]),
-    ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
-    ("com_offset", "payload", [0.02, 0.01, -0.03]),
-    ("mount_surge", "isolators z", [20.0, 0.3, 0.05, 0.0, 0.02, 0.01]),
-    ("base_compliance", "chassis/rocking", list(CHASSIS.values())),
-    ("payload_flexible_mode", "payload", [25.0, 0.01, *np.linspace(-0.02, 0.03, 12)])])
+@pytest.mark.parametrize(
+    ("name", "place", "values"),
+    [
+        ("mount_relaxation", "isolators z", [0.5, 2.0]),
+        ("attached_oscillator", "payload/xyz", [10.0, 8.0, 0.05, 0.3, 0.2, 0.1]),
+        ("com_offset", "payload", [0.02, 0.01, -0.03]),
+        ("mount_surge", "isolators z", [20.0, 0.3, 0.05, 0.0, 0.02, 0.01]),
+        ("base_compliance", "chassis/rocking", list(CHASSIS.values())),
+        ("payload_flexible_mode", "payload", [25.0, 0.01, *np.linspace(-0.02, 0.03, 12)]),
+    ],
+)
 def test_reciprocity(name, place, values):
     """Whatever has no rotor and no feedback answers alike when force and displacement change places."""
     made = Assembled(with_effect(name, place, values).operators(OMEGA))
@@ -346,11 +389,23 @@ def test_reciprocity(name, place, values):
     np.testing.assert_allclose(inverse, np.swapaxes(inverse, 1, 2), rtol=0, atol=1e-9 * np.abs(inverse).max())
 
 
-@pytest.mark.parametrize(("effect", "relative"), [
-    (None, True), (("geophone_corner", "Sz1", [5.0, 0.6]), False), (("actuator_lag", "actuators", [2e-3]), False),
-    (("attached_oscillator", "payload/z", [20.0, 12.0, 0.05, 0.3, 0.2]), False),
-    (("base_compliance", "chassis/rocking",
-      [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2]), False)])
+@pytest.mark.parametrize(
+    ("effect", "relative"),
+    [
+        (None, True),
+        (("geophone_corner", "Sz1", [5.0, 0.6]), False),
+        (("actuator_lag", "actuators", [2e-3]), False),
+        (("attached_oscillator", "payload/z", [20.0, 12.0, 0.05, 0.3, 0.2]), False),
+        (
+            (
+                "base_compliance",
+                "chassis/rocking",
+                [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2],
+            ),
+            False,
+        ),
+    ],
+)
 def test_derivatives_by_parameters_and_tolerances_are_those_of_differences(effect, relative):
     """Volts, floor and transient; an oblique sensor that reads against the chassis where nothing but the floor moves
     it. Effects on mounts leave out that they move with an isolator's place. The slope by a corner's tolerance is that
@@ -360,9 +415,13 @@ def test_derivatives_by_parameters_and_tolerances_are_those_of_differences(effec
         one, *others = rig.instruments
         rig = replace(rig, instruments=(PositionSensorAt(one.name, one.position, (0.6, 0.0, 0.8), 3e3), *others))
     same = ("corner.Sz1", "damping.Sz1") if effect and effect[0] == "geophone_corner" else ()
-    free = [name for name in ResponseModel.of(rig, ()).all_parameters()
-            if name != "loop_delay_s" and name not in same
-            and not (effect and effect[0] == "base_compliance" and ".p_" in name)]
+    free = [
+        name
+        for name in ResponseModel.of(rig, ()).all_parameters()
+        if name != "loop_delay_s"
+        and name not in same
+        and not (effect and effect[0] == "base_compliance" and ".p_" in name)
+    ]
     model = TableModel(ResponseModel.of(rig, free))
     if effect:
         model = with_effect(*effect, model)

@@ -28,6 +28,7 @@ def found_in(duration_s=20.0, **case):
 
 # --- nothing, one, two, something else
 
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 21])
 def test_nothing_is_missing(seed):
@@ -42,15 +43,17 @@ def test_nothing_is_missing(seed):
 
 # One of each family: seed, strength (gross where a small departure is within tolerance), duration, and the truth's
 # name of the parameter by the report's.
-ONE = {"geophone_corner": (2, "gross", 20.0, {"corner_Hz": "corner_Hz"}),
-       "mains_hum": (3, "clear", 20.0, {"frequency_Hz": "frequency_Hz", "amplitude_V": "amplitude_V"}),
-       "actuator_gain": (5, "gross", 20.0, {"gain": "gain"}),
-       "actuator_lag": (6, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
-       "actuator_saturation": (7, "clear", 20.0, {"limit_V": "limit_V"}),
-       "contact_friction": (9, "clear", 20.0, {}),  # each contact of its own: no one value is the true one
-       "cable_stiffness": (13, "clear", 20.0, {}),  # one oblique direction: nine numbers of which the truth tells one
-       "mount_relaxation": (12, "clear", 20.0, {"stiffness_ratio": "stiffness_ratio", "corner_Hz": "corner_Hz"}),
-       "product_of_inertia": (10, "gross", 20.0, {"Jxy_kgm2": "product_kgm2"})}
+ONE = {
+    "geophone_corner": (2, "gross", 20.0, {"corner_Hz": "corner_Hz"}),
+    "mains_hum": (3, "clear", 20.0, {"frequency_Hz": "frequency_Hz", "amplitude_V": "amplitude_V"}),
+    "actuator_gain": (5, "gross", 20.0, {"gain": "gain"}),
+    "actuator_lag": (6, "clear", 20.0, {"corner_Hz": "corner_Hz"}),
+    "actuator_saturation": (7, "clear", 20.0, {"limit_V": "limit_V"}),
+    "contact_friction": (9, "clear", 20.0, {}),  # each contact of its own: no one value is the true one
+    "cable_stiffness": (13, "clear", 20.0, {}),  # one oblique direction: nine numbers of which the truth tells one
+    "mount_relaxation": (12, "clear", 20.0, {"stiffness_ratio": "stiffness_ratio", "corner_Hz": "corner_Hz"}),
+    "product_of_inertia": (10, "gross", 20.0, {"Jxy_kgm2": "product_kgm2"}),
+}
 
 
 @pytest.mark.slow
@@ -89,11 +92,18 @@ def test_a_heavy_sprung_mass_is_no_flexible_mode():
     """Mass and stiffness of the fit without it are off by more than to first order."""
     case = draw_case(7, effect="attached_oscillator", strength="gross", duration_s=20.0)
     mass = 0.02 * rig().parameters()["mass"].value
-    heavy = replace(case.effects[0], parameters={"mass_kg": mass, "frequency_Hz": 9.0, "damping_ratio": 0.03},
-                    details={**case.effects[0].details, "point_m": [0.4, -0.3, 0.4], "axes": np.eye(3).tolist(),
-                             "frequencies_Hz": [9.0, 9.0, 14.0]})
+    heavy = replace(
+        case.effects[0],
+        parameters={"mass_kg": mass, "frequency_Hz": 9.0, "damping_ratio": 0.03},
+        details={
+            **case.effects[0].details,
+            "point_m": [0.4, -0.3, 0.4],
+            "axes": np.eye(3).tolist(),
+            "frequencies_Hz": [9.0, 9.0, 14.0],
+        },
+    )
     found = find_gap(simulate_case(replace(case, effects=(heavy,))), rig()).gap
-    named, = found.effects
+    (named,) = found.effects
     assert named.name == "attached_oscillator"
     assert named.parameters["mass_kg"].value == pytest.approx(mass, rel=0.02)
     assert found.verdict == "explained"
@@ -109,11 +119,12 @@ def test_distortion_that_an_effect_predicts_is_no_noise():
     power, total = 0.0, 0.0
     for record, best in zip(campaign.records, best_prediction(case), strict=True):
         y = record.load().y
-        power, total = power + np.sum((y - best) ** 2, axis=0), total + np.sum(y ** 2, axis=0)
+        power, total = power + np.sum((y - best) ** 2, axis=0), total + np.sum(y**2, axis=0)
     noise = float(np.sqrt(np.mean(power / total)))
     assert 0.3 * noise < found.noise_nrmse < 3 * noise
-    assert found.effects[0].parameters["force_N"].value == pytest.approx(case.effects[0].parameters["coulomb_N"],
-                                                                         rel=0.03)
+    assert found.effects[0].parameters["force_N"].value == pytest.approx(
+        case.effects[0].parameters["coulomb_N"], rel=0.03
+    )
 
 
 @pytest.mark.slow
@@ -129,8 +140,10 @@ def test_what_is_outside_the_library_is_not_named_as_something_else():
     require_contract(found.to_json())
 
 
-@pytest.mark.parametrize(("name", "stated", "taken"), [
-    ("avis", None, None), ("avis", 90.0, 90.0), ("halcyonics", None, 300.0), ("halcyonics", 90.0, 90.0)])
+@pytest.mark.parametrize(
+    ("name", "stated", "taken"),
+    [("avis", None, None), ("avis", 90.0, 90.0), ("halcyonics", None, 300.0), ("halcyonics", 90.0, 90.0)],
+)
 def test_the_amplifiers_of_a_table_with_accelerometers_lag(monkeypatch, name, stated, taken):
     """As `avis identify` and `avis simulate-campaign` have it; a rig file states no lag."""
     rig, asked = load_rig(name), []
@@ -138,6 +151,7 @@ def test_the_amplifiers_of_a_table_with_accelerometers_lag(monkeypatch, name, st
     def stop(campaign, rig, seed, band_Hz, corner, *rest):
         asked.append(corner)
         raise ComputationError("enough")
+
     monkeypatch.setattr(gap_study, "analyse", stop)
     y, u = tuple(rig.sensor_rows()[0]), rig.equations_of_motion().actuators
     header = RecordHeader("00", rig.sample_rate_Hz, 400, u, y, "noise", 1.0, 0.0, y_unit="V")
@@ -149,6 +163,7 @@ def test_the_amplifiers_of_a_table_with_accelerometers_lag(monkeypatch, name, st
 
 
 # --- the contract
+
 
 def require_contract(told):
     """Keys, types and finite numbers of gap.json."""
@@ -199,15 +214,29 @@ RIG = load_rig("avis")
 NAMES = RIG.equations_of_motion().actuators, RIG.geophones.names
 
 
-def campaign(samples=3000, drive=0.3, u_names=NAMES[0], y_names=NAMES[1], records=2, rate=1000.0, unit="V",
-             excitation="noise", change=lambda u, y: None):
+def campaign(
+    samples=3000,
+    drive=0.3,
+    u_names=NAMES[0],
+    y_names=NAMES[1],
+    records=2,
+    rate=1000.0,
+    unit="V",
+    excitation="noise",
+    change=lambda u, y: None,
+):
     rng = np.random.default_rng(1)
     made = []
     for k in range(records):
         u, y = drive * rng.standard_normal((samples, len(u_names))), 0.1 * rng.standard_normal((samples, len(y_names)))
         change(u, y)
-        made.append(Record(RecordHeader(f"{k:02d}", rate, samples, u_names, y_names, excitation, drive, 100.0 * k,
-                                        u_unit=unit), u, y))
+        made.append(
+            Record(
+                RecordHeader(f"{k:02d}", rate, samples, u_names, y_names, excitation, drive, 100.0 * k, u_unit=unit),
+                u,
+                y,
+            )
+        )
     return Campaign("avis", tuple(made))
 
 
@@ -237,7 +266,8 @@ HOSTILE = {
     "another rate": (lambda: campaign(rate=500.0), "sample_rate"),
     "newtons": (lambda: campaign(unit="N"), "unit of u = 'N': expected commanded voltages"),
     "frequency responses": (responses, "expected records in time"),
-    "no record": (lambda: campaign(records=0), "expected at least one record")}
+    "no record": (lambda: campaign(records=0), "expected at least one record"),
+}
 
 
 @pytest.mark.parametrize("gates", [True, False], ids=["gates", "no gates"])

@@ -75,11 +75,19 @@ def test_every_effect_comes_back(name, place):
 def test_several_effects_clock_and_drives():
     base = replace(BASE.base, amplifier_corner_Hz=173.25, delay_s=1.23456789e-3)
     model = TableModel(base)
-    for effect, place in ((LargeMotion(), "payload"), (library()["com_offset"], "payload"),
-                          (library()["geophone_corner"], "Sy3")):
+    for effect, place in (
+        (LargeMotion(), "payload"),
+        (library()["com_offset"], "payload"),
+        (library()["geophone_corner"], "Sy3"),
+    ):
         model = model.with_effect(active(effect, model, place, some_values(effect, place)))
-    record = RecordMotion("00", 1e3, 12.5, (12.5, 390.25), *(np.zeros((4, 8)), np.zeros((4, 12)), np.zeros((12, 6)),
-                                                            np.zeros(12), np.zeros(12, bool), np.zeros(8, int)))
+    record = RecordMotion(
+        "00",
+        1e3,
+        12.5,
+        (12.5, 390.25),
+        *(np.zeros((4, 8)), np.zeros((4, 12)), np.zeros((12, 6)), np.zeros(12), np.zeros(12, bool), np.zeros(8, int)),
+    )
     model = replace(model, motion={"00": record})
     written = json.loads(json.dumps(model_to_dict(model)))
     again, _ = model_from_dict(written)
@@ -110,16 +118,28 @@ def changed(**changes):
 
 
 HOSTILE = [
-    ([], "format"), ({}, "format"), (changed(format="avis-gap"), "format"), (changed(version=2), "version"),
-    ({key: value for key, value in changed().items() if key != "rig"}, "rig"), (changed(extra=1), "extra"),
-    (changed(rig="name = "), "rig"), (changed(rig="name = \"x\""), "rig"),
+    ([], "format"),
+    ({}, "format"),
+    (changed(format="avis-gap"), "format"),
+    (changed(version=2), "version"),
+    ({key: value for key, value in changed().items() if key != "rig"}, "rig"),
+    (changed(extra=1), "extra"),
+    (changed(rig="name = "), "rig"),
+    (changed(rig='name = "x"'), "rig"),
     (changed(rig=changed()["rig"].replace("mass_kg", "mass_g")), "mass_g"),
-    (changed(rig_values={"weight": 3.0}), "weight"), (changed(rig_values={"mass": -3.0}), "mass"),
-    (changed(rig_values={"mass": float("nan")}), "rig_values"), (changed(sensors=["Sz9"] * 6), "sensors"),
-    (changed(sensors=[]), "sensors"), (changed(sensitivity=[1.0]), "sensitivity"),
-    (changed(sensitivity=["a"] * 6), "sensitivity"), (changed(sensitivity=[-1.0] * 6), "sensitivity"),
-    (changed(actuators=["Ax9"]), "u names"), (changed(free=["weight"]), "parameters"),
-    (changed(unit="furlong"), "unit"), (changed(delay_s=-1.0), "delay_s"), (changed(period_s="fast"), "period_s"),
+    (changed(rig_values={"weight": 3.0}), "weight"),
+    (changed(rig_values={"mass": -3.0}), "mass"),
+    (changed(rig_values={"mass": float("nan")}), "rig_values"),
+    (changed(sensors=["Sz9"] * 6), "sensors"),
+    (changed(sensors=[]), "sensors"),
+    (changed(sensitivity=[1.0]), "sensitivity"),
+    (changed(sensitivity=["a"] * 6), "sensitivity"),
+    (changed(sensitivity=[-1.0] * 6), "sensitivity"),
+    (changed(actuators=["Ax9"]), "u names"),
+    (changed(free=["weight"]), "parameters"),
+    (changed(unit="furlong"), "unit"),
+    (changed(delay_s=-1.0), "delay_s"),
+    (changed(period_s="fast"), "period_s"),
     (changed(campaign_s=[2.0, 1.0]), "campaign_s"),
     (changed(campaign_s=[1.0]), "campaign_s"),
     (changed(effects=[{"name": "ghost", "place": "attic", "values": {}}]), "effects\\[1\\].name"),
@@ -127,9 +147,20 @@ HOSTILE = [
     (changed(effects=[{"name": "sensor_gain", "place": "Sz2", "values": {"loss": 1.1}}]), "effects\\[1\\].values"),
     (changed(effects=[{"name": "sensor_gain", "place": "Sz2"}]), "effects\\[1\\].values"),
     (changed(effects=[{"name": "sensor_gain", "place": "Sz2", "values": {"gain": True}}]), "gain"),
-    (changed(effects=[{"name": "mount_relaxation", "place": "isolators z",
-                       "values": {"stiffness_ratio": 1.0, "corner_Hz": 0.0}}]), "finite response"),
-    (changed(effects="all"), "effects"), (changed(loaded=True), "load"),
+    (
+        changed(
+            effects=[
+                {
+                    "name": "mount_relaxation",
+                    "place": "isolators z",
+                    "values": {"stiffness_ratio": 1.0, "corner_Hz": 0.0},
+                }
+            ]
+        ),
+        "finite response",
+    ),
+    (changed(effects="all"), "effects"),
+    (changed(loaded=True), "load"),
 ]
 
 
@@ -155,19 +186,36 @@ def test_what_is_no_json(content, tmp_path):
 
 def updated_model():
     model = BASE
-    for name, place, values in (("sensor_gain", "Sz1", [0.8]),
-                                ("cubic_stiffness", "isolators z", [3e12, 0.1, 0.0, -0.1]),
-                                ("actuator_gain", "Ax2", [1.2]),
-                                ("com_offset", "payload", [0.01, 0.0, -0.02])):
+    for name, place, values in (
+        ("sensor_gain", "Sz1", [0.8]),
+        ("cubic_stiffness", "isolators z", [3e12, 0.1, 0.0, -0.1]),
+        ("actuator_gain", "Ax2", [1.2]),
+        ("com_offset", "payload", [0.01, 0.0, -0.02]),
+    ):
         model = model.with_effect(active(library()[name], model, place, values))
     return model
 
 
 def gap_of(updated=None, effects=()):
     updated = updated or updated_model()
-    return Gap("explained", tuple(effects), (Stage("nominal", 0.3, 900.0), Stage("re-identified", 0.1, float("inf"))),
-               (Where(2.0, 6.0, "Az1", "Sz2", 0.8),), (), 0.01, None, BASE, updated, (), None, ("found",),
-               "record 05 held out", 1, 2.5, np.diag(np.arange(1.0, 1 + len(updated.names))))
+    return Gap(
+        "explained",
+        tuple(effects),
+        (Stage("nominal", 0.3, 900.0), Stage("re-identified", 0.1, float("inf"))),
+        (Where(2.0, 6.0, "Az1", "Sz2", 0.8),),
+        (),
+        0.01,
+        None,
+        BASE,
+        updated,
+        (),
+        None,
+        ("found",),
+        "record 05 held out",
+        1,
+        2.5,
+        np.diag(np.arange(1.0, 1 + len(updated.names))),
+    )
 
 
 def named(name, location, **parameters):
@@ -204,7 +252,11 @@ def test_gap_json_says_where_it_comes_from(tmp_path):
     told = read_gap(tmp_path)
     assert told["provenance"] == made_by
     assert (told["noise_nrmse"], told["sentences"], told["design"], told["design_note"]) == (
-        0.01, ["found"], None, "no controller")
+        0.01,
+        ["found"],
+        None,
+        "no controller",
+    )
 
 
 def find_gap_quickly(monkeypatch, options):
@@ -226,6 +278,7 @@ def test_the_hash_is_that_of_the_design_file_as_it_was_read(tmp_path, monkeypatc
 
     def synthesis(gap, design, progress):
         design.write_text("edited during the synthesis")
+
     monkeypatch.setattr("avis_ctrl.study.gap.design_effect", synthesis)
     found = find_gap_quickly(monkeypatch, GapOptions(design=True, design_file=path))
     assert found.provenance["design_sha256"] == hashlib.sha256(b"as read").hexdigest()
@@ -243,8 +296,12 @@ def test_a_run_without_a_design_removes_that_of_an_earlier_run(tmp_path):
     (tmp_path / "design" / "design.toml").write_text("my own")
     write_gap(tmp_path, gap_of())
     assert (tmp_path / "design" / "design.toml").read_text() == "my own"
-    written = write_gap(tmp_path, gap_of(), content=gap_of().to_json() | {"design": {"before": {}}},
-                        design={"rig.toml": "a", "design.toml": "b"})
+    written = write_gap(
+        tmp_path,
+        gap_of(),
+        content=gap_of().to_json() | {"design": {"before": {}}},
+        design={"rig.toml": "a", "design.toml": "b"},
+    )
     assert written[-1].name == "gap.json" and (tmp_path / "design" / "design.toml").read_text() == "b"
     (tmp_path / "design" / "notes.txt").write_text("my own")
     write_gap(tmp_path, gap_of())
@@ -253,9 +310,11 @@ def test_a_run_without_a_design_removes_that_of_an_earlier_run(tmp_path):
 
 def test_a_response_removes_the_model_of_an_earlier_drive(tmp_path):
     """A seismometer has no model that predicts records; that of another kind in the same folder would be used."""
+
     def written(model):
         found = SimpleNamespace(model=model, to_json=lambda: {"format": "avis-gap-axis"})
         return write_axis_gap(tmp_path, found, "record.csv", {}, lambda *given: (b"<html></html>", b"%PDF-1.7"))
+
     assert written({"kind": "drive", "reading": {}})[-1] == "axis_model.json"
     assert written({"kind": "seismometer"}) == ["gap.json", "gap.html", "gap.pdf"]
     with pytest.raises(InputError, match="expected the model of a drive or an oscillator"):
@@ -269,6 +328,7 @@ def test_a_disk_that_refuses_leaves_the_old_result_whole(tmp_path, monkeypatch):
 
     def full(path, content):
         raise ComputationError(f"{path} was not written", cause="no space left")
+
     monkeypatch.setattr("avis_ctrl.files.write_whole", full)
     with pytest.raises(ComputationError, match="no space left"):
         write_gap(tmp_path, gap_of())
@@ -282,8 +342,18 @@ def campaign_of(level, names=None, floor=False, samples=3000, unit="V"):
     for k in range(2):
         u = level * rng.standard_normal((samples, 8))
         w = 1e-6 * rng.standard_normal((samples, 3)) if floor else None
-        header = RecordHeader(f"{k:02d}", 1e3, samples, base.actuators, names, "noise", level, 10.0 * k, y_unit=unit,
-                              floor_names=("vx", "vy", "vz") if floor else ())
+        header = RecordHeader(
+            f"{k:02d}",
+            1e3,
+            samples,
+            base.actuators,
+            names,
+            "noise",
+            level,
+            10.0 * k,
+            y_unit=unit,
+            floor_names=("vx", "vy", "vz") if floor else (),
+        )
         records.append(Record(header, u, np.zeros((samples, len(names))), w))
     return Campaign("avis", tuple(records))
 
@@ -292,8 +362,13 @@ def campaign_of(level, names=None, floor=False, samples=3000, unit="V"):
 def folder(tmp_path):
     path = tmp_path / "gap"
     path.mkdir()
-    write_gap(path, gap_of(None, [named("sensor_quantisation", "Sz2", clip_high_V=0.5, clip_low_V=-0.25),
-                                  named("mains_hum", "geophones")]))
+    write_gap(
+        path,
+        gap_of(
+            None,
+            [named("sensor_quantisation", "Sz2", clip_high_V=0.5, clip_low_V=-0.25), named("mains_hum", "geophones")],
+        ),
+    )
     return path
 
 
@@ -339,7 +414,7 @@ def test_predictions_at_the_limits(folder, tmp_path):
     campaign, out = campaign_of(12.0), tmp_path / "pred.h5"
     write_gap_predictions(folder, campaign, out)
     record = campaign.records[0]
-    exact = np.clip(Predictor(BASE.base).read(np.clip(record.u, -10, 10)), -10, 10 - 20 / 2 ** 14)
+    exact = np.clip(Predictor(BASE.base).read(np.clip(record.u, -10, 10)), -10, 10 - 20 / 2**14)
     with h5py.File(out) as file:
         found = file["records/00/y_baseline"][:]
         assert "floor of records 00, 01" in file.attrs["not_predicted"]
@@ -356,10 +431,22 @@ def test_the_command(folder, tmp_path):
         assert set(file["records/01"]) == {"y_baseline", "y_updated"}
 
 
-@pytest.mark.parametrize(("campaign", "message"), [
-    (campaign_of(0.1, unit="m/s"), "unit of y"), (campaign_of(0.1, ("Sz2", "S9")), "S9"),
-    (Campaign("avis", tuple(replace(one, header=replace(one.header, sample_rate_Hz=500.0)) for one in
-                            campaign_of(0.1).records)), "record 00: sample_rate_Hz")])
+@pytest.mark.parametrize(
+    ("campaign", "message"),
+    [
+        (campaign_of(0.1, unit="m/s"), "unit of y"),
+        (campaign_of(0.1, ("Sz2", "S9")), "S9"),
+        (
+            Campaign(
+                "avis",
+                tuple(
+                    replace(one, header=replace(one.header, sample_rate_Hz=500.0)) for one in campaign_of(0.1).records
+                ),
+            ),
+            "record 00: sample_rate_Hz",
+        ),
+    ],
+)
 def test_campaigns_that_do_not_fit(folder, campaign, message, tmp_path):
     with pytest.raises(InputError, match=message):
         write_gap_predictions(folder, campaign, tmp_path / "pred.h5")
@@ -369,14 +456,21 @@ def test_campaigns_that_do_not_fit(folder, campaign, message, tmp_path):
 def break_file(name, text):
     def act(folder: Path):
         (folder / name).write_text(text, encoding="utf-8")
+
     return act
 
 
-@pytest.mark.parametrize(("damage", "message"), [
-    (break_file("gap.json", "{"), r"gap\.json"), (break_file("gap.json", "[1]"), r"gap\.json: format"),
-    (break_file("gap.json", '{"format": "avis-gap", "effects": 3}'), r"gap\.json: effects"),
-    (lambda folder: (folder / "updated.json").unlink(), r"updated\.json"),
-    (break_file("baseline.json", "{}"), r"baseline\.json: format"), (shutil.rmtree, r"gap\.json")])
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (break_file("gap.json", "{"), r"gap\.json"),
+        (break_file("gap.json", "[1]"), r"gap\.json: format"),
+        (break_file("gap.json", '{"format": "avis-gap", "effects": 3}'), r"gap\.json: effects"),
+        (lambda folder: (folder / "updated.json").unlink(), r"updated\.json"),
+        (break_file("baseline.json", "{}"), r"baseline\.json: format"),
+        (shutil.rmtree, r"gap\.json"),
+    ],
+)
 def test_folders_that_are_broken(folder, damage, message, tmp_path):
     damage(folder)
     with pytest.raises(InputError, match=message):

@@ -53,12 +53,26 @@ def block(model: ResponseModel, seed: int, lines: int = 60, noise: float = 1e-3)
     return SpectralBlock(f"{seed:02d}", omega, U, Y, whole, transient=True, samples=60000)
 
 
-@pytest.mark.parametrize("name", ["place.Ay1.x", "place.Sz3.y", "direction.Az2.x", "direction.Sx2.z", "actuator.Ax4",
-                                  "sensor.Sy1", "corner.Sz1", "damping.Sy3", "com_z", "J13", "isolator2.p_x"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "place.Ay1.x",
+        "place.Sz3.y",
+        "direction.Az2.x",
+        "direction.Sx2.z",
+        "actuator.Ax4",
+        "sensor.Sy1",
+        "corner.Sz1",
+        "damping.Sy3",
+        "com_z",
+        "J13",
+        "isolator2.p_x",
+    ],
+)
 def test_derivatives_by_tolerances_are_those_of_differences(name):
     model = bare((name,))
     omega, U = 2 * np.pi * np.geomspace(0.5, 80, 40), np.random.default_rng(1).standard_normal((40, 11, 2)) + 0j
-    value, = model.values
+    (value,) = model.values
     step = 1e-5 * max(abs(value), 0.1)
     high, low = (model.at([value + sign * step]).driven(omega, U, False).Y for sign in (1, -1))
     slope = model.driven(omega, U).dY[0]
@@ -96,10 +110,12 @@ def test_path_errors_are_integrated_out_as_a_dense_covariance_would_do():
     C = np.zeros((144, 144), complex)
     lines = [(r, k, int(np.floor(np.log2(blocks[r].omega[k]) + 1e-9))) for r in range(2) for k in range(12)]
     for i, (r, k, band) in enumerate(lines):
-        C[6 * i:6 * i + 6, 6 * i:6 * i + 6] += 1e-3 * np.eye(6) + np.diag(found.distortion[levels[r], band])
+        C[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += 1e-3 * np.eye(6) + np.diag(found.distortion[levels[r], band])
         for j, (s, m, other) in enumerate(lines):
             if other == band:
-                C[6 * i:6 * i + 6, 6 * j:6 * j + 6] += np.diag(path[band] * np.sum(G[r][k] * G[s][m].conj(), axis=1))
+                C[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += np.diag(
+                    path[band] * np.sum(G[r][k] * G[s][m].conj(), axis=1)
+                )
     assert flat @ flat == pytest.approx(2 * np.real(e.ravel().conj() @ np.linalg.solve(C, e.ravel())), rel=1e-9)
     assert weights.log_determinant == pytest.approx(2 * np.linalg.slogdet(C)[1], rel=1e-9)
     assert_allclose(np.sort(np.concatenate(list(weights.rows.values()))), np.arange(288))
@@ -115,8 +131,9 @@ def test_a_tolerance_is_found_within_its_deviation_and_the_priors_hold_the_rest(
     model = bare(priors.names)
     true = model.at(priors.values(truth))
     data = Data(tuple(block(true, seed, 50, 1e-4) for seed in (5, 6)), (0.2, 0.2))
-    start = replace(first_variances(data, settings), path={k: np.full(6, 1e-6) for k in
-                                                          first_variances(data, settings).path})
+    start = replace(
+        first_variances(data, settings), path={k: np.full(6, 1e-6) for k in first_variances(data, settings).path}
+    )
     found = fit(model, priors, np.zeros(len(truth)), data, start, settings)
     sigma = np.sqrt(np.diag(found.covariance))
     assert np.max(np.abs(found.z - truth) / sigma) < 4.5
@@ -124,8 +141,14 @@ def test_a_tolerance_is_found_within_its_deviation_and_the_priors_hold_the_rest(
 
 
 def test_parameters_stay_within_their_bounds():
-    priors = Priors(("a", "b"), np.array([0.0, 1.0]), np.array([1.0, 0.1]), np.array([False, True]),
-                    np.array([-0.5, 0.0]), np.array([0.5, 2.0]))
+    priors = Priors(
+        ("a", "b"),
+        np.array([0.0, 1.0]),
+        np.array([1.0, 0.1]),
+        np.array([False, True]),
+        np.array([-0.5, 0.0]),
+        np.array([0.5, 2.0]),
+    )
     assert_allclose(priors.values(np.array([3.0, 1.0])), [0.5, np.exp(0.1)])
 
 
@@ -139,7 +162,7 @@ def test_at_a_bound_the_other_parameters_find_their_own_optimum():
     truth = mean * np.where(np.arange(len(mean)) == 0, 1.2, 0.97)
     data = Data(tuple(block(bare(names).at(truth), seed, 120, 1e-7) for seed in (3, 4)), (0.2, 0.2))
     found = fit(bare(names), priors, np.zeros(len(mean)), data, first_variances(data, settings), settings)
-    slope = (found.J @ found.e - found.z) / np.sqrt(np.sum(found.J ** 2, axis=1) + 1)
+    slope = (found.J @ found.e - found.z) / np.sqrt(np.sum(found.J**2, axis=1) + 1)
     bound = found.z == priors.bounds[1]
     assert bound[0] and not np.all(bound)
     assert np.all(slope[bound] > 1) and np.max(np.abs(slope[~bound])) < 0.05
@@ -157,8 +180,10 @@ def test_a_step_within_bounds_is_that_of_bounded_least_squares(bounded, rng):
 
         def expand(z, derivative=True, root=root, target=target):
             e = target - root @ z
-            return SimpleNamespace(z=z, H=root.T @ root, g=root.T @ e, whole=float(e @ e + z @ z),
-                                   now=SimpleNamespace(e=e))
+            return SimpleNamespace(
+                z=z, H=root.T @ root, g=root.T @ e, whole=float(e @ e + z @ z), now=SimpleNamespace(e=e)
+            )
+
         end, _ = descent(expand, np.full(8, 0.1), priors, 12, SETTINGS)
         best = lsq_linear(np.vstack([root, np.eye(8)]), np.r_[target, np.zeros(8)], (low, np.inf), tol=1e-14)
         assert end.whole <= 2 * best.cost * (1 + 1e-8) + 1e-6 and np.all(end.z >= low)
@@ -178,8 +203,9 @@ def found_at(seed: int = 7, bend: float = 0.0):
         blocks.append(replace(one, Y=one.Y * factor))
     data = Data(tuple(blocks), (0.2, 0.2))
     first = first_variances(data, settings)
-    little = Variances({group: 1e-4 * v for group, v in first.path.items()},
-                       {group: 1e-9 * s for group, s in first.distortion.items()})
+    little = Variances(
+        {group: 1e-4 * v for group, v in first.path.items()}, {group: 1e-9 * s for group, s in first.distortion.items()}
+    )
     return fit(model, priors, np.zeros(1), data, little, settings), data, settings
 
 
@@ -195,8 +221,10 @@ def fit_with_places(noise: float, moved: float):
     blocks = tuple(block(model.at(priors.values(z)), seed, noise=noise) for seed in (5, 6))
     data = Data(blocks, (0.5, 0.5))
     first = first_variances(data, settings)
-    none = Variances({group: 1e-20 * v for group, v in first.path.items()},
-                     {group: 1e-20 * s for group, s in first.distortion.items()})
+    none = Variances(
+        {group: 1e-20 * v for group, v in first.path.items()},
+        {group: 1e-20 * s for group, s in first.distortion.items()},
+    )
     return fit(model, priors, np.zeros(len(z)), data, none, settings), blocks
 
 
@@ -236,24 +264,37 @@ def test_variances_are_the_most_likely_ones():
     circular = rng.standard_normal((2, 2, 30, 6)) / np.sqrt(2)
     size = np.array([0.03, 0.1])[:, None, None]
     e = np.einsum("rkcj,cj->rkc", path[..., :3], errors) + size * (circular[0] + 1j * circular[1])
-    blocks = [SpectralBlock("01", omega, np.zeros((30, 11, 1), complex), one[:, :, None], whole, transient=False,
-                            samples=60000) for one in e]
+    blocks = [
+        SpectralBlock(
+            "01", omega, np.zeros((30, 11, 1), complex), one[:, :, None], whole, transient=False, samples=60000
+        )
+        for one in e
+    ]
     band = int(np.floor(np.log2(omega[0]) + 1e-9))
     assert np.all(np.floor(np.log2(omega) + 1e-9) == band)
     start = Variances({band: np.full(6, 1e-2)}, {(level, band): np.full(6, 1e-3) for level in levels})
     found = estimated(list(e), blocks, levels, list(path), start, settings)
-    nu, v0, s0 = settings.error_weight, settings.least_error ** 2, settings.least_distortion * noise
+    nu, v0, s0 = settings.error_weight, settings.least_error**2, settings.least_distortion * noise
 
     def cost(x, c):
         v, *s = np.exp(x)
         C = v * np.einsum("rkj,sij->rksi", path[:, :, c], path[:, :, c].conj()).reshape(60, 60)
         C += np.diag(noise + np.repeat(s, 30))
         own = e[:, :, c].ravel()
-        return float(np.real(own.conj() @ np.linalg.solve(C, own)) + np.linalg.slogdet(C)[1]
-                     + nu / 2 * (x.sum() + v0 / v + sum(s0 / one for one in s)))
+        return float(
+            np.real(own.conj() @ np.linalg.solve(C, own))
+            + np.linalg.slogdet(C)[1]
+            + nu / 2 * (x.sum() + v0 / v + sum(s0 / one for one in s))
+        )
+
     for c in range(6):
-        best = minimize(cost, np.log([1e-3, 1e-3, 1e-2]), args=(c,), method="Nelder-Mead",
-                        options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 4000})
+        best = minimize(
+            cost,
+            np.log([1e-3, 1e-3, 1e-2]),
+            args=(c,),
+            method="Nelder-Mead",
+            options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 4000},
+        )
         own = [found.path[band][c], *(found.distortion[level, band][c] for level in levels)]
         assert_allclose(np.log(own), best.x, atol=0.02)
 
@@ -289,8 +330,8 @@ def test_a_parameter_that_moves_with_the_band_refutes_its_law():
 def test_a_parameter_that_hardly_acts_in_a_half_may_move_there():
     """a x + b x^5 with an error at small x that bends b alone; by least squares on the half and on the whole."""
     rng, x = np.random.default_rng(3), np.concatenate([np.linspace(0.05, 0.4, 80), np.linspace(0.6, 1.0, 40)])
-    columns, std = np.stack([x, x ** 5]), 1e-4
-    bent = 0.02 * np.where(x < 0.5, x ** 5 - (x[:80] @ x[:80] ** 5) / (x[:80] @ x[:80]) * x, 0.0)
+    columns, std = np.stack([x, x**5]), 1e-4
+    bent = 0.02 * np.where(x < 0.5, x**5 - (x[:80] @ x[:80] ** 5) / (x[:80] @ x[:80]) * x, 0.0)
     y = columns.T @ [1.0, 0.5] + 100 * bent + std * rng.standard_normal(len(x))
     wide = Priors(("a", "b"), np.zeros(2), np.full(2, 1e3), np.zeros(2, bool))
     J = columns * 1e3 / std
@@ -299,8 +340,8 @@ def test_a_parameter_that_hardly_acts_in_a_half_may_move_there():
     found = SimpleNamespace(priors=wide, z=z, covariance=P, J=J, e=y / std - J.T @ z, rows={})
     low = np.arange(80)
     settings = GapSettings(most_of_half=1e12)
-    parameter, = halves(found, ("a", "b"), settings, [("small", low)])
-    effect, = halves(found, ("a", "b"), settings, [("small", low)], {"a": 0.0, "b": 0.0})
+    (parameter,) = halves(found, ("a", "b"), settings, [("small", low)])
+    (effect,) = halves(found, ("a", "b"), settings, [("small", low)], {"a": 0.0, "b": 0.0})
     whole, half = (np.linalg.lstsq(columns[:, at].T, y[at], rcond=None)[0] for at in (np.arange(len(x)), low))
     change = np.abs(half / whole - 1)
     assert parameter.change == pytest.approx(change.max(), rel=1e-3) and change.max() > 1
@@ -308,8 +349,9 @@ def test_a_parameter_that_hardly_acts_in_a_half_may_move_there():
     assert effect.change == pytest.approx(np.linalg.norm(moved) / np.linalg.norm(columns[:, low].T @ whole), rel=1e-3)
     assert effect.change < 0.05
     gain = found_at(bend=0.3)[0]  # of a logarithm, which never is zero
-    plain, same = (halves(gain, ("sensor.Sz1",), GapSettings(), absent=absent)
-                   for absent in (None, {"sensor.Sz1": 0.0}))
+    plain, same = (
+        halves(gain, ("sensor.Sz1",), GapSettings(), absent=absent) for absent in (None, {"sensor.Sz1": 0.0})
+    )
     assert [one.change for one in plain] == [one.change for one in same]
 
 
@@ -323,7 +365,7 @@ def test_a_gain_moves_relative_to_its_departure():
     z = P @ J @ (y - x) / std
     wide = Priors(("gain",), np.ones(1), np.full(1, 1e3), np.zeros(1, bool))
     found = SimpleNamespace(priors=wide, z=z, covariance=P, J=J, e=(y - x) / std - J.T @ z, rows={})
-    half, = halves(found, ("gain",), GapSettings(), [("first", np.arange(200))], {"gain": 1.0})
+    (half,) = halves(found, ("gain",), GapSettings(), [("first", np.arange(200))], {"gain": 1.0})
     assert half.change == pytest.approx(1.0, abs=0.15)
 
 
@@ -355,7 +397,7 @@ def test_cluster_variances_are_right_in_the_mean_where_the_model_holds_and_where
         y = z @ J + noise
         found = y @ J.T @ P
         moves = [cluster_moves(P, J, own - x @ J, clusters) for own, x in zip(y[:1000], found, strict=False)]
-        variances = np.diag(P @ P) + np.mean([np.sum(one ** 2, axis=0) for one in moves], axis=0)
+        variances = np.diag(P @ P) + np.mean([np.sum(one**2, axis=0) for one in moves], axis=0)
         assert_allclose(variances, np.mean((found - z) ** 2, axis=0), rtol=0.1 if not common else 0.25)
 
 
@@ -406,9 +448,11 @@ def test_odds_by_how_evenly_two_models_differ():
 def test_what_is_beyond_a_tolerance_and_the_tolerance_behind_it():
     model = TableModel(bare())
     priors = with_tolerances(bare(), TOLERANCES)
-    for name, place, value, behind in (("sensor_gain", "Sz1", 1.02, ["sensor.Sz1"]),
-                                       ("product_of_inertia", "Jxz", 0.5, ["J13"]),
-                                       ("geophone_corner", "Sy1", None, ["corner.Sy1", "damping.Sy1"])):
+    for name, place, value, behind in (
+        ("sensor_gain", "Sz1", 1.02, ["sensor.Sz1"]),
+        ("product_of_inertia", "Jxz", 0.5, ["J13"]),
+        ("geophone_corner", "Sy1", None, ["corner.Sy1", "damping.Sy1"]),
+    ):
         effect = library()[name]
         none = [p.none for p in effect.parameters(model, place)]
         near = active(effect, model, place, none if value is None else [value])
@@ -417,22 +461,35 @@ def test_what_is_beyond_a_tolerance_and_the_tolerance_behind_it():
         assert not within_tolerance(near.at([v + 0.1 * max(abs(v), 10) for v in none]), TOLERANCES, GapSettings())
 
 
-@pytest.mark.parametrize(("name", "place", "values", "expected"), [
-    ("com_offset", "payload", [0.004, 0.0, -0.002], {"com_x": (None, 4.0), "com_z": (None, -2.0)}),
-    ("sensor_gain", "Sz1", [1.05], {"sensor.Sz1": (1.05, np.log(1.05) / 0.01)}),
-    ("product_of_inertia", "Jxz", [0.8], {"J13": (None, 4.0)}),
-    ("sensor_misalignment", "Sz1", [2.0, -1.0], {"direction.Sz1.x": (None, np.radians(2) / 0.005),
-                                                 "direction.Sz1.y": (None, -np.radians(1) / 0.005)}),
-    ("geophone_corner", "Sy1", None, {"corner.Sy1": (None, np.log(1.1) / 0.01), "damping.Sy1": (None, 0.0)}),
-])
+@pytest.mark.parametrize(
+    ("name", "place", "values", "expected"),
+    [
+        ("com_offset", "payload", [0.004, 0.0, -0.002], {"com_x": (None, 4.0), "com_z": (None, -2.0)}),
+        ("sensor_gain", "Sz1", [1.05], {"sensor.Sz1": (1.05, np.log(1.05) / 0.01)}),
+        ("product_of_inertia", "Jxz", [0.8], {"J13": (None, 4.0)}),
+        (
+            "sensor_misalignment",
+            "Sz1",
+            [2.0, -1.0],
+            {"direction.Sz1.x": (None, np.radians(2) / 0.005), "direction.Sz1.y": (None, -np.radians(1) / 0.005)},
+        ),
+        ("geophone_corner", "Sy1", None, {"corner.Sy1": (None, np.log(1.1) / 0.01), "damping.Sy1": (None, 0.0)}),
+    ],
+)
 def test_values_beyond_their_tolerance_have_moved_as_their_effect_says(name, place, values, expected):
     """The effect has all of the value: its tolerance is held, and released without it."""
     settings = GapSettings(rounds=0, iterations=0)
     one = active(library()[name], TableModel(bare()), place)
     one = one.at([1.1 * one.values[0], one.values[1]] if values is None else values)
     priors = with_tolerances(bare(), TOLERANCES, settings)
-    before = fit(TableModel(bare(priors.names)), priors, np.zeros(len(priors.names)),
-                 data := Data((block(bare(), 5, 30),), (0.2,)), first_variances(data, settings), settings)
+    before = fit(
+        TableModel(bare(priors.names)),
+        priors,
+        np.zeros(len(priors.names)),
+        data := Data((block(bare(), 5, 30),), (0.2,)),
+        first_variances(data, settings),
+        settings,
+    )
     fitted = with_effect(before, one, data, settings)
     assert fitted is not None
     rest = without_effect(fitted, one.label, data, settings)

@@ -30,20 +30,28 @@ TAU = 1 / (2 * np.pi * 90)
 SHAPE = tuple(0.05 * np.random.default_rng(4).standard_normal(12))
 # Linear effects: name, place, values.
 LINEAR = [
-    ("geophone_corner", "Sz1", (4.0, 0.5)), ("sensor_gain", "Sz1", (1.2,)), ("sensor_misalignment", "Sz1", (5.0, -8.0)),
-    ("tilt_coupling", "horizontal geophones", (9.8,)), ("actuator_gain", "Az1", (1.3,)),
+    ("geophone_corner", "Sz1", (4.0, 0.5)),
+    ("sensor_gain", "Sz1", (1.2,)),
+    ("sensor_misalignment", "Sz1", (5.0, -8.0)),
+    ("tilt_coupling", "horizontal geophones", (9.8,)),
+    ("actuator_gain", "Az1", (1.3,)),
     ("actuator_lag", "actuators", (TAU,)),
     ("actuator_lag", "actuators/each", (TAU, 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07)),
     ("loop_delay", "loop", (2e-3,)),
     ("com_offset", "payload", (0.02, 0.01, -0.03)),
-    ("product_of_inertia", "Jxy", (5.0,)), ("mount_relaxation", "isolators z", (0.4, 3.0)),
+    ("product_of_inertia", "Jxy", (5.0,)),
+    ("mount_relaxation", "isolators z", (0.4, 3.0)),
     ("mount_surge", "isolators z", (40.0, 0.4, 0.03, 0.01, -0.02, 0.02)),
-    ("leveling_loop", "isolators 1-3 z/plain", (0.18,)), ("leveling_loop", "isolators 1-3 z/lag", (0.18, 0.5)),
+    ("leveling_loop", "isolators 1-3 z/plain", (0.18,)),
+    ("leveling_loop", "isolators 1-3 z/lag", (0.18, 0.5)),
     ("leveling_loop", "isolators 1-3 z/each", (0.18, 0.2, -0.1)),
     ("base_compliance", "chassis/translation", (2000.0, 0.06, 20.0, 20.0, 14.0)),
     ("base_compliance", "chassis/rocking", (2000.0, 0.06, 20.0, 20.0, 14.0, 25.0, 25.0, 25.0, 0.6, 0.6, 0.6, 0.0, 0.0)),
-    ("base_compliance", "chassis/rocking",
-     (1000.0, 0.06, 20.0, 22.0, 14.0, 25.0, 24.0, 26.0, 0.4, 0.5, 0.6, -0.4, -0.1)),
+    (
+        "base_compliance",
+        "chassis/rocking",
+        (1000.0, 0.06, 20.0, 22.0, 14.0, 25.0, 24.0, 26.0, 0.4, 0.5, 0.6, -0.4, -0.1),
+    ),
     ("attached_oscillator", "payload/oblique", (2.0, -3.0, 1.5, 12.0, 0.04, 0.3, -0.2, 0.1)),
     ("attached_oscillator", "payload/axes", (20.0, 9.0, 11.0, 14.0, 0.04, 0.3, -0.2, 0.1)),
     ("attached_oscillator", "payload/z", (20.0, 12.0, 0.04, 0.3, -0.2)),
@@ -51,9 +59,22 @@ LINEAR = [
     ("cable_stiffness", "payload/axes", (1e4, 2e4, 3e3, 5e-3, 0.3, 0.2, 0.1)),
     ("cable_stiffness", "payload/oblique", (100.0, -30.0, 60.0, 5e-3, 0.3, 0.2, 0.1)),
     ("payload_flexible_mode", "payload", (30.0, 0.02, *SHAPE)),
-    ("payload_flexible_mode", "payload/two", (30.0, 0.02, *SHAPE, 55.0, 0.01, *SHAPE[::-1]))]
-MECHANICAL = [one for one in LINEAR if one[0] not in ("geophone_corner", "sensor_gain", "sensor_misalignment",
-                                                      "tilt_coupling", "actuator_gain", "actuator_lag", "loop_delay")]
+    ("payload_flexible_mode", "payload/two", (30.0, 0.02, *SHAPE, 55.0, 0.01, *SHAPE[::-1])),
+]
+MECHANICAL = [
+    one
+    for one in LINEAR
+    if one[0]
+    not in (
+        "geophone_corner",
+        "sensor_gain",
+        "sensor_misalignment",
+        "tilt_coupling",
+        "actuator_gain",
+        "actuator_lag",
+        "loop_delay",
+    )
+]
 
 
 def name_of(one) -> str:
@@ -148,8 +169,10 @@ def assemble_with_mass(model: TableModel, omega: np.ndarray, M: np.ndarray, kept
 
 def test_friction_at_rest_is_stiffness_of_the_driven_mounts(rig, plain):
     model = with_one(plain, "contact_friction", "actuators", (7e3, 1e-5, *(0.0,) * 7))
-    changes = {f"isolator{m.isolator}.k_{m.axis}": rig.parameters()[f"isolator{m.isolator}.k_{m.axis}"].value + 7e3
-               for m in rig.motors}
+    changes = {
+        f"isolator{m.isolator}.k_{m.axis}": rig.parameters()[f"isolator{m.isolator}.k_{m.axis}"].value + 7e3
+        for m in rig.motors
+    }
     stiffer = realise(replace(plain, base=replace(plain.base, rig=rig.with_parameters(changes))))
     made = realise(model)
     omega = made.omega
@@ -176,8 +199,10 @@ def test_a_settling_drift_is_nearly_over_in_the_middle_of_the_campaign(rig, plai
     assert differ(found.system.frequency_response(found.omega), other.system.frequency_response(found.omega)) < 1e-9
 
 
-@pytest.mark.parametrize("name, place, values", [("cubic_stiffness", "isolators z", (1e9, 0.0, 0.0, 0.0)),
-                                                ("actuator_saturation", "actuators", (3.0,))])
+@pytest.mark.parametrize(
+    "name, place, values",
+    [("cubic_stiffness", "isolators z", (1e9, 0.0, 0.0, 0.0)), ("actuator_saturation", "actuators", (3.0,))],
+)
 def test_what_vanishes_with_amplitude_is_left_out_and_said(plain, name, place, values):
     made, without = realise(with_one(plain, name, place, values)), realise(plain)
     assert differ(made.system.frequency_response(made.omega), without.system.frequency_response(made.omega)) < 1e-9
@@ -213,13 +238,14 @@ def test_a_hanging_mass_in_time(rig, plain):
     eom, w = rig.equations_of_motion(), 2 * np.pi * frequency
     g = np.append(point_map(np.array([x, y, 0.0]))[2], -1.0)  # stretch of the spring by (q, displacement of the mass)
     M = la.block_diag(eom.M, mass)
-    K = la.block_diag(eom.K, 0.0) + mass * w ** 2 * np.outer(g, g)
+    K = la.block_diag(eom.K, 0.0) + mass * w**2 * np.outer(g, g)
     C = la.block_diag(eom.C, 0.0) + 2 * zeta * w * mass * np.outer(g, g)
     push = np.append(eom.T[:, eom.actuators.index("Az2")], 0.0)
 
     def slope(t: float, state: np.ndarray) -> np.ndarray:
         q, v = state[:7], state[7:]
         return np.concatenate([v, la.solve(M, push - K @ q - C @ v, assume_a="pos")])
+
     times = np.linspace(0.05, 1.0, 20)
     there = solve_ivp(slope, (0.0, 1.0), np.zeros(14), t_eval=times, rtol=1e-10, atol=1e-14).y[7:13].T
     step = made.select(["x_dot", "y_dot", "z_dot", "phi_x_edge_dot", "phi_y_edge_dot", "phi_z_edge_dot"], ["Az2"])

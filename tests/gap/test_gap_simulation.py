@@ -46,7 +46,7 @@ def with_effect(name, place, values, model=BARE):
 
 def error(found, true):
     """Largest r.m.s. error of a channel over its r.m.s."""
-    return float(np.max(np.sqrt(np.mean((found - true) ** 2, axis=0) / np.mean(true ** 2, axis=0))))
+    return float(np.max(np.sqrt(np.mean((found - true) ** 2, axis=0) / np.mean(true**2, axis=0))))
 
 
 def test_bare_rig_as_predict():
@@ -81,9 +81,10 @@ def test_a_floor_with_a_mean_moves_payload_and_chassis_together():
 def attached(mass, f, zeta, place, axis):
     """A sprung mass with its absolute position as a state."""
     table, w = Table(RIG), 2 * np.pi * f
-    k, c = mass * w ** 2, 2 * zeta * w * mass
-    table.attach(mount_map(place)[axis], [[0, 1], [-k / mass, -c / mass]], [[0, 0], [k / mass, c / mass]],
-                 [-k, -c, k, c])
+    k, c = mass * w**2, 2 * zeta * w * mass
+    table.attach(
+        mount_map(place)[axis], [[0, 1], [-k / mass, -c / mass]], [[0, 0], [k / mass, c / mass]], [-k, -c, k, c]
+    )
     return table
 
 
@@ -111,8 +112,13 @@ def lagging(tau):
 
 
 LINEAR = [
-    ("attached_oscillator", "payload/z", [20.0, 12.0, 0.03, 0.3, -0.2],
-     attached(20.0, 12.0, 0.03, [0.3, -0.2, 0.0], 2), {}),
+    (
+        "attached_oscillator",
+        "payload/z",
+        [20.0, 12.0, 0.03, 0.3, -0.2],
+        attached(20.0, 12.0, 0.03, [0.3, -0.2, 0.0], 2),
+        {},
+    ),
     ("mount_relaxation", "isolators z", [0.8, 2.5], relaxing(0.8, 2.5), {}),
     ("leveling_loop", "isolators 1-3 z/plain", [0.07], leveled(0.07), {}),
     ("actuator_lag", "actuators", [4e-3], lagging(4e-3), {}),
@@ -135,13 +141,23 @@ NONLINEAR = [  # name, place, values, what Runge-Kutta takes, when, least effect
     ("contact_friction", "actuators", [3e4, 1e-7, *EVEN], {"friction": (3e4, 1e-7)}, {}, 0.01, 1e-4),
     ("contact_friction", "actuators", [3e4, 1e-3, *EVEN], {"friction": (3e4, 1e-3)}, {}, 0.5, 2e-3),
     ("contact_friction", "actuators", [3e5, 1e-6, *EVEN], {"friction": (3e5, 1e-6)}, {}, 0.5, 2e-2),
-    ("stiffness_drift", "isolators/linear", [0.3], {"drift": (0.3, -100.0, 150.0)}, {"start_s": 100.0,
-                                                                              "campaign_s": (0.0, 150.0)}, 0.1, 1e-4),
+    (
+        "stiffness_drift",
+        "isolators/linear",
+        [0.3],
+        {"drift": (0.3, -100.0, 150.0)},
+        {"start_s": 100.0, "campaign_s": (0.0, 150.0)},
+        0.1,
+        1e-4,
+    ),
 ]
 
 
-@pytest.mark.parametrize(("name", "place", "values", "given", "when", "least", "largest"), NONLINEAR,
-                         ids=[f"{one[0]}-{one[2][0]:g}" for one in NONLINEAR])
+@pytest.mark.parametrize(
+    ("name", "place", "values", "given", "when", "least", "largest"),
+    NONLINEAR,
+    ids=[f"{one[0]}-{one[2][0]:g}" for one in NONLINEAR],
+)
 def test_effects_of_amplitude_and_time_as_runge_kutta(name, place, values, given, when, least, largest):
     found = simulate(with_effect(name, place, values), U, None, FS, **when)
     y, d = Table(RIG).run(U, FS, **given)
@@ -157,8 +173,9 @@ def test_saturation_and_the_drive_limit():
     assert error(Table(RIG).run(np.clip(U, -0.4, 0.4), FS)[0], Table(RIG).run(U, FS)[0]) > 0.02
     limit = RIG.drive_limit_V
     far = 20 * limit * U
-    np.testing.assert_array_equal(simulate(BARE, far, None, FS).y,
-                                  simulate(BARE, np.clip(far, -limit, limit), None, FS).y)
+    np.testing.assert_array_equal(
+        simulate(BARE, far, None, FS).y, simulate(BARE, np.clip(far, -limit, limit), None, FS).y
+    )
 
 
 def test_two_effects_at_once():
@@ -170,9 +187,17 @@ def test_two_effects_at_once():
     assert error(simulate(model, U, None, FS).y, y) < 2e-4
 
 
-@pytest.mark.parametrize(("name", "place", "values"), [
-    ("base_compliance", "chassis/rocking", [5e3, 0.05, 30.0, 30.0, 40.0, 35.0, 35.0, 35.0, 0.8, 0.8, 0.8, 0.0, 0.0]),
-    ("payload_flexible_mode", "payload", [60.0, 0.02, *np.linspace(-0.02, 0.02, 12)])])
+@pytest.mark.parametrize(
+    ("name", "place", "values"),
+    [
+        (
+            "base_compliance",
+            "chassis/rocking",
+            [5e3, 0.05, 30.0, 30.0, 40.0, 35.0, 35.0, 35.0, 0.8, 0.8, 0.8, 0.0, 0.0],
+        ),
+        ("payload_flexible_mode", "payload", [60.0, 0.02, *np.linspace(-0.02, 0.02, 12)]),
+    ],
+)
 def test_cubic_mounts_on_a_table_with_more_coordinates(name, place, values):
     """A chassis that recoils a little, a payload that bends a little: the march has their coordinates."""
     cubic = with_effect("cubic_stiffness", "isolators z", [1e13, 0.0, 0.0, 0.0])
@@ -192,8 +217,10 @@ def test_large_rotations_as_the_nonlinear_table():
     still, h, out = np.zeros(6), 2.5e-4, []
 
     def slope(state, volts):
-        return np.concatenate([state[6:], payload_acceleration(state[:6].copy(), state[6:].copy(), volts, still, still,
-                                                               arrays)])
+        return np.concatenate(
+            [state[6:], payload_acceleration(state[:6].copy(), state[6:].copy(), volts, still, still, arrays)]
+        )
+
     big = np.clip(big[:2000], -10, 10)
     for k in range(len(big)):
         out.append(x[:6].copy())
@@ -253,23 +280,39 @@ def test_what_has_no_motion_is_said():
         simulate(with_effect("cubic_stiffness", "isolators z", [-1e15, 0.0, 0.0, 0.0]), U, None, FS)
 
 
-@pytest.mark.parametrize(("u", "floor", "rate", "message"), [
-    (U[:, :3], None, FS, "8"), (U, np.zeros((5, 3)), FS, "floor"), (np.full((10, 8), np.nan), None, FS, "finite"),
-    (U, None, 500.0, "sample_rate_Hz"), (U[:1], None, FS, "two samples")])
+@pytest.mark.parametrize(
+    ("u", "floor", "rate", "message"),
+    [
+        (U[:, :3], None, FS, "8"),
+        (U, np.zeros((5, 3)), FS, "floor"),
+        (np.full((10, 8), np.nan), None, FS, "finite"),
+        (U, None, 500.0, "sample_rate_Hz"),
+        (U[:1], None, FS, "two samples"),
+    ],
+)
 def test_hostile_arrays(u, floor, rate, message):
     with pytest.raises(InputError, match=message):
         simulate(BARE, u, floor, rate)
 
 
 def record_of(u, y, name="00", start_s=0.0, floor=None):
-    header = RecordHeader(name, FS, len(u), BARE.actuators, BARE.sensors.names, "noise", 0.3, start_s,
-                          floor_names=() if floor is None else ("vx", "vy", "vz"))
+    header = RecordHeader(
+        name,
+        FS,
+        len(u),
+        BARE.actuators,
+        BARE.sensors.names,
+        "noise",
+        0.3,
+        start_s,
+        floor_names=() if floor is None else ("vx", "vy", "vz"),
+    )
     return Record(header, u, y, floor)
 
 
 def parts(found, true):
     """Error of the deflection over its r.m.s.: away from the ends, and in the last two seconds."""
-    size = np.sqrt(np.mean(true ** 2, axis=0))
+    size = np.sqrt(np.mean(true**2, axis=0))
     inner, last = slice(3000, -3000), slice(-2000, None)
     return tuple(float(np.max(np.sqrt(np.mean((found - true)[one] ** 2, axis=0)) / size)) for one in (inner, last))
 
@@ -291,14 +334,25 @@ def test_motion_of_a_table_with_cubic_mounts():
 @pytest.mark.parametrize(("measured", "largest"), [(True, 0.005), (False, 0.04)])
 def test_motion_of_a_perturbed_nonlinear_table(measured, largest):
     """0.3 V on a table whose parameters are off, floor and noise: 0.5 % where the floor is measured, else 4 %."""
-    plan = CampaignPlan.model_validate({
-        "duration_s": 30.0, "settle_s": 5.0, "ambient": {"velocity_rms_m_per_s": 2e-6}, "truth": {"nonlinear": True},
-        "floor_sensor": {"recorded": measured}, "record": [{"excitation": "noise", "level_V": 0.3}]})
+    plan = CampaignPlan.model_validate(
+        {
+            "duration_s": 30.0,
+            "settle_s": 5.0,
+            "ambient": {"velocity_rms_m_per_s": 2e-6},
+            "truth": {"nonlinear": True},
+            "floor_sensor": {"recorded": measured},
+            "record": [{"excitation": "noise", "level_V": 0.3}],
+        }
+    )
     truth = perturbed_truth(RIG, 5.0, 20.0, 3)
     campaign = simulate_campaign(RIG, plan, 1, truth=truth)
     found = motion_of(campaign, BARE)["00"]
-    again = simulate_campaign(RIG, plan.model_copy(update={"floor_sensor": plan.floor_sensor.model_copy(update={
-        "recorded": True})}), 1, truth=truth).records[0]
+    again = simulate_campaign(
+        RIG,
+        plan.model_copy(update={"floor_sensor": plan.floor_sensor.model_copy(update={"recorded": True})}),
+        1,
+        truth=truth,
+    ).records[0]
     # The truth's own linear model: it differs from the nonlinear one by 1e-5 at this level.
     true = simulate(TableModel(ResponseModel.of(truth, ())), again.u, again.floor, FS).deflection
     assert parts(found.deflection, true)[0] < largest

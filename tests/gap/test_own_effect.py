@@ -58,7 +58,7 @@ def low_passed(campaign: Campaign) -> Campaign:
         k = h.y_names.index(PLACE)
         f = np.fft.rfftfreq(2 * h.samples, 1 / h.sample_rate_Hz)
         spectrum = np.fft.rfft(y[:, k], 2 * h.samples) / (1 + 2j * np.pi * f * TAU)
-        y[:, k] = np.fft.irfft(spectrum)[:h.samples]
+        y[:, k] = np.fft.irfft(spectrum)[: h.samples]
         records.append(Record(h, record.u, y, record.floor))
     return replace(campaign, records=tuple(records))
 
@@ -116,26 +116,33 @@ def test_candidates_can_be_given_as_objects(example):
 
 
 START = "import numpy as np\nfrom avis_ctrl.gap.effects.base import Effect, EffectParameter, register\n"
-CLASS = START + '''
+CLASS = (
+    START
+    + """
 @register
 class Own(Effect):
     name, title, looks_like = "own_thing", "something", "something"
     def places(self, model): return ("payload",)
     def parameters(self, model, place): return (EffectParameter("k", "N/m", "a k", 0.0, -1.0, 1.0, 0.1),)
     def change(self, ops, place, values): pass
-'''
+"""
+)
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("def broken(:\n", "line 1: SyntaxError"),
-    ("\n\nimport no_such_module\n", "line 3: ModuleNotFoundError: No module named 'no_such_module'"),
-    ("raise SystemExit(0)\n", "line 1: SystemExit: 0"),
-    ("x = 1\n", "registers no effect"),
-    ("\x00", "expected a Python file that runs"),
-    (CLASS.replace("own_thing", "sensor_gain").replace("class Own", "class SensorGain"), "a name that no other"),
-    (CLASS.replace("own_thing", ""), "an effect with a name"),
-    (START + "@register\nclass Own(Effect):\n    name = 'half'\n    def __init__(self, x): pass\n", "TypeError"),
-], ids=["syntax", "import", "exit", "nothing", "null", "taken", "nameless", "constructor"])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("def broken(:\n", "line 1: SyntaxError"),
+        ("\n\nimport no_such_module\n", "line 3: ModuleNotFoundError: No module named 'no_such_module'"),
+        ("raise SystemExit(0)\n", "line 1: SystemExit: 0"),
+        ("x = 1\n", "registers no effect"),
+        ("\x00", "expected a Python file that runs"),
+        (CLASS.replace("own_thing", "sensor_gain").replace("class Own", "class SensorGain"), "a name that no other"),
+        (CLASS.replace("own_thing", ""), "an effect with a name"),
+        (START + "@register\nclass Own(Effect):\n    name = 'half'\n    def __init__(self, x): pass\n", "TypeError"),
+    ],
+    ids=["syntax", "import", "exit", "nothing", "null", "taken", "nameless", "constructor"],
+)
 def test_files_that_cannot_be_loaded_are_one_line(tmp_path, text, said):
     path = tmp_path / "bad.py"
     path.write_text(text, encoding="utf-8")
@@ -154,17 +161,21 @@ def test_a_file_that_is_none(tmp_path, path):
         load_effects(tmp_path / path)
 
 
-@pytest.mark.parametrize(("old", "new", "said"), [
-    ("own_thing", "own.thing", "name = 'own.thing': expected letters"),
-    ('return ("payload",)', "return 1 / 0", "line 7: ZeroDivisionError"),
-    ("def places", "def place", "places: expected the method"),
-    ("-1.0, 1.0, 0.1", "1.0, -1.0, 0.1", "k = (1.0, -1.0): expected low below high"),
-    ("-1.0, 1.0, 0.1", "-1.0, 1.0, 0.0", "k = 0.0: expected a positive size"),
-    ("-1.0, 1.0, 0.1", "-1.0, 1.0, 0.1, False", "k: expected a grid of values"),
-    ("values): pass", "values): ops.sense[:] = np.nan", "place payload = [0.1]: expected a finite response"),
-    ("values): pass", "values): ops.sensor('Sq9')", "line 9: ValueError"),
-    (', "something"\n', "\n", "ValueError"),
-], ids=["name", "places", "method", "range", "size", "grid", "finite", "channel", "words"])
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("own_thing", "own.thing", "name = 'own.thing': expected letters"),
+        ('return ("payload",)', "return 1 / 0", "line 7: ZeroDivisionError"),
+        ("def places", "def place", "places: expected the method"),
+        ("-1.0, 1.0, 0.1", "1.0, -1.0, 0.1", "k = (1.0, -1.0): expected low below high"),
+        ("-1.0, 1.0, 0.1", "-1.0, 1.0, 0.0", "k = 0.0: expected a positive size"),
+        ("-1.0, 1.0, 0.1", "-1.0, 1.0, 0.1, False", "k: expected a grid of values"),
+        ("values): pass", "values): ops.sense[:] = np.nan", "place payload = [0.1]: expected a finite response"),
+        ("values): pass", "values): ops.sensor('Sq9')", "line 9: ValueError"),
+        (', "something"\n', "\n", "ValueError"),
+    ],
+    ids=["name", "places", "method", "range", "size", "grid", "finite", "channel", "words"],
+)
 def test_effects_that_do_not_work_are_said_before_the_search(tmp_path, old, new, said):
     path = tmp_path / "bad.py"
     text = CLASS.replace(old, new)
@@ -178,8 +189,14 @@ def test_effects_that_do_not_work_are_said_before_the_search(tmp_path, old, new,
 
 def avis(*arguments):
     threads = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    return subprocess.run([sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
-                          capture_output=True, text=True, timeout=300, env=threads, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=threads,
+        check=False,
+    )
 
 
 def test_the_option_refuses_before_anything_is_read(tmp_path):

@@ -52,15 +52,19 @@ def sprung_table(directions, frequencies):
     for k, (d, f) in enumerate(zip(directions, frequencies, strict=True)):
         w = 2 * np.pi * f
         table.mass(table.row(**{f"e{k}": 1.0}), MASS)
-        table.spring(table.row(d @ mount_map(PLACE), **{f"e{k}": -1.0}), MASS * w ** 2, 2 * ZETA * w * MASS)
+        table.spring(table.row(d @ mount_map(PLACE), **{f"e{k}": -1.0}), MASS * w**2, 2 * ZETA * w * MASS)
     return table
 
 
 ONE = ([ALONG], [14.0], "payload/oblique", [*(np.sqrt(MASS) * ALONG), 14.0, ZETA, *PLACE])
 THREE = (list(np.eye(3)), [14.0, 9.0, 21.0], "payload/axes", [MASS, 14.0, 9.0, 21.0, ZETA, *PLACE])
 TURN = [0.4, -0.3, 0.5]
-TURNED = (list(expm(np.cross(np.eye(3), TURN)).T), [14.0, 9.0, 21.0], "payload/turned",
-          [MASS, 14.0, 9.0, 21.0, ZETA, *PLACE, *TURN])
+TURNED = (
+    list(expm(np.cross(np.eye(3), TURN)).T),
+    [14.0, 9.0, 21.0],
+    "payload/turned",
+    [MASS, 14.0, 9.0, 21.0, ZETA, *PLACE, *TURN],
+)
 SPRUNG = [ONE, THREE, TURNED]
 
 
@@ -80,8 +84,13 @@ def test_transients_hold_whatever_the_mass_starts_with(directions, frequencies, 
     z0, v0 = np.zeros(n), np.zeros(n)
     z0[6:], v0[6:] = rng.standard_normal((2, n - 6))
     omega = 2 * np.pi * F
-    free = np.array([table.R @ np.linalg.solve(s ** 2 * table.M + s * table.C + table.K,
-                                               (s * table.M + table.C) @ z0 + table.M @ v0) for s in 1j * omega])
+    free = np.array(
+        [
+            table.R
+            @ np.linalg.solve(s**2 * table.M + s * table.C + table.K, (s * table.M + table.C) @ z0 + table.M @ v0)
+            for s in 1j * omega
+        ]
+    )
     U = np.zeros((len(F), 11 + 12, 12), complex)
     U[:, 11:] = np.eye(12)
     body = model.driven(omega, U, False).Y
@@ -111,18 +120,23 @@ def test_a_bending_payload_and_its_transients():
     for m in range(2):
         w = 2 * np.pi * f[m]
         table.mass(table.row(**{f"e{m}": 1.0}), 1.0)
-        table.spring(table.row(**{f"e{m}": 1.0}), w ** 2, 2 * zeta[m] * w)
+        table.spring(table.row(**{f"e{m}": 1.0}), w**2, 2 * zeta[m] * w)
         for k, motor in enumerate(RIG.motors):
             at = 3 * (motor.isolator - 1) + "xyz".index(motor.axis)
             table.T[6 + m, k] = motor.constant_N_per_V * shapes[m, at]
-        table.R[:, 6 + m] = [shapes[m, 3 * (i - 1) + "xyz".index(axis)]
-                             for i, axis in zip(g.isolator, g.axis, strict=True)]
+        table.R[:, 6 + m] = [
+            shapes[m, 3 * (i - 1) + "xyz".index(axis)] for i, axis in zip(g.isolator, g.axis, strict=True)
+        ]
     omega = 2 * np.pi * F
     assert differ(model.response(omega), table.response(F)) < 1e-9
     assert differ(BARE.response(omega), table.response(F)) > 1e-2
     z0 = np.r_[np.zeros(6), 1.0, -2.0]
-    free = np.array([table.R @ np.linalg.solve(s ** 2 * table.M + s * table.C + table.K,
-                                               (s * table.M + table.C) @ z0) for s in 1j * omega])
+    free = np.array(
+        [
+            table.R @ np.linalg.solve(s**2 * table.M + s * table.C + table.K, (s * table.M + table.C) @ z0)
+            for s in 1j * omega
+        ]
+    )
     assert left_of(free, model.inner_transients(omega)) > 1e-3  # damping of the mounts pushes the body too
     U = np.zeros((len(F), 23, 12), complex)
     U[:, 11:] = np.eye(12)
@@ -141,6 +155,7 @@ def test_modes_are_reported_in_the_order_of_their_frequencies():
 
 
 # --- what is told of them
+
 
 def monte_carlo(f, mean, C):
     drawn = np.random.default_rng(2).multivariate_normal(mean, C, 20000)
@@ -188,9 +203,12 @@ def test_a_valve_that_follows_at_once_is_no_fault_of_a_leveling_and_one_that_nev
 
     def of(corner):
         return forbidden(with_effect("leveling_loop", place, [0.05, corner]))
+
     assert of(100.0) == of(0.3) == "" and "does not level" in of(0.01)
-    told = [own.reported(BARE, place, {"rate_Hz": 0.05, "valve_corner_Hz": corner}, 1e-6 * np.eye(2))
-            for corner in (0.3, 100.0)]
+    told = [
+        own.reported(BARE, place, {"rate_Hz": 0.05, "valve_corner_Hz": corner}, 1e-6 * np.eye(2))
+        for corner in (0.3, 100.0)
+    ]
     assert ["valve_corner_Hz" in one for one in told] == [True, False]
 
 
@@ -208,7 +226,7 @@ def test_leveling_measures_the_payload_against_a_chassis_that_moves():
                 table.spring(table.row(G[a], **{f"e{a}": -1.0}), one.stiffness[a] * law, one.damping[a])
         for a in range(3):
             table.mass(table.row(**{f"e{a}": 1.0}), m)
-            table.spring(table.row(**{f"e{a}": 1.0}), m * w ** 2, 2 * zeta * w * m, np.eye(3)[a])
+            table.spring(table.row(**{f"e{a}": 1.0}), m * w**2, 2 * zeta * w * m, np.eye(3)[a])
         true.append(table.response([f])[0])
     found, true = model.response(2 * np.pi * F), np.array(true)
     floor = slice(8, 11)
@@ -228,12 +246,14 @@ def measured(truth, rng):
 
     def drawn(*shape):
         return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
     U = np.concatenate([drawn(len(omega), 8, 4), np.zeros((len(omega), 3, 4))], axis=1)
     made = SpectralBlock("00", omega, U, np.zeros((len(omega), 6, 4), complex))
     Y = truth.answer(made, None, False).Y
     power = 1e-6 * np.mean(np.abs(Y) ** 2, axis=(0, 2))
     return replace(made, Y=Y + np.sqrt(power / 2)[:, None] * drawn(*Y.shape)).with_noise(
-        np.broadcast_to(np.diag(power), (len(omega), 6, 6)).astype(complex).copy())
+        np.broadcast_to(np.diag(power), (len(omega), 6, 6)).astype(complex).copy()
+    )
 
 
 def test_what_no_record_tells_of_a_mode_is_in_the_deviation_of_its_frequency():
@@ -241,8 +261,10 @@ def test_what_no_record_tells_of_a_mode_is_in_the_deviation_of_its_frequency():
     rng = np.random.default_rng(3)
     seen = [17.0, 0.02, *0.015 * rng.standard_normal(12)]
     parameters = library()["payload_flexible_mode"].parameters(IDENTIFIED, "payload")
-    start = [0.0 if one.optional and one.name.startswith("shape") else value
-             for one, value in zip(parameters, seen, strict=True)]
+    start = [
+        0.0 if one.optional and one.name.startswith("shape") else value
+        for one, value in zip(parameters, seen, strict=True)
+    ]
     assert start.count(0.0) == 4
     truth, begin = (with_effect("payload_flexible_mode", "payload", values, IDENTIFIED) for values in (seen, start))
     block = measured(truth, rng)
@@ -268,6 +290,7 @@ def test_a_fit_reaches_how_a_resonance_scatters_over_the_mounts():
 
 
 # --- seeds
+
 
 def block_of(truth, noise=1e-4):
     """What a table answers to eight motors, without noise in the data."""
@@ -324,6 +347,7 @@ def test_along_its_line_of_action_a_place_may_end_anywhere():
     def of(point):
         values = [0.0, 1.9, 0.0, 21.0, 0.02, *point]
         return forbidden(with_effect("attached_oscillator", "payload/oblique", values, FREE))
+
     assert of((0.1, 2.0, 0.1)) == ""
     assert "line of action" in of((2.0, 0.0, 0.1))
 
@@ -354,9 +378,13 @@ def test_a_mass_without_strength_changes_nothing():
     assert model.inner_transients(2 * np.pi * F).shape == (len(F), 6, 0)
 
 
-@pytest.mark.parametrize(("name", "place", "values", "of"), [
-    ("cable_stiffness", "payload/axes", [60.0, 0.0, 0.0, 0.0, *PLACE], "k_x_N_per_m"),
-    ("attached_oscillator", "payload/axes", [0.6, 14.0, 9.0, 21.0, ZETA, *PLACE], "mass_kg")])
+@pytest.mark.parametrize(
+    ("name", "place", "values", "of"),
+    [
+        ("cable_stiffness", "payload/axes", [60.0, 0.0, 0.0, 0.0, *PLACE], "k_x_N_per_m"),
+        ("attached_oscillator", "payload/axes", [0.6, 14.0, 9.0, 21.0, ZETA, *PLACE], "mass_kg"),
+    ],
+)
 def test_what_the_data_do_not_tell_from_none_is_not_taken(name, place, values, of):
     own = library()[name]
     named = dict(zip((one.name for one in own.parameters(BARE, place)), values, strict=True))

@@ -31,9 +31,19 @@ def model() -> TableModel:
     return TableModel(ResponseModel.of(rig, default_parameters(rig)))
 
 
-def record(model: TableModel, name: str, level: float, rng: np.random.Generator, *, gain: complex = 1.0,
-           floor: float = 0.0, sensor: float = 0.0, distortion: float = 0.0, excitation: str = "noise",
-           actual: TableModel | None = None) -> tuple[PredictionError, RecordHeader, dict[str, np.ndarray]]:
+def record(
+    model: TableModel,
+    name: str,
+    level: float,
+    rng: np.random.Generator,
+    *,
+    gain: complex = 1.0,
+    floor: float = 0.0,
+    sensor: float = 0.0,
+    distortion: float = 0.0,
+    excitation: str = "noise",
+    actual: TableModel | None = None,
+) -> tuple[PredictionError, RecordHeader, dict[str, np.ndarray]]:
     """A record of known parts: the model's answer times a gain, floor motion at random through the table, noise of the
     sensors, and distortion that is a share of the output's power times the level squared."""
     omega = 2 * np.pi * np.linspace(*BAND_HZ, LINES)
@@ -47,18 +57,33 @@ def record(model: TableModel, name: str, level: float, rng: np.random.Generator,
     hiss = sensor * normal(rng, LINES, n_y, 1)
     bent = np.sqrt(distortion) * level * np.abs(linear) * normal(rng, LINES, n_y, 1)
     Y = gain * own + shaken + hiss + bent
-    ground = floor ** 2 * np.sum(np.abs(G[:, :, n_a:]) ** 2, axis=2)
-    C = (ground + sensor ** 2 + 1e-30)[:, :, None] * np.eye(n_y)
+    ground = floor**2 * np.sum(np.abs(G[:, :, n_a:]) ** 2, axis=2)
+    C = (ground + sensor**2 + 1e-30)[:, :, None] * np.eye(n_y)
     block = SpectralBlock(name, omega, U, Y).with_noise(C)
     left = Y - linear
-    header = RecordHeader(name=name, sample_rate_Hz=1000.0, samples=30000, u_names=model.actuators,
-                          y_names=model.sensors.names, u_unit="V", y_unit="V", excitation=excitation, level_V=level)
-    parts = {"unmeasured": np.sum(ground, axis=0), "sensors": LINES * np.full(n_y, sensor ** 2),
-             "nonlinear": np.sum(distortion * level ** 2 * np.abs(linear[:, :, 0]) ** 2, axis=0),
-             "missing": np.sum(np.abs((gain * own - linear)[:, :, 0]) ** 2, axis=0)}
+    header = RecordHeader(
+        name=name,
+        sample_rate_Hz=1000.0,
+        samples=30000,
+        u_names=model.actuators,
+        y_names=model.sensors.names,
+        u_unit="V",
+        y_unit="V",
+        excitation=excitation,
+        level_V=level,
+    )
+    parts = {
+        "unmeasured": np.sum(ground, axis=0),
+        "sensors": LINES * np.full(n_y, sensor**2),
+        "nonlinear": np.sum(distortion * level**2 * np.abs(linear[:, :, 0]) ** 2, axis=0),
+        "missing": np.sum(np.abs((gain * own - linear)[:, :, 0]) ** 2, axis=0),
+    }
     whole = np.sum(np.abs(Y[:, :, 0]) ** 2, axis=0)
-    return (PredictionError(block, left, left, left, np.empty(0), 2 * left.size, np.full(n_y, 2 * LINES)), header,
-            {key: value / whole for key, value in parts.items()})
+    return (
+        PredictionError(block, left, left, left, np.empty(0), 2 * left.size, np.full(n_y, 2 * LINES)),
+        header,
+        {key: value / whole for key, value in parts.items()},
+    )
 
 
 def shares_of(records, model: TableModel, silent: bool, sensor: float | None):
@@ -69,8 +94,10 @@ def shares_of(records, model: TableModel, silent: bool, sensor: float | None):
 @pytest.mark.parametrize("silent", [True, False])
 def test_what_is_put_in_comes_out(model, silent):
     rng = np.random.default_rng(24100)
-    made = [record(model, f"{k}", level, rng, gain=1.1, floor=2e-5, sensor=1e-3, distortion=0.04 * (level > 0.1))
-            for k, level in enumerate((0.05, 0.05, 0.5, 0.5))]
+    made = [
+        record(model, f"{k}", level, rng, gain=1.1, floor=2e-5, sensor=1e-3, distortion=0.04 * (level > 0.1))
+        for k, level in enumerate((0.05, 0.05, 0.5, 0.5))
+    ]
     low, high = shares_of(made, model, silent, 1e-3)
     assert (low.how, low.level_V, high.level_V) == ("silent" if silent else "levels", 0.05, 0.5)
     assert low.records == ("0", "1")
@@ -120,15 +147,16 @@ def test_noise_alone_leaves_nothing_else(model):
     lines = lines_of([e for e, _, _ in made], model)
     one = split(lines, found.bands_Hz)
     np.testing.assert_allclose((one.incoherent * one.lines[:, None]).sum(0) / one.lines.sum(), 1e-4, rtol=0.1)
-    np.testing.assert_allclose(found.whole["sensors"], np.mean([parts["sensors"] for *_, parts in made], axis=0),
-                               rtol=0.15)
+    np.testing.assert_allclose(
+        found.whole["sensors"], np.mean([parts["sensors"] for *_, parts in made], axis=0), rtol=0.15
+    )
     assert np.all(found.whole["missing"] < 0.02 * found.whole["sensors"])
 
 
 def test_lines_without_drive_and_records_at_rest_are_left_out(model):
     rng = np.random.default_rng(24104)
     e, header, _ = record(model, "0", 0.3, rng, sensor=1e-3)
-    e.block.U[::2, :len(model.actuators)] = 0
+    e.block.U[::2, : len(model.actuators)] = 0
     lines = lines_of([e], model)
     np.testing.assert_allclose(lines.frequency_Hz, e.block.omega[1::2] / (2 * np.pi))
     rest = replace(header, excitation="rest")
@@ -138,8 +166,10 @@ def test_lines_without_drive_and_records_at_rest_are_left_out(model):
 def test_bands_hold_lines_enough_for_the_poorest_level():
     f = np.linspace(1.0, 64.0, 2000)
     few = np.sort(np.random.default_rng(1).uniform(1.0, 64.0, 60))
-    groups = [Lines(g, *(np.ones((len(g), 1)) for _ in range(3)), np.ones((len(g), 1, 4)), np.ones((len(g), 1)))
-              for g in (f, few)]
+    groups = [
+        Lines(g, *(np.ones((len(g), 1)) for _ in range(3)), np.ones((len(g), 1, 4)), np.ones((len(g), 1)))
+        for g in (f, few)
+    ]
     edges = bands(groups)
     assert edges[0] == 1.0 and edges[-1] == pytest.approx(64.0) and len(edges) > 3
     assert np.all(np.histogram(few, edges)[0] >= shares.SETTINGS.least_lines * 4)

@@ -34,7 +34,7 @@ def gaussian(rng, *shape):
 def covariance():
     """Correlated noise, one for all lines."""
     A = np.eye(6) + 0.3 * np.random.default_rng(9).standard_normal((6, 6))
-    return SIGMA ** 2 * A @ A.T
+    return SIGMA**2 * A @ A.T
 
 
 C = covariance()
@@ -57,8 +57,12 @@ def effect(name, place, values=None, model=MODEL):
     return active(library()[name], model, place, values)
 
 
-ABSENT = [("com_offset", "payload", None), ("sensor_gain", "Sz2", None), ("loop_delay", "loop", None),
-          ("mount_relaxation", "isolators z", (0.0, 3.0))]
+ABSENT = [
+    ("com_offset", "payload", None),
+    ("sensor_gain", "Sz2", None),
+    ("loop_delay", "loop", None),
+    ("mount_relaxation", "isolators z", (0.0, 3.0)),
+]
 
 
 @pytest.mark.parametrize("transient", [False, True], ids=["periodic", "with ends"])
@@ -108,17 +112,27 @@ def test_parameter_errors_alone_are_found_by_no_effect():
     blocks = [block(truth, rng, True, name=name) for name in ("00", "01")]
     fitted = fit(MODEL, blocks).model
     score = Score(fitted, blocks)
-    found = [seed.p_value for one in library().values() if not one.nonlinear for place in one.places(fitted)
-             for seed in seeds(one, score, place)]
+    found = [
+        seed.p_value
+        for one in library().values()
+        if not one.nonlinear
+        for place in one.places(fitted)
+        for seed in seeds(one, score, place)
+    ]
     assert len(found) > 10
     assert min(found) > CHANCE
 
 
-SMALL = [("actuator_gain", "Az3", [1.02], ()), ("com_offset", "payload", [4e-4, -2e-4, 4e-4], ()),
-         ("sensor_misalignment", "Sy1", [0.1, -0.05], ()), ("actuator_lag", "actuators", [3e-4], ()),
-         ("mount_relaxation", "isolators z", [3e-3, 4.0], ("corner_Hz",)),
-         ("attached_oscillator", "payload/z", [0.1, 12.0, 0.05, 0.3, 0.2], ("frequency_Hz", "damping", "x_m", "y_m")),
-         ("tilt_coupling", "horizontal geophones", [0.3], ()), ("structural_damping", "isolators/causal", [5e-4], ())]
+SMALL = [
+    ("actuator_gain", "Az3", [1.02], ()),
+    ("com_offset", "payload", [4e-4, -2e-4, 4e-4], ()),
+    ("sensor_misalignment", "Sy1", [0.1, -0.05], ()),
+    ("actuator_lag", "actuators", [3e-4], ()),
+    ("mount_relaxation", "isolators z", [3e-3, 4.0], ("corner_Hz",)),
+    ("attached_oscillator", "payload/z", [0.1, 12.0, 0.05, 0.3, 0.2], ("frequency_Hz", "damping", "x_m", "y_m")),
+    ("tilt_coupling", "horizontal geophones", [0.3], ()),
+    ("structural_damping", "isolators/causal", [5e-4], ()),
+]
 
 
 def inner_states(score: Score, one) -> list[np.ndarray]:
@@ -149,7 +163,7 @@ def test_a_refit_gains_what_the_score_predicts(name, place, values, held):
     assert took.chi2 == pytest.approx(before.chi2 - after.chi2, rel=0.02)
     linear = [k for k, one in enumerate(true.parameters) if one.linear]
     found = np.array(after.model.effects[0].values)[linear]
-    wanted = np.array([true.parameters[k].none for k in linear]) + took.coefficients[:len(linear)]
+    wanted = np.array([true.parameters[k].none for k in linear]) + took.coefficients[: len(linear)]
     sizes = np.abs(np.array(values)[linear] - [true.parameters[k].none for k in linear])
     np.testing.assert_allclose(found, wanted, atol=0.05 * np.max(sizes))
 

@@ -17,18 +17,50 @@ from avis_ctrl.gap.tuning_values import tuning_values
 FOLDER = Path(avis_ctrl.gap.__file__).parent
 FILES = sorted(FOLDER.rglob("*.py"))
 # What no tuning can change: physics, mathematics, names, tables.
-NO_TUNING = {"ADDED", "ALL", "AT_REST", "BEYOND", "BY_PHYSICS", "COORDINATES", "COUNTS", "DECAY", "FASTER", "FILES",
-             "FORMAT", "HANN_COST", "HANN_SHARED", "HIGHER", "MAINS_HZ", "MOUNT", "PROBLEMS",
-             "PRODUCTS", "RAYLEIGH", "RELEASED", "REST", "SETTINGS", "SLOW", "SWEEP", "SYMMETRIC",
-             "THREE_AXES", "TOGETHER",
-             "UNITS", "VERDICTS", "VERSION", "_AT_REST", "_ELSEWHERE", "_MADE", "_NOTES"}
+NO_TUNING = {
+    "ADDED",
+    "ALL",
+    "AT_REST",
+    "BEYOND",
+    "BY_PHYSICS",
+    "COORDINATES",
+    "COUNTS",
+    "DECAY",
+    "FASTER",
+    "FILES",
+    "FORMAT",
+    "HANN_COST",
+    "HANN_SHARED",
+    "HIGHER",
+    "MAINS_HZ",
+    "MOUNT",
+    "PROBLEMS",
+    "PRODUCTS",
+    "RAYLEIGH",
+    "RELEASED",
+    "REST",
+    "SETTINGS",
+    "SLOW",
+    "SWEEP",
+    "SYMMETRIC",
+    "THREE_AXES",
+    "TOGETHER",
+    "UNITS",
+    "VERDICTS",
+    "VERSION",
+    "_AT_REST",
+    "_ELSEWHERE",
+    "_MADE",
+    "_NOTES",
+}
 
 
 def constants(path: Path) -> set[str]:
     found = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) \
-            else []
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        )
         found |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
     return {name for name in found if re.match(r"_?[A-Z][A-Z0-9]+(_|$)", name)}
 
@@ -53,8 +85,9 @@ def test_provenance_lists_every_setting():
     json.dumps(tuning_values())
 
 
-@pytest.mark.parametrize("path", [path for path in FILES if "SETTINGS" in constants(path)],
-                         ids=lambda path: str(path.relative_to(FOLDER)))
+@pytest.mark.parametrize(
+    "path", [path for path in FILES if "SETTINGS" in constants(path)], ids=lambda path: str(path.relative_to(FOLDER))
+)
 def test_every_setting_is_explained(path):
     name = ".".join(["avis_ctrl.gap", *path.relative_to(FOLDER).with_suffix("").parts])
     own = type(importlib.import_module(name).SETTINGS)

@@ -21,8 +21,9 @@ SHORT = 20_000
 
 def one_record(y: np.ndarray, u: np.ndarray | None = None, unit: str = "V") -> Campaign:
     u = np.zeros((len(y), 8)) if u is None else u
-    header = RecordHeader("00", 1000.0, len(y), tuple(m.name for m in rig().motors), rig().geophones.names, "rest",
-                          y_unit=unit)
+    header = RecordHeader(
+        "00", 1000.0, len(y), tuple(m.name for m in rig().motors), rig().geophones.names, "rest", y_unit=unit
+    )
     return Campaign("avis", (Record(header, u, y),))
 
 
@@ -36,8 +37,10 @@ def test_clean_channels_give_no_finding_even_where_they_reach_the_nominal_limits
 
 def test_quiet_white_noise_is_no_coarse_converter():
     """0.8 lsb r.m.s.: few codes. 300 channels and rest records."""
-    found = [inspect_converter(one_record(convert(np.random.default_rng(k).normal(0, 1e-3, (5000, 6)))), rig())
-             for k in range(50)]
+    found = [
+        inspect_converter(one_record(convert(np.random.default_rng(k).normal(0, 1e-3, (5000, 6)))), rig())
+        for k in range(50)
+    ]
     assert not any(found)
 
 
@@ -71,6 +74,7 @@ def test_a_coarse_step_shows_at_rest_too(step):
         z = y.copy()
         z[:, 1] = step * LSB * np.floor(z[:, 1] / (step * LSB) + 0.5)
         return convert(z)
+
     campaign, _ = draw(5, levels=(0.0, 0.0), samples=SHORT, adc=adc)
     found = inspect_converter(campaign, rig())
     assert [(one.channel, one.kind) for one in found] == [("Sz1", "resolution")]
@@ -84,14 +88,17 @@ def test_a_low_clip_level_is_measured(kind, both):
         z = y.copy()
         z[:, 3] = np.clip(z[:, 3], -1.3 if both else -99.0, 1.3)
         return convert(z)
+
     campaign, _ = draw(7, kind, levels=(0.1, 0.2, 0.5), samples=SHORT, adc=adc)
     found = inspect_converter(campaign, rig())
     assert [(one.channel, one.kind) for one in found] == [("Sz2", "clipping")]
     assert set(found[0].parameters) == ({"clip_low_V", "clip_high_V"} if both else {"clip_high_V"})
     for value in found[0].parameters.values():
         assert abs(abs(value.value) - 1.3) <= LSB
-    clipped = sum(np.count_nonzero(np.abs(r.y[:, 3]) >= 1.299) if both else
-                  np.count_nonzero(r.y[:, 3] >= 1.299) for r in campaign.records)
+    clipped = sum(
+        np.count_nonzero(np.abs(r.y[:, 3]) >= 1.299) if both else np.count_nonzero(r.y[:, 3] >= 1.299)
+        for r in campaign.records
+    )
     assert f", {clipped} samples of" in found[0].sentence
 
 
@@ -100,6 +107,7 @@ def test_repair_puts_the_prediction_beyond_the_limit_and_nowhere_else():
         z = y.copy()
         z[:, 3] = np.clip(z[:, 3], -1.3, 1.3)
         return convert(z)
+
     campaign, predicted = draw(7, "noise", levels=(0.1, 0.5), samples=SHORT, adc=adc)
     truth, _ = draw(7, "noise", levels=(0.1, 0.5), samples=SHORT)
     made = repair(campaign, rig(), predicted, inspect_converter(campaign, rig()))
@@ -126,6 +134,7 @@ def test_memory_does_not_grow_with_the_number_of_records():
 
         def load(self, *part):
             return Record(self.header, self.u, convert(np.random.default_rng(1).normal(0, 1.0, (100_000, 6))))
+
     u, y = (np.broadcast_to(0.0, (100_000, channels)) for channels in (8, 6))
     header = one_record(y, u).records[0].header
 
@@ -136,6 +145,7 @@ def test_memory_does_not_grow_with_the_number_of_records():
         _, most = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         return most
+
     assert peak(8) < 1.5 * peak(2)
 
 

@@ -17,8 +17,14 @@ from avis_ctrl.measurement.campaign import RecordHeader
 def white(seed: int, records: int = 6, samples: int = 10_000, added=0.0) -> list[RecordResidual]:
     rng = np.random.default_rng(seed)
     names = tuple(m.name for m in rig().motors), rig().geophones.names
-    return [RecordResidual(RecordHeader(f"{k:02d}", FS, samples, *names, "rest"), np.zeros((samples, 8)),
-                     rng.normal(size=(samples, 6)) + added) for k in range(records)]
+    return [
+        RecordResidual(
+            RecordHeader(f"{k:02d}", FS, samples, *names, "rest"),
+            np.zeros((samples, 8)),
+            rng.normal(size=(samples, 6)) + added,
+        )
+        for k in range(records)
+    ]
 
 
 def test_white_noise_raises_no_alarm_at_five_per_cent_in_more_than_its_share(monkeypatch):
@@ -37,13 +43,18 @@ def test_misfit_of_the_model_is_no_hum(kind, seed):
 
 
 @pytest.mark.parametrize("kind", ["multisine", "noise"])
-@pytest.mark.parametrize(("f0", "amplitudes"), [
-    (50.013, {(0, 1): 5e-3, (1, 1): 2e-3, (0, 3): 1e-3}),
-    (59.98, {(2, 2): 3e-4, (2, 3): 2e-4}),
-    (50.0, {(j, 1): 3e-4 for j in range(6)})])
+@pytest.mark.parametrize(
+    ("f0", "amplitudes"),
+    [
+        (50.013, {(0, 1): 5e-3, (1, 1): 2e-3, (0, 3): 1e-3}),
+        (59.98, {(2, 2): 3e-4, (2, 3): 2e-4}),
+        (50.0, {(j, 1): 3e-4 for j in range(6)}),
+    ],
+)
 def test_lines_are_found_and_measured(kind, f0, amplitudes):
-    campaign, predicted = draw(3, kind, levels=(0.1, 0.2, 0.4), samples=30_000,
-                               added=lambda n, rng: hum(n, f0, amplitudes, rng))
+    campaign, predicted = draw(
+        3, kind, levels=(0.1, 0.2, 0.4), samples=30_000, added=lambda n, rng: hum(n, f0, amplitudes, rng)
+    )
     found = find_hum(record_residuals(campaign, predicted))
     assert found is not None and found.confidence > 0.999
     assert abs(found.frequency_Hz.value - f0) < 4 * found.frequency_Hz.std
@@ -110,8 +121,9 @@ def test_subtraction_leaves_noise_and_the_driven_signal():
 
 
 def test_the_mask_holds_the_lines_power():
-    campaign, predicted = draw(4, "noise", levels=(0.1, 0.2), samples=30_000,
-                               added=lambda n, rng: hum(n, 50.02, {(0, 1): 5e-2}, rng))
+    campaign, predicted = draw(
+        4, "noise", levels=(0.1, 0.2), samples=30_000, added=lambda n, rng: hum(n, 50.02, {(0, 1): 5e-2}, rng)
+    )
     left = record_residuals(campaign, predicted)
     found = find_hum(left)
     assert found is not None

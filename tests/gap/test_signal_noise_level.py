@@ -64,8 +64,11 @@ def test_three_times_ambient_is_ground_motion_whatever_its_shape(kind, slope):
 def test_what_the_model_lacks_is_no_ground_motion(kind, wrong):
     campaign, predicted = drawn(3, kind)
     exact = levels(campaign, predicted)
-    change = {"gain": lambda y: 1.2 * y, "delay": lambda y: np.roll(y, 2, 0),
-              "corner": lambda y: y + 0.2 * np.cumsum(y - y.mean(0), 0) * 2e-3 * np.pi * 5}[wrong]
+    change = {
+        "gain": lambda y: 1.2 * y,
+        "delay": lambda y: np.roll(y, 2, 0),
+        "corner": lambda y: y + 0.2 * np.cumsum(y - y.mean(0), 0) * 2e-3 * np.pi * 5,
+    }[wrong]
     found = levels(campaign, {name: change(y) for name, y in predicted.items()})
     assert found.ground_motion is None and found.raised == ()
     assert found.floor is not None and exact.floor is not None
@@ -108,6 +111,7 @@ def test_a_coarse_converter_is_not_noise_of_the_sensor():
         z = LSB * np.floor(y / LSB + 0.5)
         z[:, 0] = 8 * LSB * np.floor(y[:, 0] / (8 * LSB) + 0.5)
         return z
+
     campaign, predicted = drawn(6, "noise", adc=adc)
     assert levels(campaign, predicted).raised == ("Sy1",)
     assert levels(campaign, predicted, steps_V={"Sy1": 8 * LSB}).raised == ()

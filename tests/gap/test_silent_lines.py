@@ -32,8 +32,12 @@ def estimated_over_true(slope: float) -> np.ndarray:
     assert blocks[0].noise is not None
     held = np.real(np.einsum("nii->ni", blocks[0].noise[:, 0]))
     lines = blocks[0].omega / (2 * np.pi)
-    return np.array([np.mean(held[(lines >= low) & (lines < high)], axis=0)
-                     / np.mean(true[(f >= low) & (f < high)], axis=0) for low, high in BANDS_Hz])
+    return np.array(
+        [
+            np.mean(held[(lines >= low) & (lines < high)], axis=0) / np.mean(true[(f >= low) & (f < high)], axis=0)
+            for low, high in BANDS_Hz
+        ]
+    )
 
 
 @pytest.mark.parametrize("slope", [0.0, 3.0])

@@ -37,7 +37,7 @@ def recorded(truth: TableModel, count: int, noise: float) -> list[SpectralBlock]
         U[:, :8] = 0.3 * gaussian(rng, len(omega), 8, 1)
         made = SpectralBlock(f"{k:02d}", omega, U, np.zeros((len(omega), 6, 1), complex), transient=False)
         Y = truth.answer(made, None, False).Y + noise * gaussian(rng, len(omega), 6, 1)
-        blocks.append(replace(made, Y=Y).with_noise(noise ** 2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
+        blocks.append(replace(made, Y=Y).with_noise(noise**2 * np.tile(np.eye(6, dtype=complex), (len(omega), 1, 1))))
     return blocks
 
 
@@ -49,20 +49,24 @@ def test_a_push_on_the_mass_inside_a_mount():
     up = mounts.along("z")
     G, k, c, w = mounts.payload[up], mounts.stiffness[up], mounts.damping[up], 2 * np.pi * f * (1 + uneven)
     upper, lower = (k / part * (1 + 2 * zeta * s / w) for part in (share, 1 - share))
-    mass = k * (1 / share + 1 / (1 - share)) / w ** 2
+    mass = k * (1 / share + 1 / (1 - share)) / w**2
     full = np.zeros((len(OMEGA), 10, 10), complex)
     full[:, :6, :6] = made.D + G.T @ ((upper + s * c - made.z_pp[:, up])[:, :, None] * G)
     full[:, :6, 6:] = -G.T * upper[:, None]
     full[:, 6:, :6] = np.swapaxes(full[:, :6, 6:], 1, 2)
-    full[:, range(6, 10), range(6, 10)] = upper + lower + s ** 2 * mass
+    full[:, range(6, 10), range(6, 10)] = upper + lower + s**2 * mass
     impulses, steps = np.split(made.inverse @ made.forces_of_states, 2, axis=2)
     np.testing.assert_allclose(impulses, np.linalg.inv(full)[:, :6, 6:], rtol=1e-9)
     np.testing.assert_allclose(steps, s[:, :, None] * impulses, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("place", "values"), [
-    ("chassis/translation", [900.0, 0.05, 9.0, 11.0, 14.0]),
-    ("chassis/rocking", [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2])])
+@pytest.mark.parametrize(
+    ("place", "values"),
+    [
+        ("chassis/translation", [900.0, 0.05, 9.0, 11.0, 14.0]),
+        ("chassis/rocking", [900.0, 0.05, 9.0, 11.0, 14.0, 10.0, 12.0, 13.0, 0.4, 0.5, 0.6, -0.45, -0.2]),
+    ],
+)
 def test_a_push_on_the_chassis(place, values):
     """Against payload and chassis as two bodies: what the payload's momentum gains the chassis loses."""
     model = with_effect("base_compliance", place, values)
@@ -71,10 +75,14 @@ def test_a_push_on_the_chassis(place, values):
     ways = np.flatnonzero(np.any(moves, axis=(0, 1)))
     G, under = made.G, made.ops.mounts.chassis[:, ways]
     z = made.z_pp[:, :, None]
-    inertia = S ** 2 * made.M
-    full = np.concatenate([
-        np.concatenate([inertia + G.T @ (z * G), -G.T @ (z * under)], axis=2),
-        np.concatenate([inertia[:, ways], np.linalg.inv(moves[:, ways][:, :, ways])], axis=2)], axis=1)
+    inertia = S**2 * made.M
+    full = np.concatenate(
+        [
+            np.concatenate([inertia + G.T @ (z * G), -G.T @ (z * under)], axis=2),
+            np.concatenate([inertia[:, ways], np.linalg.inv(moves[:, ways][:, :, ways])], axis=2),
+        ],
+        axis=1,
+    )
     impulses, steps = np.split(made.inverse @ made.forces_of_states, 2, axis=2)
     true = np.linalg.inv(full)[:, :6, 6:]
     np.testing.assert_allclose(impulses, true, atol=1e-9 * np.abs(true).max())
@@ -93,17 +101,17 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
     made = Assembled(model.with_effect(oscillator).with_effect(cable).operators(OMEGA))
     s, w = 1j * OMEGA[:, None, None], 2 * np.pi * f
     g = point_map(np.array(at))
-    k = m * (w ** 2 + 2 * zeta * w * s)
+    k = m * (w**2 + 2 * zeta * w * s)
     K = (g.T @ np.diag([2e4, 1e4, 3e4]) @ g) * (1 + 1e-3 * s)
     z, under = alone.z_pp[:, :, None], alone.ops.mounts.chassis
     up = point_map(np.array([*at[:2], 0.0]))[2:3]
     springs, stands = alone.G.T @ (z * alone.G), np.linalg.inv(alone.ops.recoil)
     full = np.zeros((len(OMEGA), 13, 13), complex)
-    full[:, 6:12, :6] = s ** 2 * alone.M + K + up.T * k * up        # of both bodies together: motors cancel
+    full[:, 6:12, :6] = s**2 * alone.M + K + up.T * k * up  # of both bodies together: motors cancel
     full[:, :6, :6] = full[:, 6:12, :6] + springs
     full[:, :6, 6:12], full[:, 6:12, 6:12] = -alone.G.T @ (z * under), stands
     full[:, :6, 12:] = full[:, 6:12, 12:] = -up.T * k
-    full[:, 12:, :6], full[:, 12:, 12:] = -k * up, k + m * s ** 2
+    full[:, 12:, :6], full[:, 12:, 12:] = -k * up, k + m * s**2
     motors = np.broadcast_to(np.vstack([made.T, np.zeros((7, made.T.shape[1]))]), (len(OMEGA), 13, made.T.shape[1]))
     floor = np.concatenate([K[:, :, :3], K[:, :, :3] + stands @ alone.ops.follow, np.zeros((len(OMEGA), 1, 3))], axis=1)
     w = np.broadcast_to(np.eye(3, dtype=complex), (len(OMEGA), 3, 3))
@@ -112,28 +120,41 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
         np.testing.assert_allclose(made.inverse @ found, true, atol=1e-9 * np.abs(true).max())
 
 
-@pytest.mark.parametrize("values", [
-    pytest.param([1045.0, 0.0169, 5.86, 9.06, 7.13, 10.2, 6.64, 8.0, 0.558, 0.435, 0.47, -0.347, -0.243],
-                 id="beside the suspension's modes"),
-    pytest.param([721.0, 0.0159, 15.6, 13.8, 18.2, 23.3, 16.4, 19.7, 0.382, 0.594, 0.523, -0.513, -0.218],
-                 id="in the middle", marks=pytest.mark.slow),
-    pytest.param([2140.0, 0.0216, 21.1, 17.0, 18.8, 23.1, 17.4, 23.9, 0.469, 0.36, 0.466, -0.478, -0.211], id="heavy",
-                 marks=[pytest.mark.slow, pytest.mark.xfail(strict=True, reason="ends with four times the mass")])])
+@pytest.mark.parametrize(
+    "values",
+    [
+        pytest.param(
+            [1045.0, 0.0169, 5.86, 9.06, 7.13, 10.2, 6.64, 8.0, 0.558, 0.435, 0.47, -0.347, -0.243],
+            id="beside the suspension's modes",
+        ),
+        pytest.param(
+            [721.0, 0.0159, 15.6, 13.8, 18.2, 23.3, 16.4, 19.7, 0.382, 0.594, 0.523, -0.513, -0.218],
+            id="in the middle",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            [2140.0, 0.0216, 21.1, 17.0, 18.8, 23.1, 17.4, 23.9, 0.469, 0.36, 0.466, -0.478, -0.211],
+            id="heavy",
+            marks=[pytest.mark.slow, pytest.mark.xfail(strict=True, reason="ends with four times the mass")],
+        ),
+    ],
+)
 def test_six_sharp_resonances_are_found_from_a_model_without(values):
     """Each a per cent of damping wide, none at the frequency of another, and the rig fitted without them before."""
     truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/rocking", values))
     blocks = recorded(truth, 4, 3e-4)
     base = fitted(MODEL, blocks)
     assert base.chi2_per_dof > 5
-    seed, = seeds(library()["base_compliance"], Score(base.model, blocks), "chassis/rocking")
+    (seed,) = seeds(library()["base_compliance"], Score(base.model, blocks), "chassis/rocking")
     np.testing.assert_allclose(seed.values[2:8], values[2:8], rtol=0.03)
     assert seed.values[0] == pytest.approx(values[0], rel=0.1)
 
 
 def test_a_small_recoil_in_one_coordinate_is_significant():
     """A heavy chassis that moves up and down at 34 Hz: the test counts its own five parameters, not the rig's."""
-    truth = MODEL.with_effect(active(library()["base_compliance"], MODEL, "chassis/translation",
-                                     [1500.0, 0.018, 280.0, 280.0, 34.0]))
+    truth = MODEL.with_effect(
+        active(library()["base_compliance"], MODEL, "chassis/translation", [1500.0, 0.018, 280.0, 280.0, 34.0])
+    )
     blocks = recorded(truth, 2, 4e-3)
     seed = seeds(library()["base_compliance"], Score(fitted(MODEL, blocks).model, blocks), "chassis/translation")[0]
     assert seed.p_value < 1e-3
@@ -145,9 +166,15 @@ def test_what_holds_no_states_leaves_none():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "seed", "strength", "parameter"), [
-    ("mount_surge", 20000, "clear", "frequency_Hz"), ("mount_surge", 20001, "gross", "frequency_Hz"),
-    ("base_compliance", 20000, "clear", "mass_kg"), ("base_compliance", 20001, "gross", "mass_kg")])
+@pytest.mark.parametrize(
+    ("name", "seed", "strength", "parameter"),
+    [
+        ("mount_surge", 20000, "clear", "frequency_Hz"),
+        ("mount_surge", 20001, "gross", "frequency_Hz"),
+        ("base_compliance", 20000, "clear", "mass_kg"),
+        ("base_compliance", 20001, "gross", "mass_kg"),
+    ],
+)
 def test_one_is_found_from_the_first_look(name, seed, strength, parameter):
     """The search among this one effect closes the gap, at the truth's frequency or mass within its scatter of 3 %."""
     case = draw_case(seed, effect=name, strength=strength, duration_s=30.0)

@@ -34,8 +34,18 @@ def record(name, level):
     rng = np.random.default_rng([5, int(name)])
     volts, slow = level * rng.standard_normal((SAMPLES, 8)), rng.standard_normal((SAMPLES, 18))
     slow = np.apply_along_axis(lambda x: np.convolve(x, np.ones(20) / 5, "same"), 0, slow)
-    return RecordMotion(name, RATE, 10.0 * int(name), (0.0, 60.0), volts, 1e-5 * slow[:, :12], *mount_rows(BARE),
-                        actuators=BARE.actuators, sensors=BARE.sensors.names, y=0.1 * slow[:, 12:])
+    return RecordMotion(
+        name,
+        RATE,
+        10.0 * int(name),
+        (0.0, 60.0),
+        volts,
+        1e-5 * slow[:, :12],
+        *mount_rows(BARE),
+        actuators=BARE.actuators,
+        sensors=BARE.sensors.names,
+        y=0.1 * slow[:, 12:],
+    )
 
 
 MOTION = {name: record(name, level) for name, level in (("00", 0.1), ("01", 0.5), ("02", 0.1), ("03", 0.5))}
@@ -49,7 +59,7 @@ def block(truth, name, noise=NOISE):
     made = SpectralBlock(name, OMEGA, U, np.zeros((len(OMEGA), 6, 1), complex), transient=False)
     white = (rng.standard_normal((len(OMEGA), 6, 1)) + 1j * rng.standard_normal((len(OMEGA), 6, 1))) / np.sqrt(2)
     Y = truth.answer(made, None, False).Y + noise * white
-    return replace(made, Y=Y).with_noise(np.broadcast_to(noise ** 2 * np.eye(6), (len(OMEGA), 6, 6)).astype(complex))
+    return replace(made, Y=Y).with_noise(np.broadcast_to(noise**2 * np.eye(6), (len(OMEGA), 6, 6)).astype(complex))
 
 
 def test_none_of_them_is_in_the_library():
@@ -61,8 +71,12 @@ def test_none_of_them_is_in_the_library():
 FILTERS = {  # effect, place, values, factor on the channel by s, volts or outputs
     "sensor_late": ("Sz2", (2e-3, 5e-3), lambda s: np.exp(-2e-3 * s) / (1 + 5e-3 * s)),
     "motor_late": ("Az2", (2e-3, 5e-3), lambda s: np.exp(-2e-3 * s) / (1 + 5e-3 * s)),
-    "sensor_resonance": ("Sz2", (0.1, 30.0, 0.02),
-                         lambda s: 1 + 0.1 * s ** 2 / (s ** 2 + 2 * 0.02 * 60 * np.pi * s + (60 * np.pi) ** 2))}
+    "sensor_resonance": (
+        "Sz2",
+        (0.1, 30.0, 0.02),
+        lambda s: 1 + 0.1 * s**2 / (s**2 + 2 * 0.02 * 60 * np.pi * s + (60 * np.pi) ** 2),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -85,7 +99,8 @@ ADDITIONS = {  # place, strength, (volts, outputs) that are added to a record of
     "drive_quadratic": ("Ay1", 0.3, lambda u, y, t: (only(0, u[:, 0] ** 2, 8), 0)),
     "drive_absolute": ("all motors", 0.3, lambda u, y, t: (u * np.abs(u), 0)),
     "drive_cubic": ("Ay1", 0.3, lambda u, y, t: (only(0, u[:, 0] ** 3, 8), 0)),
-    "force_drift": ("all motors", 0.3, lambda u, y, t: (u * ((t - 30.0) / 60.0)[:, None], 0))}
+    "force_drift": ("all motors", 0.3, lambda u, y, t: (u * ((t - 30.0) / 60.0)[:, None], 0)),
+}
 
 
 def only(k, samples, channels):

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 
-def block_bootstrap(estimate: Callable[[np.ndarray], np.ndarray], samples: int, block: int, draws: int,
-                    rng: np.random.Generator) -> np.ndarray:
+def block_bootstrap(
+    estimate: Callable[[np.ndarray], np.ndarray], samples: int, block: int, draws: int, rng: np.random.Generator
+) -> np.ndarray:
     """(p,) standard deviations of estimate(indices) over moving blocks of rows (Kuensch, Ann. Statist. 17 (1989) 1217).
 
     It assumes nothing of the scores but that blocks are long against their correlation.

@@ -52,8 +52,9 @@ def _mode(s: np.ndarray, x: np.ndarray) -> np.ndarray:
     return 1 / (1 + x[0] * s + (s / omega) ** 2)
 
 
-def compare_lags(frequency_Hz: np.ndarray, ratio: np.ndarray, variance: np.ndarray, fitted: np.ndarray
-                 ) -> tuple[LagHypothesis, ...]:
+def compare_lags(
+    frequency_Hz: np.ndarray, ratio: np.ndarray, variance: np.ndarray, fitted: np.ndarray
+) -> tuple[LagHypothesis, ...]:
     """Delay, pole and mode, in this order.
 
     Parameters
@@ -67,8 +68,11 @@ def compare_lags(frequency_Hz: np.ndarray, ratio: np.ndarray, variance: np.ndarr
     """
     fitted = np.asarray(fitted, bool)
     if np.count_nonzero(fitted) < 3 or np.all(fitted) or np.any(np.abs(ratio) == 0):
-        raise InputError("expected at least three frequencies to fit, and some held out", field="fitted",
-                         value=int(np.count_nonzero(fitted)))
+        raise InputError(
+            "expected at least three frequencies to fit, and some held out",
+            field="fitted",
+            value=int(np.count_nonzero(fitted)),
+        )
     s = 2j * np.pi * np.asarray(frequency_Hz, float)
     D = ratio * s
     D = D * np.sign(np.sum(D.real))  # a sensor may count backwards
@@ -76,17 +80,27 @@ def compare_lags(frequency_Hz: np.ndarray, ratio: np.ndarray, variance: np.ndarr
     start = start if start > 0 else 1e-4
     sigma = np.sqrt(variance / 2) / np.abs(ratio)
     models: tuple[tuple[str, Callable, list[str], list[float]], ...] = (
-        ("delay", _delay, ["delay_s"], [start]), ("pole", _pole, ["time_constant_s"], [start]),
-        ("mode", _mode, ["lag_s", "damping"], [start, 0.1]))
+        ("delay", _delay, ["delay_s"], [start]),
+        ("pole", _pole, ["time_constant_s"], [start]),
+        ("mode", _mode, ["lag_s", "damping"], [start, 0.1]),
+    )
     return tuple(_judged(name, shape, names, np.array(x0), s, D, sigma, fitted) for name, shape, names, x0 in models)
 
 
-def _judged(name: str, shape: Callable, names: list[str], x0: np.ndarray, s: np.ndarray, D: np.ndarray,
-            sigma: np.ndarray, fitted: np.ndarray) -> LagHypothesis:
+def _judged(
+    name: str,
+    shape: Callable,
+    names: list[str],
+    x0: np.ndarray,
+    s: np.ndarray,
+    D: np.ndarray,
+    sigma: np.ndarray,
+    fitted: np.ndarray,
+) -> LagHypothesis:
     def error(x: np.ndarray, keep: np.ndarray) -> np.ndarray:
         return np.angle(D[keep] / shape(s[keep], x * x0))
 
-    bounds = (np.full(len(x0), 1e-2), np.array([1e2, LARGEST_MODE_DAMPING / x0[-1]][:len(x0)]))
+    bounds = (np.full(len(x0), 1e-2), np.array([1e2, LARGEST_MODE_DAMPING / x0[-1]][: len(x0)]))
     found = least_squares(error, np.ones(len(x0)), bounds=bounds, args=(fitted,), xtol=1e-14, ftol=1e-14)
     e, out = found.fun, error(found.x, ~fitted)
     slope = np.linalg.norm(found.jac[:, 0])
@@ -95,10 +109,17 @@ def _judged(name: str, shape: Callable, names: list[str], x0: np.ndarray, s: np.
     K = np.exp(np.mean(np.log(gain[fitted])))
 
     def rms(x: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(x ** 2)))
-    return LagHypothesis(name, dict(zip(names, (found.x * x0).tolist(), strict=True)), float(level / slope * x0[0]),
-                         float(np.degrees(rms(e))), float(np.degrees(rms(out))), rms(out / sigma[~fitted]),
-                         rms(gain[~fitted] / K - 1))
+        return float(np.sqrt(np.mean(x**2)))
+
+    return LagHypothesis(
+        name,
+        dict(zip(names, (found.x * x0).tolist(), strict=True)),
+        float(level / slope * x0[0]),
+        float(np.degrees(rms(e))),
+        float(np.degrees(rms(out))),
+        rms(out / sigma[~fitted]),
+        rms(gain[~fitted] / K - 1),
+    )
 
 
 def cubic_share(frequency_Hz: np.ndarray, ratio: np.ndarray) -> tuple[float, float]:
@@ -116,8 +137,8 @@ def cubic_share(frequency_Hz: np.ndarray, ratio: np.ndarray) -> tuple[float, flo
     x = np.asarray(frequency_Hz, float) / np.max(frequency_Hz)
     D = ratio * 1j * x
     phase = np.angle(D * np.sign(np.sum(D.real)))
-    X = np.column_stack([-x, x ** 3 / 3])
+    X = np.column_stack([-x, x**3 / 3])
     (tau, cubic), *_ = np.linalg.lstsq(X, phase, rcond=None)
     e = phase - X @ (tau, cubic)
     sigma = np.sqrt(np.linalg.inv(X.T @ X)[1, 1] * float(e @ e) / (len(e) - 2))
-    return float(cubic / tau ** 3), float(sigma / abs(tau) ** 3)
+    return float(cubic / tau**3), float(sigma / abs(tau) ** 3)

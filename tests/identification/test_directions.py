@@ -53,7 +53,7 @@ def test_box_and_ball_hold_together_as_often_as_they_say(rng):
     for q in (0, 3, 8):
         for confidence in (0.8, 0.95, 0.99):
             box, ball = half_widths(q, 8, confidence)
-            inside = np.all(np.abs(z[:, :q]) <= box, axis=1) & (np.sum(z[:, q:] ** 2, axis=1) <= ball ** 2 + (q == 8))
+            inside = np.all(np.abs(z[:, :q]) <= box, axis=1) & (np.sum(z[:, q:] ** 2, axis=1) <= ball**2 + (q == 8))
             assert np.mean(inside) == pytest.approx(confidence, abs=0.003)
 
 
@@ -103,9 +103,15 @@ def test_two_coordinates_have_at_most_eight_combinations():
     assert len(found.changes) == 8
 
 
-@pytest.mark.parametrize(("names", "S", "confidence", "field"), [
-    (["mass"], np.ones((2, 1)), 0.95, "factor"), (["mass"], np.array([[np.nan]]), 0.95, "factor"),
-    (["mass"], np.ones((1, 1)), 1.0, "confidence"), (["no"], np.ones((1, 1)), 0.95, "names")])
+@pytest.mark.parametrize(
+    ("names", "S", "confidence", "field"),
+    [
+        (["mass"], np.ones((2, 1)), 0.95, "factor"),
+        (["mass"], np.array([[np.nan]]), 0.95, "factor"),
+        (["mass"], np.ones((1, 1)), 1.0, "confidence"),
+        (["no"], np.ones((1, 1)), 0.95, "names"),
+    ],
+)
 def test_what_is_refused(names, S, confidence, field):
     with pytest.raises(InputError, match=field):
         directions_that_matter(load_rig("avis"), names, S, KEEP, OMEGA, confidence)

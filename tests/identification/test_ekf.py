@@ -27,8 +27,9 @@ def rig():
 def wrong(rig):
     """The rig with the source's parameters off by up to 25 %."""
     draw = np.random.default_rng(5)
-    return rig.with_parameters({name: rig.parameters()[name].value * (1 + draw.uniform(-0.25, 0.25))
-                                for name in source_parameters(rig)})
+    return rig.with_parameters(
+        {name: rig.parameters()[name].value * (1 + draw.uniform(-0.25, 0.25)) for name in source_parameters(rig)}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +50,9 @@ def two_masses():
     dM[0, 0, 0], dC[0, 0, 1], dK[0, 0, 3] = 1.0, 1.0, 1.0
     dC[..., 2] = dK[..., 4] = [[1.0, -1.0], [-1.0, 1.0]]
     values = np.array([10.0, 20.0, 15.0, 4e3, 3e3])
-    return LinearModel(names, values, np.array([np.diag([0.0, 8.0]), zero, zero]), slopes, np.eye(2),
-                       np.hstack([zero, np.eye(2)]))
+    return LinearModel(
+        names, values, np.array([np.diag([0.0, 8.0]), zero, zero]), slopes, np.eye(2), np.hstack([zero, np.eye(2)])
+    )
 
 
 def plant(model, G=None, decay=1.0):
@@ -94,6 +96,7 @@ def textbook(Phi, Gamma, Qd, H, R, x, P, u, y):
 
 # -- the linear limit ----------------------------------------------------------------------------------------------
 
+
 def linear_limit(rig, rng, samples=1500):
     model = linear_model(rig, ())
     u, y = rng.normal(size=(samples, 8)), 1e-4 * rng.normal(size=(samples, 6))
@@ -103,7 +106,7 @@ def linear_limit(rig, rng, samples=1500):
     assert done == samples
     Phi, Gamma = exact(model, np.zeros(0), H1)
     Qd = process_noise(model.system(np.zeros(0))[0], 1e-8 * np.eye(6), H1)
-    P0 = np.diag(np.repeat([2.5e-6 ** 2, 1e-16], 6))
+    P0 = np.diag(np.repeat([2.5e-6**2, 1e-16], 6))
     return model, u, y, trace, (Phi, Gamma, Qd, P0)
 
 
@@ -143,6 +146,7 @@ def test_process_noise_of_a_sample(rig):
 
 # -- Jacobians -----------------------------------------------------------------------------------------------------
 
+
 def test_the_sampled_jacobian_is_the_complex_step_of_the_matrix_exponential(rig, rng):
     """Fourth order: a step lacks (omega h)^4 / 120 = 8e-9 of itself at 5 Hz, 2e-8 where s makes that 6 Hz."""
     model = linear_model(rig, source_parameters(rig))
@@ -162,12 +166,14 @@ def test_the_sampled_jacobian_is_the_complex_step_of_the_matrix_exponential(rig,
             term = A @ term * H1 / k
             total = total + term
         return total
+
     scale = np.repeat([1e-3, 1.0], 6)
     for half in (slice(0, 6), slice(6, 12)):
         change = true(s)[half] - x0[half]
         assert np.max(np.abs(x - true(s))[half]) < 2e-8 * np.max(np.abs(change))
-    assert np.allclose(Phi * scale / scale[:, None],
-                       exact(model, model.values * s, H1)[0] * scale / scale[:, None], atol=1e-9)
+    assert np.allclose(
+        Phi * scale / scale[:, None], exact(model, model.values * s, H1)[0] * scale / scale[:, None], atol=1e-9
+    )
     for j in range(26):
         moved = s.astype(complex)
         moved[j] += 1e-30j
@@ -198,8 +204,9 @@ def test_a_disturbance_acts_as_a_held_acceleration(rig, rng):
 
 # -- covariance ----------------------------------------------------------------------------------------------------
 
+
 @settings(deadline=None, max_examples=40)
-@given(st.integers(0, 2 ** 32 - 1), st.integers(0, 5), st.integers(1, 4))
+@given(st.integers(0, 2**32 - 1), st.integers(0, 5), st.integers(1, 4))
 def test_square_root_propagation_and_update_are_those_of_the_covariance(seed, n_p, n_q):
     draw, n_x = np.random.default_rng(seed), 2 * n_q
     n = n_p + n_x
@@ -226,13 +233,14 @@ def test_square_root_propagation_and_update_are_those_of_the_covariance(seed, n_
 def test_the_covariance_stays_definite_over_1e5_samples(rig, wrong, R):
     """Smallest eigenvalue with every state at unit variance, at every 1e4th of 1e5 samples (seen: 3e-4)."""
     from avis_ctrl.identification.prefilter import prefilter, sensor_inverse
+
     record = source_campaign(rig, sets=1, duration_s=100.0).records[0].load()
     u, y = prefilter(record, sensor_inverse(rig, record.header.y_names, "V"), rig.loop_delay_s)
     kalman = ParameterFilter(linear_model(wrong, source_parameters(rig)), SOURCE_SETTINGS, np.full(6, R), H1)
     kalman.begin(y[0])
     smallest = []
     for k in range(0, 100_000, 10_000):
-        _, done = kalman.filter(u[k:k + 10_000], y[k:k + 10_000], 1000)
+        _, done = kalman.filter(u[k : k + 10_000], y[k : k + 10_000], 1000)
         assert done == 10_000
         P = kalman.covariance
         size = np.sqrt(np.diag(P))
@@ -241,6 +249,7 @@ def test_the_covariance_stays_definite_over_1e5_samples(rig, wrong, R):
 
 
 # -- consistency ---------------------------------------------------------------------------------------------------
+
 
 def test_errors_are_as_large_as_the_filter_says():
     """NEES and NIS over 60 draws of parameters, states and noise from the filter's own assumptions."""
@@ -265,7 +274,7 @@ def test_errors_are_as_large_as_the_filter_says():
         P, e = kalman.covariance, np.concatenate([kalman.state.s - s, kalman.state.x - last])
         nees_s.append(e[:5] @ np.linalg.solve(P[:5, :5], e[:5]))
         nees_x.append(e[5:] @ np.linalg.solve(P[5:, 5:], e[5:]))
-        nis.append(np.sum(trace.innovation ** 2))
+        nis.append(np.sum(trace.innovation**2))
     for values, dof in ((nees_s, 5), (nees_x, 4), (nis, 2 * n)):
         low, high = chi2.ppf((0.0005, 0.9995), dof * runs)
         assert low < np.sum(values) < high, (dof, np.mean(values))
@@ -282,6 +291,7 @@ def test_a_filter_told_a_tenth_of_the_noise_is_seen_through(rig, wrong, campaign
 
 
 # -- the rig -------------------------------------------------------------------------------------------------------
+
 
 def determined(rig, names):
     """How many combinations M, C and K depend on at all: the rank of the map from parameters to matrices."""
@@ -318,7 +328,8 @@ def test_directions_that_kept_their_prior_are_those_that_move_nothing(wrong, hon
     assert kept.shape == (26, 6) and len(ratio) == 6
     assert {tuple(sorted(name for name, _ in main_members(result.names, one)[:2])) for one in kept.T} == {
         (f"isolator{i}.{kind}", f"isolator{j}.{kind}")
-        for i, j, kind in ((3, 4, "k_x"), (2, 3, "k_y"), (1, 4, "k_y"), (2, 3, "c_y"), (3, 4, "c_x"), (1, 4, "c_y"))}
+        for i, j, kind in ((3, 4, "k_x"), (2, 3, "k_y"), (1, 4, "k_y"), (2, 3, "c_y"), (3, 4, "c_x"), (1, 4, "c_y"))
+    }
     model = linear_model(wrong, result.names)
     for part, whole in zip(model.slopes, model.matrices(model.values), strict=True):
         assert np.max(np.abs((part * model.values) @ kept)) < 1e-2 * np.max(np.abs(whole))
@@ -344,8 +355,15 @@ def test_bands_hold_with_floor_motion_too(rig, wrong):
     names = source_parameters(rig)
     true = np.array([rig.parameters()[name].value for name in names])
     model = linear_model(rig, names)
-    columns = np.concatenate([(part / np.max(np.abs(whole))).reshape(36, -1) for part, whole in
-                              zip(model.slopes, model.matrices(true), strict=True)]) * true
+    columns = (
+        np.concatenate(
+            [
+                (part / np.max(np.abs(whole))).reshape(36, -1)
+                for part, whole in zip(model.slopes, model.matrices(true), strict=True)
+            ]
+        )
+        * true
+    )
     map_ = np.linalg.svd(columns)[2][:20]
     nees = []
     for seed in (11, 12, 13):

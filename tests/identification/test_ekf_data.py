@@ -39,12 +39,14 @@ def campaign(rig):
 
 
 def record_of(rig, u, y, unit="V", rate=1000.0):
-    header = RecordHeader("00", rate, len(u), rig.equations_of_motion().actuators, rig.geophones.names, "noise",
-                          y_unit=unit)
+    header = RecordHeader(
+        "00", rate, len(u), rig.equations_of_motion().actuators, rig.geophones.names, "noise", y_unit=unit
+    )
     return Record(header, u, y)
 
 
 # -- the simulated campaign ----------------------------------------------------------------------------------------
+
 
 def test_the_simulation_is_what_an_integrator_of_the_equations_finds(rig, rng):
     """Held volts a sample late, floor velocity in ramps, geophone with its compensated corner in the time domain."""
@@ -59,8 +61,9 @@ def test_the_simulation_is_what_an_integrator_of_the_equations_finds(rig, rng):
         force = eom.K_floor[:, :3] @ qf + eom.C_floor[:, :3] @ vf - eom.K @ q - eom.C @ v
         a = np.linalg.solve(eom.M, force + (eom.T @ u[k - 1] if k else 0))
         # The compensated geophone: s^2/(s^2 + 2 zeta w s + w^2) of velocity is velocity less a damped spring's.
-        back = -2 * g.compensated_damping * w * moving - w ** 2 * sprung + rows @ v
+        back = -2 * g.compensated_damping * w * moving - w**2 * sprung + rows @ v
         return np.concatenate([v, a, vf, moving, back])
+
     x, volts = np.zeros(27), []
     for k in range(n):
         back = slope(k * h, x, k)[21:27]
@@ -80,7 +83,7 @@ def test_drives_and_floor_have_the_variance_asked_for(rig, rng):
     floor = flat_floor(200_000, 1000.0, 2e-6, rng)
     spectrum = np.abs(np.fft.rfft(floor, axis=0)) ** 2
     f = np.fft.rfftfreq(200_000, 1e-3)
-    density = 2e-6 ** 2 / 59.5
+    density = 2e-6**2 / 59.5
     assert 2 * np.mean(spectrum[(f > 1) & (f < 40)]) / (200_000 * 1000) == pytest.approx(density, rel=0.03)
     assert np.allclose(np.std(floor, axis=0), 2e-6, rtol=0.05)
 
@@ -92,6 +95,7 @@ def test_records_are_seeded_and_differ(rig, campaign):
 
 
 # -- prefilter -----------------------------------------------------------------------------------------------------
+
 
 def velocities(rig, volts_per_motion, u):
     """Exact velocities along the sensors: a rig whose geophones have no corner to speak of."""
@@ -125,8 +129,11 @@ def test_the_anti_alias_filter_acts_on_voltages_and_motion_alike(rig):
     for part in (np.real, np.imag):
         record = record_of(rig, part(motion) * np.ones(8), part(chain * motion) * np.ones(6))
         seen_u, seen_y = prefilter(record, inverse, 0.0)
-        plain = prefilter(record_of(rig, part(turn * motion) * np.ones(8), part(turn * motion) * np.ones(6), "m/s"),
-                          sensor_inverse(rig, rig.geophones.names, "m/s"), 0.0)
+        plain = prefilter(
+            record_of(rig, part(turn * motion) * np.ones(8), part(turn * motion) * np.ones(6), "m/s"),
+            sensor_inverse(rig, rig.geophones.names, "m/s"),
+            0.0,
+        )
         for found, right in zip((seen_u, seen_y), plain, strict=True):
             # Tustin's rule shifts 20 Hz by (w h)^2 / 12 = 1.3e-3 of itself.
             assert np.max(np.abs(found - right)[15_000:]) < 3e-3
@@ -156,6 +163,7 @@ def test_delay():
 
 # -- settings and figures ------------------------------------------------------------------------------------------
 
+
 def test_the_sources_settings():
     s = SOURCE_SETTINGS
     assert (s.q_sigma, s.v_sigma, s.prior_share, s.Q, s.R) == (2.5e-6, 1e-8, 0.25, 1e-8, 1e-8)
@@ -164,8 +172,8 @@ def test_the_sources_settings():
 
 def test_honest_noise_is_the_rigs(rig):
     names = rig.geophones.names
-    lsb = 20 / 2 ** 14
-    assert np.allclose(measurement_variance(HONEST_SETTINGS, rig, names, "V"), (1e-6 + lsb ** 2 / 12) / 3125 ** 2)
+    lsb = 20 / 2**14
+    assert np.allclose(measurement_variance(HONEST_SETTINGS, rig, names, "V"), (1e-6 + lsb**2 / 12) / 3125**2)
     floor = floor_noise(HONEST_SETTINGS, rig)
     assert floor.density == pytest.approx(4e-12 / (2 * 59.5)) and floor_noise(SOURCE_SETTINGS, rig) is None
     by_f, by_w = floor.acceleration(rig)
@@ -186,7 +194,10 @@ def test_curves_of_the_sources_figures(rig, campaign):
     names = source_parameters(rig)
     result = identify_ekf(rig, campaign, names=names)
     assert {title: len(index) for title, index in kinds(result).items()} == {
-        "Mass and inertia": 4, "Damping": 11, "Stiffness": 11}
+        "Mass and inertia": 4,
+        "Damping": 11,
+        "Stiffness": 11,
+    }
     curves = result.history
     assert curves.theta.shape == curves.lower.shape == (4, 26) == (len(curves.time_s), 26)
     assert np.all(curves.lower < curves.theta) and np.all(curves.theta < curves.upper)
@@ -196,11 +207,19 @@ def test_curves_of_the_sources_figures(rig, campaign):
 
 # -- input to refuse -----------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("names, message", [
-    (("mas",), "did you mean 'mass'"), (("mass", "mass"), "each parameter once"),
-    (("com_x",), "positive starting value"),
-    (("J12",), "positive starting value"), (("isolator2.p_x",), "moves actuators or sensors"),
-    (("actuator.Ay1",), "moves actuators or sensors"), (("isolator1.p_z",), "positive starting value")])
+
+@pytest.mark.parametrize(
+    "names, message",
+    [
+        (("mas",), "did you mean 'mass'"),
+        (("mass", "mass"), "each parameter once"),
+        (("com_x",), "positive starting value"),
+        (("J12",), "positive starting value"),
+        (("isolator2.p_x",), "moves actuators or sensors"),
+        (("actuator.Ay1",), "moves actuators or sensors"),
+        (("isolator1.p_z",), "positive starting value"),
+    ],
+)
 def test_parameters_that_the_filter_cannot_take(rig, campaign, names, message):
     with pytest.raises(InputError, match=message):
         identify_ekf(rig, campaign, SOURCE_SETTINGS, names)
@@ -219,16 +238,29 @@ def test_parameters_of_another_rig(campaign):
         identify_ekf(load_rig("halcyonics"), campaign, names=("mass",))
 
 
-@pytest.mark.parametrize("change, message", [
-    ({"highpass_Hz": 600.0}, "between 0 and 500"), ({"highpass_order": 2}, "whole number from 3")])
+@pytest.mark.parametrize(
+    "change, message", [({"highpass_Hz": 600.0}, "between 0 and 500"), ({"highpass_order": 2}, "whole number from 3")]
+)
 def test_settings_that_make_no_sense(rig, campaign, change, message):
     with pytest.raises(InputError, match=message):
         identify_ekf(rig, campaign, EkfSettings(**change), FEW)
 
 
-@pytest.mark.parametrize("change", [{"prior_share": 0.0}, {"q_sigma": -1.0}, {"v_sigma": float("inf")}, {"R": -1e-8},
-                                    {"R": float("nan")}, {"Q": -1.0}, {"lowest": 1.5}, {"highpass_Hz": "1"},
-                                    {"history_s": 0.0}, {"warm_up": -1}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"prior_share": 0.0},
+        {"q_sigma": -1.0},
+        {"v_sigma": float("inf")},
+        {"R": -1e-8},
+        {"R": float("nan")},
+        {"Q": -1.0},
+        {"lowest": 1.5},
+        {"highpass_Hz": "1"},
+        {"history_s": 0.0},
+        {"warm_up": -1},
+    ],
+)
 def test_settings_are_checked_by_name(change):
     with pytest.raises(InputError, match=next(iter(change))):
         EkfSettings(**change)
@@ -270,8 +302,11 @@ def test_a_filter_that_diverges_says_where(rig, campaign):
 def test_some_channels_are_enough(rig, campaign):
     """Records of four geophones and the vertical motors."""
     record = campaign.records[0]
-    header = replace(record.header, u_names=tuple(record.header.u_names[k] for k in (1, 3, 5, 7)),
-                     y_names=tuple(record.header.y_names[k] for k in (1, 3, 5)))
+    header = replace(
+        record.header,
+        u_names=tuple(record.header.u_names[k] for k in (1, 3, 5, 7)),
+        y_names=tuple(record.header.y_names[k] for k in (1, 3, 5)),
+    )
     picked = Record(header, record.u[:, [1, 3, 5, 7]], record.y[:, [1, 3, 5]])
     result = identify_ekf(rig, [picked], SOURCE_SETTINGS, FEW)
     assert result.values.shape == (2,) and np.all(np.isfinite(result.sigma))

@@ -14,13 +14,7 @@ from avis_ctrl.identification.experiment_plan import (
     planned,
     predicted,
 )
-from avis_ctrl.identification.experiments import (
-    Added,
-    Drive,
-    Noise,
-    changed,
-    predicted_information,
-)
+from avis_ctrl.identification.experiments import Added, Drive, Noise, changed, predicted_information
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rigid_body import cross_matrix
@@ -58,11 +52,15 @@ def test_the_added_mass_is_that_of_a_body_with_it(avis):
     centre = m * p / total
     S = [cross_matrix(v) for v in (-centre, p - centre)]
     J = avis.inertia_matrix() - avis.mass * S[0] @ S[0] - m * S[1] @ S[1]
-    rig = replace(avis, mass=total, centre_of_mass=tuple(centre),
-                  inertia=(J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]))
+    rig = replace(
+        avis, mass=total, centre_of_mass=tuple(centre), inertia=(J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2])
+    )
     omega = np.linspace(5, 200, 20)
-    assert np.allclose(changed(model, masses=[(m, CORNER)]).response(omega),
-                       ResponseModel.of(rig, ["mass"]).response(omega), rtol=1e-10)
+    assert np.allclose(
+        changed(model, masses=[(m, CORNER)]).response(omega),
+        ResponseModel.of(rig, ["mass"]).response(omega),
+        rtol=1e-10,
+    )
 
 
 def test_derivatives_of_a_changed_rig(avis):
@@ -75,8 +73,9 @@ def test_derivatives_of_a_changed_rig(avis):
     assert found.Y.shape == (7, 7, 11)
     for j, value in enumerate(other.values):
         step = 1e-4 * value * np.eye(5)[j]
-        slope = (other.at(other.values + step).response(omega)
-                 - other.at(other.values - step).response(omega)) / (2 * step[j])
+        slope = (other.at(other.values + step).response(omega) - other.at(other.values - step).response(omega)) / (
+            2 * step[j]
+        )
         assert np.allclose(found.dY[j], slope, rtol=1e-5, atol=1e-6 * np.max(np.abs(slope)))
 
 
@@ -90,7 +89,8 @@ def test_floor_shaking_brings_no_stiffness_but_calibrates_the_sensors(avis):
     after = now.plus(predicted_information(full, drive, NOISE))
     assert after.rank == 33
     assert {n for n, known in zip(full.names, after.known, strict=True) if known} == {
-        f"sensor.{n}" for n in avis.geophones.names}
+        f"sensor.{n}" for n in avis.geophones.names
+    }
 
 
 def test_raised_isolators_determine_every_stiffness(avis):
@@ -125,8 +125,7 @@ def test_sentences_and_the_plan(avis):
     now = predicted_information(model, DRIVE, NOISE)
     longer = Experiment("Record twice as long", DRIVE)
     bench = Experiment("Measure isolator1.k_x", bench={"isolator1.k_x": 0.02})
-    raised = Experiment("Raise 1 and 3", DRIVE,
-                        {"shifts": {"isolator1.p_z": 0.05, "isolator3.p_z": 0.05}})
+    raised = Experiment("Raise 1 and 3", DRIVE, {"shifts": {"isolator1.p_z": 0.05, "isolator3.p_z": 0.05}})
     added = predicted(model, [longer, bench, raised], NOISE)
     ranked = compared(now, added)
     assert [one.experiment for one in ranked] == [raised, bench, longer]
@@ -148,11 +147,17 @@ def test_channels_are_added_at_the_corner_opposite_the_first_mount(avis):
         assert any(f"sensor along {axis} on the payload at (-0.4, -0.3, -0.1) m" in words for words in said)
 
 
-@pytest.mark.parametrize("make", [
-    lambda m: Drive(1.0, 0.0), lambda m: Drive(1.0, 1.0, (5.0, 1.0)), lambda m: Drive(1.0, 1.0, (0.0, 5.0)),
-    lambda m: Drive(1.0, 1.0, (1.0, 5.0), {"v": 1.0}),
-    lambda m: changed(m, {"isolator9.p_x": 0.1}),
-    lambda m: predicted_information(m, Drive(1, 1, (900.0, 950.0)), NOISE)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda m: Drive(1.0, 0.0),
+        lambda m: Drive(1.0, 1.0, (5.0, 1.0)),
+        lambda m: Drive(1.0, 1.0, (0.0, 5.0)),
+        lambda m: Drive(1.0, 1.0, (1.0, 5.0), {"v": 1.0}),
+        lambda m: changed(m, {"isolator9.p_x": 0.1}),
+        lambda m: predicted_information(m, Drive(1, 1, (900.0, 950.0)), NOISE),
+    ],
+)
 def test_wrong_calls_are_answered(avis, make):
     with pytest.raises(InputError):
         make(ResponseModel.of(avis, ["mass"]))

@@ -8,9 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.identifiability import (
-    identifiability_report,
-)
+from avis_ctrl.identification.identifiability import identifiability_report
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.sparse_space import components, reduced_rows, sparse_rows, whole_numbers
@@ -36,7 +34,7 @@ def sets(rig):
 def information(model, noise=0.01, omega=OMEGA):
     """Of responses to each actuator with white relative noise."""
     U = np.zeros((len(omega), len(model.inputs), len(model.actuators)), complex)
-    U[:, :len(model.actuators)] = np.eye(len(model.actuators))
+    U[:, : len(model.actuators)] = np.eye(len(model.actuators))
     found = model.driven(omega, U)
     level = noise * np.sqrt(np.mean(np.abs(found.Y) ** 2, axis=(1, 2)))
     J = np.sqrt(2) * (found.dY / level[:, None, None]).reshape(len(model.names), -1)
@@ -44,6 +42,7 @@ def information(model, noise=0.01, omega=OMEGA):
 
 
 # An oracle of its own: K = sum G^T K_i G over the rationals, from the design's equations and not from the package.
+
 
 def rational_rank(rows):
     rows, rank = [[Fraction(v) for v in row] for row in rows], 0
@@ -71,13 +70,21 @@ def outer(a, b):
 
 def exact_model(rig):
     """M, C, K (6, 6), T (6, 8), R (6, 6), S (6) and derivatives of M, C, K by name, as fractions."""
+
     def F(x):
-        return Fraction(x).limit_denominator(10 ** 6)
+        return Fraction(x).limit_denominator(10**6)
+
     places = [[F(v) for v in one.position] for one in rig.isolators]
-    dM = {name: [[Fraction(int(i == j and i in where)) for j in range(6)] for i in range(6)]
-          for name, where in (("mass", (0, 1, 2)), ("J1", (3,)), ("J2", (4,)), ("J3", (5,)))}
-    dD = {(f"isolator{i}.{kind}_{axis}", kind): outer(point_row(p, a), point_row(p, a))
-          for i, p in enumerate(places, 1) for kind in "kc" for a, axis in enumerate("xyz")}
+    dM = {
+        name: [[Fraction(int(i == j and i in where)) for j in range(6)] for i in range(6)]
+        for name, where in (("mass", (0, 1, 2)), ("J1", (3,)), ("J2", (4,)), ("J3", (5,)))
+    }
+    dD = {
+        (f"isolator{i}.{kind}_{axis}", kind): outer(point_row(p, a), point_row(p, a))
+        for i, p in enumerate(places, 1)
+        for kind in "kc"
+        for a, axis in enumerate("xyz")
+    }
     columns = {m.name: point_row(places[m.isolator - 1], "xyz".index(m.axis)) for m in rig.motors}
     g = rig.geophones
     R = [point_row(places[i - 1], "xyz".index(a)) for i, a in zip(g.isolator, g.axis, strict=True)]
@@ -100,12 +107,16 @@ def exact_rank(rig, names):
         for value, matrix in parts:
             out = [[a + value * b for a, b in zip(x, y, strict=True)] for x, y in zip(out, matrix, strict=True)]
         return out
-    matrices = [total([(values[n], m) for n, m in dM.items()]),
-                *(total([(values[n], m) for (n, kind), m in dD.items() if kind == which]) for which in "ck")]
+
+    matrices = [
+        total([(values[n], m) for n, m in dM.items()]),
+        *(total([(values[n], m) for (n, kind), m in dD.items() if kind == which]) for which in "ck"),
+    ]
     T = [[values[f"actuator.{name}"] * v for v in column] for name, column in columns.items()]  # rows: actuators
 
     def flat(M, C, K, acts):
         return [v for matrix in (M, C, K) for row in matrix for v in row] + [v for row in acts for v in row]
+
     none = [[Fraction(0)] * 6 for _ in T]
     own, gauge = [], []
     inverse = invert([[Fraction(v) for v in row] for row in R])
@@ -121,8 +132,15 @@ def exact_rank(rig, names):
             k = rig.geophones.names.index(name.removeprefix("sensor."))
             E = outer([row[k] for row in inverse], R[k])
             # D E moves the response like dS; its parameter is the relative gain.
-            own.append(flat(*([[-sum(D[i][m] * E[m][j] for m in range(6)) for j in range(6)] for i in range(6)]
-                              for D in matrices), none))
+            own.append(
+                flat(
+                    *(
+                        [[-sum(D[i][m] * E[m][j] for m in range(6)) for j in range(6)] for i in range(6)]
+                        for D in matrices
+                    ),
+                    none,
+                )
+            )
     for i in range(6):
         for j in range(6):
             moved = [[[D[j][c] if r == i else Fraction(0) for c in range(6)] for r in range(6)] for D in matrices]
@@ -164,9 +182,16 @@ def test_a_weak_actuator_tells_as_much_as_a_strong_one(avis, factor):
 def test_eight_stiffness_numbers_not_twelve(avis):
     """The 12 stiffnesses span 8 dimensions of K; those of one horizontal axis two, the vertical ones four."""
     _, _, dD, _, _ = exact_model(avis)
+
     def rank(axes):
-        return rational_rank([[Fraction(v) for row in m for v in row] for (name, kind), m in dD.items()
-                              if kind == "k" and name[-1] in axes])
+        return rational_rank(
+            [
+                [Fraction(v) for row in m for v in row]
+                for (name, kind), m in dD.items()
+                if kind == "k" and name[-1] in axes
+            ]
+        )
+
     assert (rank("xyz"), rank("x"), rank("y"), rank("z")) == (8, 2, 2, 4)
 
 
@@ -179,13 +204,14 @@ def test_stated_directions_change_nothing_and_others_do(avis, count):
 
     def change(values):
         return np.max(np.abs(model.at(values).response(OMEGA)[:, :, :8] - still)) / np.max(np.abs(still))
+
     for row in report.unseen:
         step = np.array([row.get(name, 0.0) for name in model.names])
         assert change(model.values + 0.3 * step / np.max(np.abs(step / model.values))) < 1e-9
     for scaling in report.structure.scalings:
-        assert change(model.values * 1.3 ** scaling.exponents) < 1e-9
+        assert change(model.values * 1.3**scaling.exponents) < 1e-9
     for one in report.combinations:
-        step = np.array([one.weights.get(name, 0.0) for name in model.names]) * model.values ** 2
+        step = np.array([one.weights.get(name, 0.0) for name in model.names]) * model.values**2
         assert change(model.values + 0.05 * step / np.max(np.abs(step / model.values))) > 1e-5
     unseen = len(report.structure.scalings) + sum(len(group.unseen) for group in report.structure.groups)
     assert unseen == count - report.rank and len(report.combinations) == report.rank
@@ -206,7 +232,7 @@ def test_the_28_in_words(avis):
                 one, two = (f"isolator{i}.{kind}_{axis}" for i in pair)
                 assert f"{one} and {two} are determined only as their sum" in text
         alone = [*BODY, *(name for name in MOUNTS if name.endswith("_z"))]
-        said, = (one for one in report.sentences if one.startswith("Determined individually (12)"))
+        (said,) = (one for one in report.sentences if one.startswith("Determined individually (12)"))
         assert set(said.partition(": ")[2].removesuffix(".").split(", ")) == set(alone)
         group = next(one for one in report.structure.groups if model.names.index("isolator1.k_x") in one.members)
         assert [model.names[j] for j in group.members] == ["isolator1.k_x", "isolator2.k_x"]
@@ -228,8 +254,16 @@ def test_the_standard_deviation_of_a_sum_is_that_of_fitting_the_sum(avis):
     """With one spring of each pair held, the other's error is the sum's: a regular matrix, inverted by itself."""
     model = ResponseModel.of(avis, sets(avis)[28])
     info = information(model)
-    held = ["isolator2.k_x", "isolator4.k_x", "isolator4.k_y", "isolator3.k_y",
-            "isolator2.c_x", "isolator4.c_x", "isolator4.c_y", "isolator3.c_y"]
+    held = [
+        "isolator2.k_x",
+        "isolator4.k_x",
+        "isolator4.k_y",
+        "isolator3.k_y",
+        "isolator2.c_x",
+        "isolator4.c_x",
+        "isolator4.c_y",
+        "isolator3.c_y",
+    ]
     free = [j for j, name in enumerate(info.names) if name not in held]
     sigma = np.sqrt(np.diag(np.linalg.inv(info.relative[np.ix_(free, free)]))) * info.scale[free]
     report = identifiability_report(info, model)
@@ -276,22 +310,22 @@ def test_a_mount_pattern_without_symmetry_leaves_three_numbers_of_four(avis):
     assert report.combinations and len(report.combinations) == 3
     y = np.array([one.position[1] for one in rig.isolators])
     v = np.array([report.unseen[0].get(name, 0.0) for name in names])
-    for weights in (np.ones(4), y, y ** 2):
+    for weights in (np.ones(4), y, y**2):
         assert abs(v @ weights) < 1e-9 * np.abs(v) @ np.abs(weights)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.integers(0, 10 ** 6), st.integers(3, 12), st.integers(1, 4))
+@given(st.integers(0, 10**6), st.integers(3, 12), st.integers(1, 4))
 def test_whole_number_directions_are_found_again(seed, n, d):
     """Random information with a null space of whole numbers on parts that share no parameter."""
     rng = np.random.default_rng(seed)
     parts = np.array_split(rng.permutation(n), min(d, n // 2))
     N = np.zeros((len(parts), n))
     for row, part in zip(N, parts, strict=True):
-        chosen = part[:max(2, len(part) - 1)]
+        chosen = part[: max(2, len(part) - 1)]
         row[chosen] = rng.choice([-3, -2, -1, 1, 2, 3], len(chosen))
     scale = 10 ** rng.uniform(3, 4.3, n)
-    Q = np.linalg.svd(N * (1 / scale))[2][len(N):]
+    Q = np.linalg.svd(N * (1 / scale))[2][len(N) :]
     F = Q.T @ np.diag(10 ** rng.uniform(2, 6, len(Q))) @ Q / np.outer(scale, scale)
     names = tuple(f"p{j}" for j in range(n))
     report = identifiability_report(Information(names, scale, ("m",) * n, F, scale))
@@ -306,7 +340,7 @@ def test_whole_number_directions_are_found_again(seed, n, d):
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
-@given(st.integers(0, 10 ** 6))
+@given(st.integers(0, 10**6))
 def test_sparse_rows_span_what_they_were_given(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 9))
@@ -338,7 +372,7 @@ def test_a_small_share_in_a_weak_direction_counts():
     v, w = np.array([0.05, 1.0]), np.array([1.0, -0.05])
     v, w = v / np.linalg.norm(v), w / np.linalg.norm(w)
     for sigma in (0.9, 1.5, 15.0):
-        F = 1e8 * np.outer(w, w) + np.outer(v, v) / sigma ** 2
+        F = 1e8 * np.outer(w, w) + np.outer(v, v) / sigma**2
         info = Information(("a", "b"), np.ones(2), ("m", "m"), F, np.ones(2))
         exact = np.sqrt(np.linalg.inv(F)[0, 0])
         assert info.standard_deviation[0] == pytest.approx(exact, rel=1e-6)
@@ -348,7 +382,7 @@ def test_a_small_share_in_a_weak_direction_counts():
 @pytest.mark.parametrize("sigma", [0.9, 0.01])
 def test_the_worst_known_direction_is_said_where_it_is_weak(sigma):
     """a known to 1e-4, b to sigma."""
-    info = Information(("a", "b"), np.ones(2), ("m", "m"), np.diag([1e8, sigma ** -2]), np.ones(2))
+    info = Information(("a", "b"), np.ones(2), ("m", "m"), np.diag([1e8, sigma**-2]), np.ones(2))
     said = [one for one in identifiability_report(info).sentences if "least precise combination" in one]
     assert [("changing b by +90 %" in one, " a by" in one) for one in said] == ([(True, False)] if sigma == 0.9 else [])
 

@@ -30,9 +30,9 @@ def test_intervals_hold_the_truth_and_errors_are_near_the_bound(benchmark):
     inside = int(np.sum(np.abs(z) <= benchmark.QUANTILE))
     assert inside >= binom(z.size, 0.95).ppf(5e-4)
     low, high = chi2(z.size).ppf([5e-4, 1 - 5e-4]) / z.size
-    assert low < np.mean(z ** 2) < high
+    assert low < np.mean(z**2) < high
     # 1.2 times the bound at most, beyond what the draws scatter.
-    assert np.mean(bound ** 2) < 1.2 ** 2 * high
+    assert np.mean(bound**2) < 1.2**2 * high
 
 
 def test_wilsons_interval_covers(benchmark):

@@ -60,7 +60,8 @@ def test_sensors_that_turn_read_the_second_order_of_exact_kinematics():
     def points(t):
         q = motion(t)
         return q[:3] + Rotation.from_euler("ZYX", q[:2:-1]).apply(place)
-    acceleration = (points(h) - 2 * points(0.0) + points(-h)) / h ** 2
+
+    acceleration = (points(h) - 2 * points(0.0) + points(-h)) / h**2
     turned = Rotation.from_euler("ZYX", offset[:2:-1]).apply(direction)
     linear = np.sum((bend[:3] + np.cross(bend[3:], place)) * direction, axis=1)
     out = np.empty(5)
@@ -100,6 +101,7 @@ def test_an_independent_table_turns_its_sensors_with_it():
 
     def error(turning: Turning) -> float:
         return off(Predictor(replace(model, turning=turning), large_motion=True).read(u), y)
+
     right = error(Turning(0.0, 1.0))
     assert right < 2e-5
     for wrong in (Turning(0.0, 0.0), Turning(1.0, 1.0), Turning(1.0, 0.0)):
@@ -159,6 +161,7 @@ def test_combinations_of_drives_that_no_record_plays_are_told():
     def space(u):
         h = RecordHeader("00", 1000.0, len(u), axes.actuators, ("Sy1",), "noise", 1.0)
         return excited_space(Campaign("avis", (Record(h, u, np.zeros((len(u), 1))),)), (1.0, 100.0))
+
     found = space(rng.normal(size=(3000, 6)) @ axes.allocation.T)
     assert not found.full and np.allclose(found.unplayed @ axes.allocation, 0, atol=1e-6)
     assert len(found.unplayed) == 2 and "excite 6 of 8" in found.sentence
@@ -166,12 +169,15 @@ def test_combinations_of_drives_that_no_record_plays_are_told():
     assert space(drives).full and not space(drives).sentence
     drives[:, 2] = 0
     assert space(drives).full
-    assert "no record drives Ax2: its response is not measured, and the rig file's values for it are" in space(
-        drives).sentence
+    assert (
+        "no record drives Ax2: its response is not measured, and the rig file's values for it are"
+        in space(drives).sentence
+    )
     drives[:, 3] = 0
     assert "Ax2, Az2: their response is not measured, and the rig file's values for them are" in space(drives).sentence
     drives[:, 2], drives[:, 3] = drives[:, 0], 2 * drives[:, 1]
     assert "excite 6 of 8" in space(drives).sentence
     # Either way round, and of any size.
-    assert re.search(r"not excited: (Ay1 - Ax2|-Ay1 \+ Ax2); (-?2 Az1 [-+] Az2|-?Az1 [-+] 0\.5 Az2)\. ",
-                     space(drives).sentence)
+    assert re.search(
+        r"not excited: (Ay1 - Ax2|-Ay1 \+ Ax2); (-?2 Az1 [-+] Az2|-?Az1 [-+] 0\.5 Az2)\. ", space(drives).sentence
+    )

@@ -34,13 +34,14 @@ def responses(model, noise=0.01, seed=0, lines=200):
     rng = np.random.default_rng(seed)
     w = 2 * np.pi * np.geomspace(0.7, 60, lines)
     U = np.zeros((lines, len(model.inputs), len(model.actuators)), complex)
-    U[:, :len(model.actuators)] = np.eye(len(model.actuators))
+    U[:, : len(model.actuators)] = np.eye(len(model.actuators))
     Y = model.driven(w, U, False).Y
     size = noise * np.sqrt(np.mean(np.abs(Y) ** 2, axis=(1, 2)))
     e = rng.normal(size=Y.shape) + 1j * rng.normal(size=Y.shape)
     n_y = Y.shape[1]
     return SpectralBlock("frf", w, U, Y + size[:, None, None] * e / np.sqrt(2)).with_noise(
-        size[:, None, None] ** 2 * np.eye(n_y))
+        size[:, None, None] ** 2 * np.eye(n_y)
+    )
 
 
 def off(model, seed, spread=0.1):
@@ -70,6 +71,7 @@ def test_the_optimum_is_that_of_a_general_optimiser(avis):
         e = block.Y - true.at(x * true.values).driven(block.omega, block.U, False).Y
         white = e / np.sqrt(block.noise[:, 0, 0, 0].real)[:, None, None] * np.sqrt(2)
         return np.concatenate([white.real.ravel(), white.imag.ravel()])
+
     other = least_squares(residual, np.full(len(names), 1.05), x_scale="jac")
     assert found.chi2 == pytest.approx(2 * other.cost, rel=1e-9)
     assert np.allclose(found.values, other.x * true.values, rtol=1e-6)
@@ -102,6 +104,7 @@ def test_estimated_weights_cost_what_the_deviations_say(avis):
 
     def circular(*shape):
         return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+
     lines, dof = 30, 16
     mix, w = 1e-3 * circular(6, 6), 2 * np.pi * np.geomspace(0.8, 20, lines)
     U = np.zeros((lines, len(true.inputs), 2), complex)
@@ -167,10 +170,13 @@ def test_a_moment_of_inertia_stops_at_the_sum_of_the_others(avis):
     room = value["J1"] + value["J2"] - value["J3"]
 
     def residual(x):
-        e = block.Y - true.at(np.array([x[0], x[1], x[2], x[1] + x[2] - room, x[3]])).driven(
-            block.omega, block.U, False).Y
+        e = (
+            block.Y
+            - true.at(np.array([x[0], x[1], x[2], x[1] + x[2] - room, x[3]])).driven(block.omega, block.U, False).Y
+        )
         white = e / np.sqrt(block.noise[:, 0, 0, 0].real)[:, None, None] * np.sqrt(2)
         return np.concatenate([white.real.ravel(), white.imag.ravel()])
+
     other = least_squares(residual, found.values[[0, 1, 2, 4]] * 1.02, x_scale="jac", xtol=1e-14, ftol=1e-14)
     assert found.chi2 == pytest.approx(2 * other.cost, rel=1e-5)
     assert np.allclose(found.values[[0, 1, 2, 4]], other.x, rtol=1e-4)
@@ -206,11 +212,12 @@ def test_eight_drives_played_along_six_axes_are_fitted_like_any(avis, monkeypatc
     records = []
     for k in range(3):
         u = multisine(rng, 1.0, 8000, 1, (2.0, 25.0), 6) @ axes.allocation.T
-        u *= 0.3 / np.sqrt(np.mean(u ** 2))
+        u *= 0.3 / np.sqrt(np.mean(u**2))
         records.append(record(true.rig, u, floor_velocity(rng, len(u), 1e-6), rng, name=f"{k:02d}"))
     monkeypatch.setattr(campaign_fit, "SETTINGS", campaign_fit.CampaignFitSettings(most_lines=300))
-    found = campaign_fit.fit_campaign(Campaign("avis", tuple(records)), ResponseModel.of(avis, BODY), (2.0, 25.0),
-                                      reweights=1)
+    found = campaign_fit.fit_campaign(
+        Campaign("avis", tuple(records)), ResponseModel.of(avis, BODY), (2.0, 25.0), reweights=1
+    )
     assert found.measured and any("of 552 spectral lines are fitted" in note for note in found.notes)
     assert 0.6 < found.first.chi2_per_dof < 1.4
     assert np.allclose(found.fit.values, true.values, rtol=1e-3)
@@ -233,7 +240,7 @@ def test_records_of_a_rig_with_floor_motion(avis):
     sigma, V = found.information.directions
     z = (V.T @ ((found.values - true.values) / found.information.scale) / sigma)[:20]
     assert found.information.rank == 20
-    assert np.mean(z ** 2) < 2.2 and np.max(np.abs(z)) < 4.5
+    assert np.mean(z**2) < 2.2 and np.max(np.abs(z)) < 4.5
     known = found.information.known
     assert np.all(np.abs(found.values - true.values)[known] < 1e-3 * true.values[known])
 
@@ -279,16 +286,23 @@ def test_a_measured_response_weighs_like_its_experiments(avis):
     direct = fit(model, [SpectralBlock("records", w, U, Y).with_noise(np.broadcast_to(C, (15, 6, 6)))])
     gram = W @ np.conj(W.swapaxes(1, 2))
     G = Y @ np.conj(W.swapaxes(1, 2)) @ np.linalg.inv(gram)
-    measured = FrequencyResponse(w / (2 * np.pi), G, np.broadcast_to(C, (15, 6, 6)), gram, model.actuators,
-                                 model.sensors.names)
+    measured = FrequencyResponse(
+        w / (2 * np.pi), G, np.broadcast_to(C, (15, 6, 6)), gram, model.actuators, model.sensors.names
+    )
     through = fit(model, [response_block(measured, model)])
     assert np.allclose(through.values, direct.values, rtol=1e-9)
     assert np.allclose(through.information.matrix, direct.information.matrix, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    ({"priors": {"weight": (1.0, 1.0)}}, "free parameter"), ({"priors": {"mass": (1.0, 0.0)}}, "standard deviation"),
-    ({"starts": 0}, "start"), ({"blocks": []}, "record")])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"priors": {"weight": (1.0, 1.0)}}, "free parameter"),
+        ({"priors": {"mass": (1.0, 0.0)}}, "standard deviation"),
+        ({"starts": 0}, "start"),
+        ({"blocks": []}, "record"),
+    ],
+)
 def test_wrong_calls_are_answered(avis, change, said):
     model = ResponseModel.of(avis, ["mass"])
     arguments = {"model": model, "blocks": [responses(model, lines=5)]} | change
@@ -323,8 +337,9 @@ def test_span_of_columns_however_close(apart, rng):
 def test_many_are_whitened_as_one(m, each, rng):
     """One line and experiment after the other, more lines than fit in one go, none left over or twice."""
     n, p = 2 * SETTINGS.at_once + 5, 4
-    L, dY = (rng.normal(size=shape) + 1j * rng.normal(size=shape) for shape in
-             ((n, m if each else 1, 6, 6), (p, n, 6, m)))
+    L, dY = (
+        rng.normal(size=shape) + 1j * rng.normal(size=shape) for shape in ((n, m if each else 1, 6, 6), (p, n, 6, m))
+    )
     white = np.zeros_like(dY)
     for k in range(n):
         for i in range(m):

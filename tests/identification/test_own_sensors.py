@@ -14,15 +14,29 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
 RIGS = Path(__file__).parents[2] / "designs" / "rigs"
 OMEGA = 2 * np.pi * np.array([0.7, 2.0, 10.0, 50.0])
-QUIET = {"duration_s": 2.0, "settle_s": 0.0, "amplifier_corner_Hz": 300.0, "ambient": {"velocity_rms_m_per_s": 0.0},
-         "sensors": {"noise": False, "quantiser": False}, "truth": {"nonlinear": False}}
+QUIET = {
+    "duration_s": 2.0,
+    "settle_s": 0.0,
+    "amplifier_corner_Hz": 300.0,
+    "ambient": {"velocity_rms_m_per_s": 0.0},
+    "sensors": {"noise": False, "quantiser": False},
+    "truth": {"nonlinear": False},
+}
 
 
 def model_of(name, *parameters):
     rig = load_rig(RIGS / f"{name}.toml")
     first, last = rig.sensors()[0].name, rig.sensors()[-1].name
-    free = ("mass", "com_x", "isolator1.k_z", "isolator2.c_x", f"actuator.{rig.all_drives[0].name}",
-            f"sensor.{first}", f"sensor.{last}", *parameters)
+    free = (
+        "mass",
+        "com_x",
+        "isolator1.k_z",
+        "isolator2.c_x",
+        f"actuator.{rig.all_drives[0].name}",
+        f"sensor.{first}",
+        f"sensor.{last}",
+        *parameters,
+    )
     return ResponseModel.of(rig, free, amplifier_corner_Hz=300.0)
 
 
@@ -45,7 +59,7 @@ def test_what_is_predicted_is_what_the_simulator_reads(name, record):
     campaign = simulate_campaign(model.rig, CampaignPlan.model_validate(QUIET | {"record": [record]}), 3)
     one = campaign.records[0]
     y = Predictor(model).read(one.u, one.floor)
-    assert np.sqrt(np.mean((y - one.y) ** 2, axis=0)).max() < 1e-9 * np.sqrt(np.mean(one.y ** 2))
+    assert np.sqrt(np.mean((y - one.y) ** 2, axis=0)).max() < 1e-9 * np.sqrt(np.mean(one.y**2))
 
 
 @pytest.mark.parametrize("name", ["granite", "twelve_sensors"])

@@ -14,8 +14,21 @@ from avis_ctrl.identification.spectra import record_block, transient_columns
 from avis_ctrl.rigs import load_rig
 
 STIFFNESS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
-ALL = ["mass", "J1", "J2", "J3", "J12", "com_x", "com_z", "isolator1.p_x", "isolator3.p_z", *STIFFNESS, "actuator.Az2",
-       "sensor.Sz1", "loop_delay_s"]
+ALL = [
+    "mass",
+    "J1",
+    "J2",
+    "J3",
+    "J12",
+    "com_x",
+    "com_z",
+    "isolator1.p_x",
+    "isolator3.p_z",
+    *STIFFNESS,
+    "actuator.Az2",
+    "sensor.Sz1",
+    "loop_delay_s",
+]
 HALCYONICS = ["mass", "Ixx", "L6", "L3", "k_s1", "k_a", "k_t", "d1", "d4", "e3", "load.L8", "load.mass", "load.Ixy"]
 
 
@@ -35,9 +48,13 @@ def test_against_the_exact_discretisation(avis):
     assert np.all(error[f <= 20] < 1e-7) and np.all(error < 1e-5)
 
 
-@pytest.mark.parametrize(("words", "expected"), [
-    ("mass Ixx actuator.Az2 sensor.Sz1 isolator1.k_x isolator4.c_z k_s1 d1 e3", True),
-    ("Ixy J12 com_x isolator1.p_x L6 dx e load.L8 spring@isolator1.k_3 loop_delay_s", False)])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("mass Ixx actuator.Az2 sensor.Sz1 isolator1.k_x isolator4.c_z k_s1 d1 e3", True),
+        ("Ixy J12 com_x isolator1.p_x L6 dx e load.L8 spring@isolator1.k_3 loop_delay_s", False),
+    ],
+)
 def test_what_must_be_positive(words, expected):
     """Masses, moments of inertia, stiffness, damping and gains; no product of inertia, no place, no effect's own."""
     assert {name: positive(name) for name in words.split()} == dict.fromkeys(words.split(), expected)
@@ -104,7 +121,7 @@ def test_a_record_is_response_and_transient(avis, order, corner):
     both = np.vstack([columns.real, columns.imag])
     e = np.concatenate([plain.ravel().real, plain.ravel().imag])
     left = e - both @ np.linalg.lstsq(both, e, rcond=1e-12)[0]
-    assert np.sqrt(np.mean(e ** 2)) > 0.1 and np.max(np.abs(left)) < 2e-5
+    assert np.sqrt(np.mean(e**2)) > 0.1 and np.max(np.abs(left)) < 2e-5
 
 
 def test_results_on_lines_are_kept_while_their_model_lives(avis):
@@ -114,6 +131,7 @@ def test_results_on_lines_are_kept_while_their_model_lives(avis):
     def size(model, omega):
         calls.append(model.names)
         return np.empty((len(omega), 1000))
+
     omega, model, other = np.ones(10), ResponseModel.of(avis, ["mass"]), ResponseModel.of(avis, ["J1"])
     kept = weakref.ref(size(model, omega))
     assert size(model, omega) is kept() and size(other, omega) is size(other, omega)
@@ -133,8 +151,9 @@ def test_ideal_sensors_and_static_floor(avis):
     assert np.allclose(displacement[:, 8:] * 1j * w, R[:, :3], atol=1e-5)
 
 
-@pytest.mark.parametrize("change", [{"names": ["weight"]}, {"sensors": ["Sz9"]}, {"actuators": ["Aq1"]},
-                                    {"unit": "furlong"}])
+@pytest.mark.parametrize(
+    "change", [{"names": ["weight"]}, {"sensors": ["Sz9"]}, {"actuators": ["Aq1"]}, {"unit": "furlong"}]
+)
 def test_wrong_names_are_answered(avis, change):
     with pytest.raises(InputError) as error:
         ResponseModel.of(avis, **({"names": ["mass"]} | change))

@@ -49,8 +49,11 @@ def start_of(name):
 
 def test_a_start_is_off_by_20_to_30_per_cent_up_or_down():
     names = parameters_of(UNLOADED_TESTS)
-    off = np.array([values_of(perturbed_start(BARE, UNLOADED_TESTS, seed), names) for seed in range(20)]) / values_of(
-        BARE, names) - 1
+    off = (
+        np.array([values_of(perturbed_start(BARE, UNLOADED_TESTS, seed), names) for seed in range(20)])
+        / values_of(BARE, names)
+        - 1
+    )
     assert np.all((np.abs(off) > 0.2 - 1e-12) & (np.abs(off) < 0.3 + 1e-12))
     assert stats.binomtest(int(np.sum(off > 0)), off.size).pvalue > 1e-4
 
@@ -80,6 +83,7 @@ def independent_transfer(rig, test, omega):
 
 # What is compared
 
+
 @pytest.mark.parametrize("name", CASES)
 def test_transfers_against_the_state_space_by_positions(name):
     rig, tests = CASES[name]
@@ -102,14 +106,21 @@ def test_transfers_are_eq_32_times_the_actuators_constant(name):
 def test_a_transfer_is_the_steady_response_to_a_sine():
     """Time domain: the loaded table driven as in test 4 at 8 Hz, integrated until the transient is gone."""
     from scipy.integrate import solve_ivp
+
     test, w = LOADED_TESTS[3], 2 * np.pi * 8.0
     M, C, K = LOADED.mass_matrix(), LOADED.damping_matrix(), LOADED.stiffness_matrix()
     force = np.linalg.solve(M, LOADED.actuator_matrix() @ test.pattern)
     A = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
     B = np.concatenate([np.zeros(6), force])
     end = 8.0  # the slowest mode decays by e^-3 or more per second
-    run = solve_ivp(lambda t, q: A @ q + B * np.cos(w * t), (0, end), np.zeros(12), rtol=1e-10, atol=1e-16,
-                    t_eval=np.linspace(end - 4 / 8.0, end, 400, endpoint=False))
+    run = solve_ivp(
+        lambda t, q: A @ q + B * np.cos(w * t),
+        (0, end),
+        np.zeros(12),
+        rtol=1e-10,
+        atol=1e-16,
+        t_eval=np.linspace(end - 4 / 8.0, end, 400, endpoint=False),
+    )
     z_3 = run.y[2] + run.y[3] * LOADED.M3_arm
     amplitude = 2 * np.mean(z_3 * np.exp(-1j * w * run.t))
     expected = voltage_transfer(LOADED, LOADED.points()["M3"].position, "z", test.pattern, np.array([w]))[0]
@@ -119,8 +130,10 @@ def test_a_transfer_is_the_steady_response_to_a_sine():
 def test_a_signed_drive_is_the_difference_of_two_runs():
     measured = simulate_tests(LOADED, LOADED_TESTS, omega=BAND)
     place = LOADED.points()["M3"].position
-    one, two = (voltage_transfer(LOADED, place, "z", np.isin(np.arange(1, 9), driven).astype(float), BAND)
-                for driven in ((1, 2), (3, 4)))
+    one, two = (
+        voltage_transfer(LOADED, place, "z", np.isin(np.arange(1, 9), driven).astype(float), BAND)
+        for driven in ((1, 2), (3, 4))
+    )
     assert np.allclose(measured.transfers[4], one - two, rtol=1e-12)
 
 
@@ -132,8 +145,11 @@ def test_rows_are_those_of_the_tables():
     plain = source.read_text(encoding="utf-8")
     for subscript, digit in zip("₁₂₃₄₅₆₇₈", "12345678", strict=True):
         plain = plain.replace(subscript, digit)
-    rows = [[cell.strip().replace("$", "").replace("_", "").replace(" ", "") for cell in line.split("|")[1:4]]
-            for line in plain.splitlines() if line.startswith("|") and line.split("|")[1].strip().isdigit()]
+    rows = [
+        [cell.strip().replace("$", "").replace("_", "").replace(" ", "") for cell in line.split("|")[1:4]]
+        for line in plain.splitlines()
+        if line.startswith("|") and line.split("|")[1].strip().isdigit()
+    ]
     printed = [(int(number), drive, seen) for number, drive, seen in rows]
     ours = [(t.number, t.actuators, t.displacement.replace("_", "")) for t in (*UNLOADED_TESTS, *LOADED_TESTS)]
     assert printed == ours
@@ -163,6 +179,7 @@ def test_values_return_as_they_were_set(factors):
 
 
 # Exact data
+
 
 @pytest.mark.parametrize("name", ["unloaded", pytest.param("loaded", marks=pytest.mark.slow)])
 def test_exact_data_give_the_printed_values(name):
@@ -236,6 +253,7 @@ def test_the_places_of_the_measured_points_matter():
 
 # Noise
 
+
 def test_h1_of_the_simulated_analyser_has_the_variance_it_states():
     """E|error|^2 = S_nn / (S_vv (n - 1)) for a complex Gaussian voltage: the mean of 1/chi^2."""
     noise, test = Analyser(averages=20, resolution_Hz=2.0), UNLOADED_TESTS[0]
@@ -244,7 +262,7 @@ def test_h1_of_the_simulated_analyser_has_the_variance_it_states():
     expected = density / noise.drive_V_rtHz**2 / (noise.averages - 1)
     rng = np.random.default_rng(5)
     runs = [simulate_tests(BARE, [test], noise, rng) for _ in range(800)]
-    actual = np.mean([np.abs(run.transfers[1] - exact)**2 for run in runs], axis=0) / expected
+    actual = np.mean([np.abs(run.transfers[1] - exact) ** 2 for run in runs], axis=0) / expected
     stated = np.mean([run.variance[1] for run in runs], axis=0) / expected
     # |error|^2 of one line scatters by about its mean: 800 runs know it to 4 %, and 20 lines together to 1 %.
     assert actual.mean() == pytest.approx(1, abs=0.04) and np.all(np.abs(actual - 1) < 0.2)
@@ -255,7 +273,7 @@ def test_floor_motion_alone_reaches_the_plate_rigidly_far_below_resonance():
     noise = Analyser(accelerometer_m_s2_rtHz=0.0)
     omega = 2 * np.pi * np.array([0.02, 0.05])
     density = disturbance_density(BARE, np.eye(6)[2], omega, noise)
-    assert density == pytest.approx((noise.floor_m_s_rtHz / omega)**2, rel=1e-3)
+    assert density == pytest.approx((noise.floor_m_s_rtHz / omega) ** 2, rel=1e-3)
 
 
 def rest_point(start, tests, measured, rounds=3):
@@ -333,13 +351,15 @@ def test_without_variances_the_residual_tells_the_noise():
 
 def test_a_single_test_looks_better_than_the_scheme():
     """`conditional` takes the parameters of the other tests for known."""
-    spread = sequential_fit(LOADED, LOADED_TESTS, simulate_tests(LOADED, LOADED_TESTS, Analyser(), 1),
-                            max_iterations=1).spread
+    spread = sequential_fit(
+        LOADED, LOADED_TESTS, simulate_tests(LOADED, LOADED_TESTS, Analyser(), 1), max_iterations=1
+    ).spread
     ratio = np.sqrt(np.diag(spread.sequential)) / spread.conditional
     assert ratio[0] > 5  # L7: test 1 alone would claim a tenth of its error
 
 
 # Campaigns, tables, figures
+
 
 def response_of(rig, outputs, unit="m", noise=1e-14):
     """FRF matrix of 8 inputs from the closed form, with a known noise covariance and correlated inputs."""
@@ -350,11 +370,12 @@ def response_of(rig, outputs, unit="m", noise=1e-14):
         place = rig.points()[f"M{name[2]}"].position
         for k in range(8):
             value[:, i, k] = voltage_transfer(rig, place, name[0], np.eye(8)[k], omega)
-    value *= ((1j * omega)**{"m": 0, "m/s": 1, "m/s^2": 2}[unit])[:, None, None]
+    value *= ((1j * omega) ** {"m": 0, "m/s": 1, "m/s^2": 2}[unit])[:, None, None]
     gram = np.tile(100 * (np.eye(8) + 0.1), (omega.size, 1, 1)).astype(complex)
     covariance = np.tile(noise * np.eye(len(outputs)), (omega.size, 1, 1)).astype(complex)
-    return FrequencyResponse(frequency, value, covariance, gram, tuple(f"A{k}" for k in range(1, 9)), tuple(outputs),
-                             output_unit=unit)
+    return FrequencyResponse(
+        frequency, value, covariance, gram, tuple(f"A{k}" for k in range(1, 9)), tuple(outputs), output_unit=unit
+    )
 
 
 @pytest.mark.parametrize("unit", ["m", "m/s", "m/s^2"])
@@ -379,7 +400,7 @@ def test_the_variance_of_a_combination_counts_the_correlation_of_one_experiment(
     claimed = transfers_from_response(response, LOADED_TESTS[3:4]).variance[4][0]
     E = (rng.standard_normal((4000, 60)) + 1j * rng.standard_normal((4000, 60))) * np.sqrt(1e-14 / 2)
     errors = E @ U.conj().T @ np.linalg.inv(S) @ LOADED_TESTS[3].pattern
-    assert claimed == pytest.approx(np.mean(np.abs(errors)**2), rel=0.08)  # 4000 draws: 1.6 % standard error
+    assert claimed == pytest.approx(np.mean(np.abs(errors) ** 2), rel=0.08)  # 4000 draws: 1.6 % standard error
 
 
 def test_a_delay_is_taken_out():
@@ -410,41 +431,51 @@ def test_figure_13_divides_by_the_first_actuators_constant():
 
 # Refusals
 
+
 def exact():
     return simulate_tests(BARE, UNLOADED_TESTS, omega=BAND)
 
 
-@pytest.mark.parametrize("call, said", [
-    (lambda: sequential_fit(BARE, LOADED_TESTS, exact()), "carries none; start from loaded_start"),
-    (lambda: sequential_fit(BARE, (*UNLOADED_TESTS, replace(UNLOADED_TESTS[0], number=13, parameters=("k_a",))),
-                            exact()), r"expected a measured transfer for each test"),
-    (lambda: sequential_fit(BARE, (*UNLOADED_TESTS, UNLOADED_TESTS[0]), exact()), "each parameter in one test"),
-    (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), band_Hz=(30.0, 40.0)), "from 2.5 to 20 Hz"),
-    (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), band_Hz=(5.0, 5.0)), "expected more lines"),
-    (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), weighting="variance"), "carry no variance"),
-    (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), tolerance=0.0), "tolerance = 0.0"),
-    (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), max_iterations=0), "max_iterations = 0"),
-    (lambda: joint_fit(BARE, UNLOADED_TESTS, exact()), "carry no variance"),
-    (lambda: MeasuredTests(BAND, {1: BAND[:-1]}), "transfers of test 1"),
-    (lambda: MeasuredTests(BAND, {1: BAND * np.nan}), "transfers of test 1"),
-    (lambda: MeasuredTests(BAND, {1: BAND}, {1: 0 * BAND}), "positive variances"),
-    (lambda: MeasuredTests(BAND, {1: BAND}, {}), "a variance for each test"),
-    (lambda: MeasuredTests(BAND[::-1], {1: BAND}), "increasing frequencies"),
-    (lambda: Analyser(averages=1), "averages = 1"),
-    (lambda: Analyser(drive_V_rtHz=0.0), "drive_V_rtHz = 0.0"),
-    (lambda: Analyser(high_Hz=0.5), "high_Hz = 0.5"),
-    (lambda: TestCase(1, (1, 9), (), "M1", "z", ("e1",)), "out of 1..8"),
-    (lambda: TestCase(1, (1,), (1,), "M1", "z", ("e1",)), "out of 1..8"),
-    (lambda: TestCase(1, (1,), (), "M1", "up", ("e1",)), "direction = 'up'"),
-    (lambda: TestCase(1, (1,), (), "M1", "z", ()), "at least one parameter"),
-    (lambda: simulate_tests(BARE, [TestCase(1, (1,), (), "M9", "z", ("e1",))]), "point = 'M9'"),
-    (lambda: sequential_fit(BARE, [TestCase(1, (1,), (), "M1", "z", ("k_q",))], exact()), "k_q"),
-    (lambda: sequential_fit(BARE, [TestCase(5, (1,), (), "M1", "z", ("M3_arm",))], exact()), "points are fixed"),
-    (lambda: loaded_start(BARE, 0.0), "load_mass = 0.0"),
-    (lambda: transfers_from_response(response_of(LOADED, ("z_3",)), LOADED_TESTS), r"output for z_2 of test 1"),
-    (lambda: transfers_from_response(replace(response_of(LOADED, ("z_3",)), output_unit="V"), LOADED_TESTS),
-     "outputs in one of m, m/s"),
-])
+@pytest.mark.parametrize(
+    "call, said",
+    [
+        (lambda: sequential_fit(BARE, LOADED_TESTS, exact()), "carries none; start from loaded_start"),
+        (
+            lambda: sequential_fit(
+                BARE, (*UNLOADED_TESTS, replace(UNLOADED_TESTS[0], number=13, parameters=("k_a",))), exact()
+            ),
+            r"expected a measured transfer for each test",
+        ),
+        (lambda: sequential_fit(BARE, (*UNLOADED_TESTS, UNLOADED_TESTS[0]), exact()), "each parameter in one test"),
+        (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), band_Hz=(30.0, 40.0)), "from 2.5 to 20 Hz"),
+        (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), band_Hz=(5.0, 5.0)), "expected more lines"),
+        (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), weighting="variance"), "carry no variance"),
+        (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), tolerance=0.0), "tolerance = 0.0"),
+        (lambda: sequential_fit(BARE, UNLOADED_TESTS, exact(), max_iterations=0), "max_iterations = 0"),
+        (lambda: joint_fit(BARE, UNLOADED_TESTS, exact()), "carry no variance"),
+        (lambda: MeasuredTests(BAND, {1: BAND[:-1]}), "transfers of test 1"),
+        (lambda: MeasuredTests(BAND, {1: BAND * np.nan}), "transfers of test 1"),
+        (lambda: MeasuredTests(BAND, {1: BAND}, {1: 0 * BAND}), "positive variances"),
+        (lambda: MeasuredTests(BAND, {1: BAND}, {}), "a variance for each test"),
+        (lambda: MeasuredTests(BAND[::-1], {1: BAND}), "increasing frequencies"),
+        (lambda: Analyser(averages=1), "averages = 1"),
+        (lambda: Analyser(drive_V_rtHz=0.0), "drive_V_rtHz = 0.0"),
+        (lambda: Analyser(high_Hz=0.5), "high_Hz = 0.5"),
+        (lambda: TestCase(1, (1, 9), (), "M1", "z", ("e1",)), "out of 1..8"),
+        (lambda: TestCase(1, (1,), (1,), "M1", "z", ("e1",)), "out of 1..8"),
+        (lambda: TestCase(1, (1,), (), "M1", "up", ("e1",)), "direction = 'up'"),
+        (lambda: TestCase(1, (1,), (), "M1", "z", ()), "at least one parameter"),
+        (lambda: simulate_tests(BARE, [TestCase(1, (1,), (), "M9", "z", ("e1",))]), "point = 'M9'"),
+        (lambda: sequential_fit(BARE, [TestCase(1, (1,), (), "M1", "z", ("k_q",))], exact()), "k_q"),
+        (lambda: sequential_fit(BARE, [TestCase(5, (1,), (), "M1", "z", ("M3_arm",))], exact()), "points are fixed"),
+        (lambda: loaded_start(BARE, 0.0), "load_mass = 0.0"),
+        (lambda: transfers_from_response(response_of(LOADED, ("z_3",)), LOADED_TESTS), r"output for z_2 of test 1"),
+        (
+            lambda: transfers_from_response(replace(response_of(LOADED, ("z_3",)), output_unit="V"), LOADED_TESTS),
+            "outputs in one of m, m/s",
+        ),
+    ],
+)
 def test_wrong_input_is_refused_in_words(call, said):
     with pytest.raises(InputError, match=said):
         call()

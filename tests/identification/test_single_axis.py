@@ -20,6 +20,7 @@ from avis_ctrl.identification.single_axis.sine import fit_sine
 
 # --- standard deviations of regressions with coloured residuals
 
+
 def coloured(rng: np.random.Generator, n: int, pole: float) -> np.ndarray:
     return signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(n + 200))[200:]
 
@@ -39,7 +40,7 @@ def test_stated_deviations_are_those_of_repeated_experiments(rng):
         fit = regression("", {"a": "", "b": ""}, X, X @ (2.0, 1.0) + coloured(rng, 2000, 0.9), np.arange(2000.0))
         found.append(fit.values)
         stated.append(np.diag(fit.covariance))
-        white.append(fit.information.standard_deviation ** 2)
+        white.append(fit.information.standard_deviation**2)
     ratio = np.std(found, axis=0) / np.sqrt(np.mean(stated, axis=0))
     # The Bartlett kernel states somewhat too little, as it must: it cuts the correlation at finite lag.
     assert np.all((ratio > 0.9) & (ratio < 1.2)), ratio
@@ -73,12 +74,13 @@ def test_an_offset_beside_two_coulomb_frictions_is_not_determined(rng):
 
 # --- drive
 
+
 def simulated_drive(rng: np.random.Generator, noise: float = 0.0) -> tuple[np.ndarray, ...]:
     t = np.arange(20_000) / 1000.0
     w = 2 * np.pi * np.array([0.3, 0.7, 1.1])[:, None]
     size = np.array([0.1, 0.03, 0.01])[:, None]
     q, v = np.sum(size * np.sin(w * t), 0), np.sum(size * w * np.cos(w * t), 0)
-    a = -np.sum(size * w ** 2 * np.sin(w * t), 0)
+    a = -np.sum(size * w**2 * np.sin(w * t), 0)
     force = 95.0 * a + 200.0 * v + 20.0 * np.sign(v) - 3.0
     return t, q + 1e-6 * noise * rng.standard_normal(len(t)), force + noise * rng.standard_normal(len(t)), q
 
@@ -99,7 +101,7 @@ def test_noise_of_the_position_lowers_the_mass_unless_the_reference_is_the_instr
     t, q, force, reference = simulated_drive(rng, noise=1.0)
     plain, instrumental = fit_drive(t, q, force), fit_drive(t, q, force, reference=reference)
     w, H = signal.freqz_sos(signal.butter(4, 60.0 / 500, output="sos"), 4096)
-    noise = 1e-12 * np.mean(np.abs(H) ** 4 * (2 - 2 * np.cos(w)) ** 2) * 1000.0 ** 4
+    noise = 1e-12 * np.mean(np.abs(H) ** 4 * (2 - 2 * np.cos(w)) ** 2) * 1000.0**4
     a = np.gradient(np.gradient(reference, 1e-3), 1e-3)[50:-50]
     shrunk = 95.0 * noise / (noise + a.var())
     assert shrunk > 4 * plain.of("M")[1]
@@ -107,13 +109,17 @@ def test_noise_of_the_position_lowers_the_mass_unless_the_reference_is_the_instr
     assert abs(instrumental.of("M")[0] - 95.0) < 3 * instrumental.of("M")[1] < 0.1
 
 
-@pytest.mark.parametrize(("change", "expected"), [
-    ({"cutoff_Hz": 600.0}, "cutoff_Hz = 600.0: expected a cutoff between 0 and 500 Hz"),
-    ({"cutoff_Hz": 0.0}, "cutoff_Hz = 0.0: expected a cutoff between 0 and 500 Hz"),
-    ({"coulomb": "both"}, "coulomb = 'both': expected one of symmetric, asymmetric, none"),
-    ({"force": np.zeros(7)}, "expected 20000 samples of each channel"),
-    ({"time": np.zeros(20_000)}, "expected at least 32 uniform, increasing times"),
-    ({"position": np.full(20_000, np.nan)}, "expected finite numbers")])
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"cutoff_Hz": 600.0}, "cutoff_Hz = 600.0: expected a cutoff between 0 and 500 Hz"),
+        ({"cutoff_Hz": 0.0}, "cutoff_Hz = 0.0: expected a cutoff between 0 and 500 Hz"),
+        ({"coulomb": "both"}, "coulomb = 'both': expected one of symmetric, asymmetric, none"),
+        ({"force": np.zeros(7)}, "expected 20000 samples of each channel"),
+        ({"time": np.zeros(20_000)}, "expected at least 32 uniform, increasing times"),
+        ({"position": np.full(20_000, np.nan)}, "expected finite numbers"),
+    ],
+)
 def test_wrong_input_of_a_drive_is_named(rng, change, expected):
     t, q, force, _ = simulated_drive(rng)
     with pytest.raises(InputError, match=expected.replace("(", r"\(")):
@@ -127,6 +133,7 @@ def test_a_drive_that_never_moved_is_refused(rng):
 
 
 # --- sine records and the seismometer
+
 
 def test_a_sine_is_found_with_the_scatter_that_it_states(rng):
     t, found, stated = np.arange(3000) * 0.01, [], []
@@ -159,17 +166,29 @@ def test_a_record_without_a_sine_is_refused():
         fit_sine("0", np.arange(500.0), {"u": np.ones(500)}, "u")
 
 
-def made_responses(rng: np.random.Generator, noise: float, kinds: tuple[str, ...]
-                   ) -> tuple[Responses, tuple, np.ndarray]:
+def made_responses(
+    rng: np.random.Generator, noise: float, kinds: tuple[str, ...]
+) -> tuple[Responses, tuple, np.ndarray]:
     f = np.geomspace(0.1, 10.0, 17)
-    names = {2: ("corner_Hz", "damping", "force_gain", "sensitivity", "drive_delay_s", "delay_s"),
-             1: ("corner_Hz", "damping", "sensitivity", "delay_s")}[len(kinds)]
+    names = {
+        2: ("corner_Hz", "damping", "force_gain", "sensitivity", "drive_delay_s", "delay_s"),
+        1: ("corner_Hz", "damping", "sensitivity", "delay_s"),
+    }[len(kinds)]
     true = np.array({2: [0.487, 0.775, 0.025, 175.0, 3e-4, 2.4e-3], 1: [0.487, 0.775, 175.0, 1e-3]}[len(kinds)])
     value = {kind: H for kind, H in response(f, names, true).items() if kind in kinds}
-    e = {kind: noise * np.abs(H) * (rng.standard_normal(17) + 1j * rng.standard_normal(17)) / np.sqrt(2)
-         for kind, H in value.items()}
-    return (Responses(f, {kind: H + e[kind] for kind, H in value.items()},
-                      {kind: (noise * np.abs(H)) ** 2 for kind, H in value.items()}), names, true)
+    e = {
+        kind: noise * np.abs(H) * (rng.standard_normal(17) + 1j * rng.standard_normal(17)) / np.sqrt(2)
+        for kind, H in value.items()
+    }
+    return (
+        Responses(
+            f,
+            {kind: H + e[kind] for kind, H in value.items()},
+            {kind: (noise * np.abs(H)) ** 2 for kind, H in value.items()},
+        ),
+        names,
+        true,
+    )
 
 
 @pytest.mark.parametrize("kinds", [("coil", "displacement"), ("ground",)])
@@ -201,8 +220,11 @@ def test_delay_pole_and_mode_are_told_apart(rng):
     f = np.geomspace(0.3, 20, 20)
     s, keep = 2j * np.pi * f, f < 12
     noise = 1 + 1e-4 * (rng.standard_normal(20) + 1j * rng.standard_normal(20))
-    shapes = {"delay": np.exp(-s * 3e-3), "pole": 1 / (1 + 3e-3 * s),
-              "mode": 1 / (1 + 2 * 0.1 * s / 200 + (s / 200) ** 2)}
+    shapes = {
+        "delay": np.exp(-s * 3e-3),
+        "pole": 1 / (1 + 3e-3 * s),
+        "mode": 1 / (1 + 2 * 0.1 * s / 200 + (s / 200) ** 2),
+    }
     for truth, D in shapes.items():
         found = compare_lags(f, -5 * D / s * noise, np.abs(5 * D / s) ** 2 * 2e-8, keep)
         assert min(found, key=lambda h: h.held_out_deg).name == truth
@@ -212,11 +234,13 @@ def test_delay_pole_and_mode_are_told_apart(rng):
 
 # --- decay and oscillator
 
+
 @pytest.mark.parametrize("damping", [0.02, 0.7, 1.0, 1.4])
 def test_a_decay_is_recovered_below_at_and_beyond_critical_damping(rng, damping):
     t = np.arange(0, 8, 0.01)
-    system = signal.StateSpace([[0, 1], [-(2 * np.pi * 0.5) ** 2, -2 * damping * 2 * np.pi * 0.5]], [[0], [0]],
-                               np.eye(2), [[0], [0]])
+    system = signal.StateSpace(
+        [[0, 1], [-((2 * np.pi * 0.5) ** 2), -2 * damping * 2 * np.pi * 0.5]], [[0], [0]], np.eye(2), [[0], [0]]
+    )
     x = signal.lsim(system, np.zeros_like(t), t, [1.0, 2.0])[2]  # another solution of the equation
     fit = fit_decay(t, x + 1e-4 * rng.standard_normal(x.shape) + 0.3, 0.6, 0.5, drift=0)
     error = fit.values - [0.5, damping]
@@ -254,7 +278,7 @@ def test_an_oscillator_of_negative_mass_or_stiffness_is_none(rng, m, k):
     n, rate = 4096, 100.0
     s, U = 2j * np.pi * np.fft.rfftfreq(n, 1 / rate), np.fft.rfft(rng.standard_normal(n))
     U[np.abs(s) > 2 * np.pi * 30] = 0
-    u, y = np.fft.irfft(U), np.fft.irfft(U / (m * s ** 2 + 40.0 * s + k))
+    u, y = np.fft.irfft(U), np.fft.irfft(U / (m * s**2 + 40.0 * s + k))
     with pytest.raises(ComputationError, match=re.escape(f"measured: m {m:.3g}, k {k:.3g};")):
         fit_oscillator(u, y, rate, (0.5, 18.0))
 
@@ -266,7 +290,7 @@ def test_deviations_of_an_oscillator_hold_over_repeated_records():
     for seed in range(40):
         rng = np.random.default_rng(seed)
         U = np.where(s.imag < 2 * np.pi * 60, np.fft.rfft(rng.standard_normal(whole)), 0)
-        u, y = np.fft.irfft(U), np.fft.irfft(U / (theta[0] * s ** 2 + theta[1] * s + theta[2]))
+        u, y = np.fft.irfft(U), np.fft.irfft(U / (theta[0] * s**2 + theta[1] * s + theta[2]))
         noise = signal.lfilter([1], [1, -0.8], rng.standard_normal(whole))
         y = y + 0.05 * noise * y.std() / noise.std()
         fit = fit_oscillator(u[5000:9096], y[5000:9096], rate, (1.0, 40.0))
@@ -276,17 +300,22 @@ def test_deviations_of_an_oscillator_hold_over_repeated_records():
 
 # --- the door
 
-@pytest.mark.parametrize(("kind", "columns", "options", "expected"), [
-    ("geophone", {}, {}, "kind = 'geophone': expected one of seismometer, decay, drive, oscillator"),
-    ("drive", {"force": "vir"}, {}, "expected a column for position"),
-    ("drive", {"force": "vir", "position": "qm", "speed": "v"}, {}, "role of drive = 'speed'"),
-    ("drive", {"force": "vir", "position": "qm"}, {"cutoff": 3.0}, "option of drive = 'cutoff'"),
-    ("drive", {"force": "vir", "position": "qm"}, {"cutoff_Hz": "60"}, "cutoff_Hz = '60': expected a number"),
-    ("drive", {"force": "vir", "position": "qm"}, {"offset": 1}, "offset = 1: expected true or false"),
-    ("oscillator", {"u": "u", "y": "y"}, {"band_Hz": (1.0,)}, "band_Hz = .*: expected two numbers"),
-    ("decay", {"y": "y"}, {"drift": True}, "drift = True: expected a whole number"),
-    ("drive", {"force": "vir", "position": "qm"}, {"scale": {"force": 0.0}}, "scale of force = 0.0"),
-    ("seismometer", {"drive": "u"}, {}, "expected a column for coil or displacement or ground")])
+
+@pytest.mark.parametrize(
+    ("kind", "columns", "options", "expected"),
+    [
+        ("geophone", {}, {}, "kind = 'geophone': expected one of seismometer, decay, drive, oscillator"),
+        ("drive", {"force": "vir"}, {}, "expected a column for position"),
+        ("drive", {"force": "vir", "position": "qm", "speed": "v"}, {}, "role of drive = 'speed'"),
+        ("drive", {"force": "vir", "position": "qm"}, {"cutoff": 3.0}, "option of drive = 'cutoff'"),
+        ("drive", {"force": "vir", "position": "qm"}, {"cutoff_Hz": "60"}, "cutoff_Hz = '60': expected a number"),
+        ("drive", {"force": "vir", "position": "qm"}, {"offset": 1}, "offset = 1: expected true or false"),
+        ("oscillator", {"u": "u", "y": "y"}, {"band_Hz": (1.0,)}, "band_Hz = .*: expected two numbers"),
+        ("decay", {"y": "y"}, {"drift": True}, "drift = True: expected a whole number"),
+        ("drive", {"force": "vir", "position": "qm"}, {"scale": {"force": 0.0}}, "scale of force = 0.0"),
+        ("seismometer", {"drive": "u"}, {}, "expected a column for coil or displacement or ground"),
+    ],
+)
 def test_wrong_requests_are_named(tmp_path, kind, columns, options, expected):
     with pytest.raises(InputError, match=expected):
         identify_single_axis(kind, tmp_path / "absent.csv", columns, **options)
@@ -294,10 +323,17 @@ def test_wrong_requests_are_named(tmp_path, kind, columns, options, expected):
 
 def test_from_a_csv_file_to_a_drive(tmp_path, rng):
     t, q, force, _ = simulated_drive(rng, noise=0.1)
-    np.savetxt(tmp_path / "drive.csv", np.column_stack([t, q, force / 35.0])[:8000], delimiter=",", fmt="%.12g",
-               header="t,pos,volts", comments="")
-    fit = identify_single_axis("drive", tmp_path / "drive.csv", {"t": "t", "position": "pos", "force": "volts"},
-                               scale={"force": 35.0})
+    np.savetxt(
+        tmp_path / "drive.csv",
+        np.column_stack([t, q, force / 35.0])[:8000],
+        delimiter=",",
+        fmt="%.12g",
+        header="t,pos,volts",
+        comments="",
+    )
+    fit = identify_single_axis(
+        "drive", tmp_path / "drive.csv", {"t": "t", "position": "pos", "force": "volts"}, scale={"force": 35.0}
+    )
     assert fit.of("M")[0] == pytest.approx(95.0, rel=0.01)
     assert fit.lines()[0].startswith("M = 9")
 

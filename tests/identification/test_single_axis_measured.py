@@ -24,6 +24,7 @@ MICROVOLT = 1e-6
 
 # --- EMPS drive
 
+
 @pytest.fixture(scope="module")
 def emps(data):
     path = data / "emps" / "DATA_EMPS.mat"
@@ -96,6 +97,7 @@ def test_emps_deviations_agree_with_a_block_bootstrap(emps, rng):
 
 # --- SM-3 seismometer
 
+
 @pytest.fixture(scope="module")
 def sm3(data):
     folder = data / "seismometer_sm3"
@@ -103,8 +105,11 @@ def sm3(data):
         pytest.skip(f"measured data absent: {folder}")
     adc = dict(zip(*(line.split(",") for line in (folder / "calcontrol.cal").read_text().split()), strict=True))
     laser = float(adc["ch3cal"]) * MICROVOLT * float(adc["laserres"]) * 1e-3 * float(adc["lcalconst"])  # m a count
-    return folder, {"drive": float(adc["ch1cal"]) * MICROVOLT, "coil": float(adc["ch2cal"]) * MICROVOLT,
-                    "displacement": laser}
+    return folder, {
+        "drive": float(adc["ch1cal"]) * MICROVOLT,
+        "coil": float(adc["ch2cal"]) * MICROVOLT,
+        "displacement": laser,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -155,8 +160,9 @@ def test_sm3_distortion_is_what_the_linear_model_misses(sm3_records):
 
 def test_sm3_corner_falls_with_amplitude_so_that_two_corners_are_right(sm3):
     """Free decay: 0.473 Hz at 2 mm, 0.484 Hz at 0.35 mm, 0.485 extrapolated; sine at 1 to 3 mm gives 0.478."""
-    campaign = read_measurements(sm3[0] / "SM3_SN001_freeperiod.csv", {"y": ["Laser"], "t": ["Seconds"]},
-                                 excitation="rest")
+    campaign = read_measurements(
+        sm3[0] / "SM3_SN001_freeperiod.csv", {"y": ["Laser"], "t": ["Seconds"]}, excitation="rest"
+    )
     record = campaign.records[0].load()
     stretches = np.array_split(np.column_stack([record.time, record.y[:, 0] * sm3[1]["displacement"]]), 8)
     fits = [fit_decay(*one.T, 0.48, 0.013) for one in stretches]
@@ -178,9 +184,15 @@ def test_sm3_damping_differs_between_the_two_directions(sm3):
     the stated value and the first above it at every start.
     """
     path, columns = sm3[0] / "SM3SN001_damping.csv", {"y": "Current", "t": "Seconds"}
-    one, other = ([identify_single_axis("decay", path, columns, corner_Hz=0.487, damping=0.75, drift=0,
-                                        start_s=peak + late, end_s=end) for late in (0.0, 0.15, 0.31)]
-                  for peak, end in ((1.7664, 10.0), (26.1658, 33.8)))
+    one, other = (
+        [
+            identify_single_axis(
+                "decay", path, columns, corner_Hz=0.487, damping=0.75, drift=0, start_s=peak + late, end_s=end
+            )
+            for late in (0.0, 0.15, 0.31)
+        ]
+        for peak, end in ((1.7664, 10.0), (26.1658, 33.8))
+    )
     first, second = (np.array([fit.of("damping")[0] for fit in fits]) for fits in (one, other))
     np.testing.assert_allclose(first, 0.794, atol=0.003)
     np.testing.assert_allclose(second, [0.628, 0.665, 0.700], atol=0.01)
@@ -216,6 +228,7 @@ def test_sm3_laser_is_late_by_a_delay_and_not_by_a_mode(sm3_responses):
 
 # --- Silverbox
 
+
 @pytest.fixture(scope="module")
 def silverbox(data):
     path = data / "silverbox" / "Schroeder80mV.mat"
@@ -226,7 +239,7 @@ def silverbox(data):
     return mat["V1"].ravel()[22_500:118_500], mat["V2"].ravel()[22_500:118_500]
 
 
-SILVERBOX_RATE = 1e7 / 2 ** 14
+SILVERBOX_RATE = 1e7 / 2**14
 
 
 def resonance_Hz(fit):

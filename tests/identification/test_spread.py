@@ -26,14 +26,14 @@ def model():
 
 def exact(model, value, frequency_Hz, level=1e-12, dof=np.inf) -> FrequencyResponse:
     n, n_y, n_u = value.shape
-    noise = np.broadcast_to(level ** 2 * np.eye(n_y, dtype=complex), (n, n_y, n_y))
+    noise = np.broadcast_to(level**2 * np.eye(n_y, dtype=complex), (n, n_y, n_y))
     gram = np.broadcast_to(np.eye(n_u, dtype=complex), (n, n_u, n_u))
     return FrequencyResponse(frequency_Hz, value, noise, gram, model.actuators, model.sensors.names, dof=dof)
 
 
 def noisy(model, frequency_Hz, level, rng, error=None) -> FrequencyResponse:
     """The model's response, an error on its drives, and noise whose size differs by sensor and by drive."""
-    G = model.response(2 * np.pi * frequency_Hz)[:, :, :len(model.actuators)]
+    G = model.response(2 * np.pi * frequency_Hz)[:, :, : len(model.actuators)]
     if error is not None:
         G = G @ error
     n, n_y, n_u = G.shape
@@ -62,8 +62,9 @@ def test_drives_that_are_not_played_apart_leave_the_spread_of_what_they_do_toget
         junk = rng.normal(size=(12, 6, 8)) @ (np.eye(8) - span @ span.T)
         measured = replace(measured, value=measured.value + junk, gram=np.array([span @ span.T] * 12, complex))
     else:
-        measured = replace(measured, value=measured.value[:, :, 1:], gram=measured.gram[:, 1:, 1:],
-                           inputs=measured.inputs[1:])
+        measured = replace(
+            measured, value=measured.value[:, :, 1:], gram=measured.gram[:, 1:, 1:], inputs=measured.inputs[1:]
+        )
     spread = frf_spread(measured, model, KEEP, (0.9,))
     assert np.allclose(spread.measured, np.linalg.norm(L, ord=2), rtol=1e-6) and len(spread.frequency_Hz) == 12
 
@@ -72,8 +73,12 @@ def test_axes_that_no_record_pushes_are_named(model):
     """Vertical drives alone push no x."""
     f, up = np.geomspace(0.5, 60, 4), [1, 3, 5, 7]
     measured = exact(model, model.response(2 * np.pi * f)[:, :, :8], f)
-    measured = replace(measured, value=measured.value[:, :, up], gram=measured.gram[:, up][:, :, up],
-                       inputs=tuple(model.actuators[k] for k in up))
+    measured = replace(
+        measured,
+        value=measured.value[:, :, up],
+        gram=measured.gram[:, up][:, :, up],
+        inputs=tuple(model.actuators[k] for k in up),
+    )
     frf_spread(measured, model, KEEP, (0.9,))
     with pytest.raises(InputError, match=r"'x'\].*excite each of these coordinates"):
         frf_spread(measured, model, ("x", "z"), (0.9,))
@@ -182,7 +187,7 @@ def test_records_leave_what_the_model_does_not_explain(campaign):
 def test_the_true_table_leaves_only_noise(campaign):
     measured, _, table = campaign
     left = unexplained(measured, table).records[0].load()
-    assert np.all(np.std(left.y, axis=0) < 1.2 * np.hypot(1e-3, 20 / 2 ** 14 / np.sqrt(12)))
+    assert np.all(np.std(left.y, axis=0) < 1.2 * np.hypot(1e-3, 20 / 2**14 / np.sqrt(12)))
 
 
 def test_pieces_of_what_is_left_are_those_of_the_whole(campaign):

@@ -130,8 +130,10 @@ def test_the_prediction_in_time_is_that_of_scipy(found, records, checked):
     plan = plan_from_table({"ambient": {"velocity_rms_m_per_s": 0.0}, "record": [{"excitation": "rest"}]})
     loop = open_loop(found.fit.model.rig, plan)
     loop = replace(loop, sensors=replace(loop.sensors, noise_rms_V=np.zeros(6)))
-    table, linear = (simulate(loop, 20.0, settle_s=0.0, nonlinear=one, floor=np.zeros((20_001, 6)), drive=held.u).sensed
-                     for one in (True, False))
+    table, linear = (
+        simulate(loop, 20.0, settle_s=0.0, nonlinear=one, floor=np.zeros((20_001, 6)), drive=held.u).sensed
+        for one in (True, False)
+    )
     e = held.y - y - (table - linear)
     assert np.allclose(np.std(e, axis=0) / np.std(held.y, axis=0), checked.held_out[0].nrms_time_whole, rtol=1e-5)
 
@@ -142,8 +144,9 @@ def test_chi_square_of_the_true_model_obeys_its_law(true):
     w = 2 * np.pi * np.arange(10, 310) / 20.0
     C = np.eye(6) + 0.5
     factor = np.linalg.cholesky(C)
-    block = SpectralBlock("00", w, np.zeros((300, 11, 1), complex), np.zeros((300, 6, 1), complex), transient=True,
-                          kind="k").with_noise(np.broadcast_to(C, (300, 6, 6)))
+    block = SpectralBlock(
+        "00", w, np.zeros((300, 11, 1), complex), np.zeros((300, 6, 1), complex), transient=True, kind="k"
+    ).with_noise(np.broadcast_to(C, (300, 6, 6)))
     totals, outputs = [], []
     for _ in range(40):
         e = factor @ (rng.normal(size=(300, 6, 1)) + 1j * rng.normal(size=(300, 6, 1))) / np.sqrt(2)
@@ -207,9 +210,11 @@ def test_what_is_not_white_is_found(kind):
     rng = np.random.default_rng(8)
     plain = white_error(rng).white
     omega = 2 * np.pi * np.linspace(1, 41, 400)
-    planted = {"lines": lambda U: (plain + 0.5 * np.roll(plain, 3, axis=0)) / np.sqrt(1.25),
-               "time": lambda U: plain * np.sqrt(1 + 0.7 * np.cos(0.5 * omega))[:, None, None],
-               "input": lambda U: plain + 0.3 * U[:, 1:2] * np.exp(-0.3j * omega)[:, None, None]}[kind]
+    planted = {
+        "lines": lambda U: (plain + 0.5 * np.roll(plain, 3, axis=0)) / np.sqrt(1.25),
+        "time": lambda U: plain * np.sqrt(1 + 0.7 * np.cos(0.5 * omega))[:, None, None],
+        "input": lambda U: plain + 0.3 * U[:, 1:2] * np.exp(-0.3j * omega)[:, None, None],
+    }[kind]
     said = whiteness(white_error(rng, white=planted), ("a", "b", "c"), ("u", "v"), np.zeros((1, 1)))
     which = dict(zip(("lines", "time", "input"), said.correlations, strict=True))[kind]
     assert which.beyond and "values exceed their limit" in which.sentence
@@ -253,12 +258,16 @@ def test_measured_modes_know_their_errors(found, true, records, checked):
         noisy = found.fit.residuals[0].block
         measured = measured_modes([block.with_noise(noisy.noise[:, 0], noisy.dof)], true)
         assert measured.misfit == pytest.approx(1, abs=0.2)
-        z.append((np.concatenate([measured.frequency_Hz - exact.frequency_Hz, measured.damping - exact.damping]))
-                 / np.sqrt(np.diag(measured.covariance)))
+        z.append(
+            (np.concatenate([measured.frequency_Hz - exact.frequency_Hz, measured.damping - exact.damping]))
+            / np.sqrt(np.diag(measured.covariance))
+        )
     assert 0.6 < np.mean(np.square(z)) < 1.6 and np.max(np.abs(z)) < 4.5
     assert len(checked.modes) == 6 and max(abs(row.frequency_sigma) for row in checked.modes) < 4.5
-    errors = [abs(row.frequency_Hz - f) / row.frequency_std_Hz
-              for row, f in zip(checked.modes, exact.frequency_Hz, strict=True)]
+    errors = [
+        abs(row.frequency_Hz - f) / row.frequency_std_Hz
+        for row, f in zip(checked.modes, exact.frequency_Hz, strict=True)
+    ]
     assert max(errors) < 4.5
 
 
@@ -283,13 +292,16 @@ def test_errors_of_the_modes_follow_from_each_parameter(true, name):
     j, step = true.names.index(name), 1e-5
     sigma = 0.01 * true.values[j]
     covariance = np.zeros((len(true.names),) * 2)
-    covariance[j, j] = sigma ** 2
-    moved = [model_modes(true.at(true.values + sign * step * true.values[j] * np.eye(len(true.names))[j]), None)
-             for sign in (1, -1)]
+    covariance[j, j] = sigma**2
+    moved = [
+        model_modes(true.at(true.values + sign * step * true.values[j] * np.eye(len(true.names))[j]), None)
+        for sign in (1, -1)
+    ]
     slope = np.concatenate([moved[0].frequency_Hz - moved[1].frequency_Hz, moved[0].damping - moved[1].damping]) / (
-        2 * step * true.values[j])
+        2 * step * true.values[j]
+    )
     found = model_modes(true, covariance).covariance
-    assert np.allclose(found, np.outer(slope, slope) * sigma ** 2, rtol=1e-3, atol=1e-6 * np.abs(found).max())
+    assert np.allclose(found, np.outer(slope, slope) * sigma**2, rtol=1e-3, atol=1e-6 * np.abs(found).max())
     spread = np.sqrt(np.diag(found)[6:])
     assert np.allclose(spread, np.abs(slope[6:]) * sigma, rtol=1e-3, atol=1e-6 * spread.max())
 
@@ -297,8 +309,7 @@ def test_errors_of_the_modes_follow_from_each_parameter(true, name):
 def test_the_scatter_of_a_measured_response_is_that_of_its_noise(true):
     f = np.array([1.0, 2.5, 4.0, 20.0])
     exact, C = true.response(2 * np.pi * f)[:, :, :8], np.broadcast_to(1e-6 * np.eye(6), (4, 6, 6))
-    measured = FrequencyResponse(f, exact, C,
-                                 np.broadcast_to(np.eye(8), (4, 8, 8)), true.actuators, true.sensors.names)
+    measured = FrequencyResponse(f, exact, C, np.broadcast_to(np.eye(8), (4, 8, 8)), true.actuators, true.sensors.names)
     drawn = overlay(measured, true, true)
     assert np.allclose(drawn.measured_std, 1e-3 / np.sqrt(2)) and drawn.inside == 1.0
 
@@ -308,8 +319,9 @@ def test_the_floor_of_a_few_loud_lines_is_wide(true):
     rng = np.random.default_rng(14)
     level = np.where(np.arange(200) < 5, 100.0, 0.1)
     C = level[:, None, None] * np.eye(6)
-    block = SpectralBlock("00", 2 * np.pi * np.linspace(1, 20, 200), np.zeros((200, 11, 1), complex),
-                          np.ones((200, 6, 1), complex)).with_noise(C)
+    block = SpectralBlock(
+        "00", 2 * np.pi * np.linspace(1, 20, 200), np.zeros((200, 11, 1), complex), np.ones((200, 6, 1), complex)
+    ).with_noise(C)
     e = rng.normal(size=(4000, 200, 6, 1)) + 1j * rng.normal(size=(4000, 200, 6, 1))
     e *= np.sqrt(level / 2)[:, None, None]
     drawn = np.sqrt(np.sum(np.abs(e) ** 2, axis=(1, 2, 3)) / 1200)
@@ -334,6 +346,7 @@ def test_noise_near_sharp_modes_is_measured(true):
     def ratio(noise, dof):
         whole = np.trace(np.linalg.solve(noise, C), axis1=1, axis2=2).real / 6
         return np.mean(whole) * (dof - 6) / dof, np.std(whole)
+
     found = noise_from_residuals(residuals, [residuals[0].block], true)[0]
     shaped = ratio(found.noise[:, 0], found.dof)
     # Averaged over 25 lines of each record as they are.
@@ -349,8 +362,14 @@ def test_responses_in_place_of_records(true, model):
     flat = replace(model, period_s=0.0, delay_s=0.0)
     G = replace(true, period_s=0.0, delay_s=0.0).response(2 * np.pi * f)[:, :, :8]
     noise = 1e-2 * (rng.normal(size=G.shape) + 1j * rng.normal(size=G.shape)) / np.sqrt(2)
-    measured = FrequencyResponse(f, G + noise, np.broadcast_to(1e-4 * np.eye(6), (240, 6, 6)),
-                                 np.broadcast_to(np.eye(8), (240, 8, 8)), true.actuators, true.sensors.names)
+    measured = FrequencyResponse(
+        f,
+        G + noise,
+        np.broadcast_to(1e-4 * np.eye(6), (240, 6, 6)),
+        np.broadcast_to(np.eye(8), (240, 8, 8)),
+        true.actuators,
+        true.sensors.names,
+    )
     third = np.arange(240) % 3 == 2
     found = fit_campaign(measured.at(~third), flat, (0.7, 30))
     one = validate(found, measured.at(~third), measured.at(third))

@@ -15,10 +15,16 @@ from avis_ctrl.study.design_file import read_study
 
 matplotlib.use("Agg")
 AVIS_DESIGN = Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml"
-NOISE = {"duration_s": 20.0, "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
-         "record": [{"excitation": "noise", "level_percent": 50.0, "records": 3, "band_Hz": [0.5, 60.0]}]}
-QUICK = {"compare_with": ["hinf"], "synthesis": {"max_iterations": 1, "polish": False},
-         "simulation": {"duration_s": 15.0, "random_plants": 0}}
+NOISE = {
+    "duration_s": 20.0,
+    "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+    "record": [{"excitation": "noise", "level_percent": 50.0, "records": 3, "band_Hz": [0.5, 60.0]}],
+}
+QUICK = {
+    "compare_with": ["hinf"],
+    "synthesis": {"max_iterations": 1, "polish": False},
+    "simulation": {"duration_s": 15.0, "random_plants": 0},
+}
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +49,13 @@ def test_from_a_campaign_to_a_controller_and_its_report(study, tmp_path):
     for one in study.requirements:
         assert one.name in study.summary() and one.name in study._repr_html_()
     assert "\n" not in repr(study)
-    for draw in (study.plot_transmissibility, study.plot_mu, study.plot_dk_history, study.plot_controller,
-                 study.plot_vibration):
+    for draw in (
+        study.plot_transmissibility,
+        study.plot_mu,
+        study.plot_dk_history,
+        study.plot_controller,
+        study.plot_vibration,
+    ):
         assert draw().get_ylabel()
 
 
@@ -70,19 +81,22 @@ def test_sections_replace_those_of_a_file():
     assert design.keep == ["z"] and design.requirement == from_file.requirement
 
 
-@pytest.mark.parametrize("call, words", [
-    (lambda: ac.rig("no_such_rig"), "expected a rig file or one of"),
-    (lambda: ac.campaign("no_such_file.h5"), "no_such_file.h5"),
-    (lambda: ac.identify("no_such_file.h5", "avis"), "no_such_file.h5"),
-    (lambda: ac.identify(None, "avis"), "expected a campaign, a frequency response or a file"),
-    (lambda: ac.design("avis", keep=["z"], transmisibility={}), "transmisibility"),
-    (lambda: ac.design("avis"), "title"),
-    (lambda: ac.design(AVIS_DESIGN, compare_with=["hinf"]), "advantage_over_skyhook_dB compares"),
-    (lambda: ac.design(AVIS_DESIGN, compare_with=["lqg"]), "compare_with"),
-    (lambda: ac.simulate_campaign(3.0), "expected a rig"),
-    (lambda: ac.design(3.0), "expected a rig"),
-    (lambda: ac.simulate_campaign("avis", {"records": []}), "record"),
-])
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda: ac.rig("no_such_rig"), "expected a rig file or one of"),
+        (lambda: ac.campaign("no_such_file.h5"), "no_such_file.h5"),
+        (lambda: ac.identify("no_such_file.h5", "avis"), "no_such_file.h5"),
+        (lambda: ac.identify(None, "avis"), "expected a campaign, a frequency response or a file"),
+        (lambda: ac.design("avis", keep=["z"], transmisibility={}), "transmisibility"),
+        (lambda: ac.design("avis"), "title"),
+        (lambda: ac.design(AVIS_DESIGN, compare_with=["hinf"]), "advantage_over_skyhook_dB compares"),
+        (lambda: ac.design(AVIS_DESIGN, compare_with=["lqg"]), "compare_with"),
+        (lambda: ac.simulate_campaign(3.0), "expected a rig"),
+        (lambda: ac.design(3.0), "expected a rig"),
+        (lambda: ac.simulate_campaign("avis", {"records": []}), "record"),
+    ],
+)
 def test_wrong_input_is_one_line(call, words):
     with pytest.raises(ac.InputError, match=words) as error:
         call()

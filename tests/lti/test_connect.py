@@ -13,8 +13,15 @@ from avis_ctrl.lti import StateSpace, connect, gain, lft_lower, lft_upper, summi
 
 
 def random_system(rng, n, n_y, n_u, inputs=(), outputs=()):
-    return StateSpace(rng.standard_normal((n, n)), rng.standard_normal((n, n_u)), rng.standard_normal((n_y, n)),
-                      0.2 * rng.standard_normal((n_y, n_u)), 0.0, inputs, outputs)
+    return StateSpace(
+        rng.standard_normal((n, n)),
+        rng.standard_normal((n, n_u)),
+        rng.standard_normal((n_y, n)),
+        0.2 * rng.standard_normal((n_y, n_u)),
+        0.0,
+        inputs,
+        outputs,
+    )
 
 
 def test_feedback_loop_agrees_with_python_control():
@@ -27,7 +34,7 @@ def test_feedback_loop_agrees_with_python_control():
         assert loop(s)[2, 0] == pytest.approx(1 / (1 + G(s)[0, 0] * K(s)[0, 0]), rel=1e-9)
 
 
-@given(st.integers(0, 2 ** 31))
+@given(st.integers(0, 2**31))
 @settings(max_examples=30, deadline=None)
 def test_connect_with_direct_terms_solves_the_signal_equations(seed):
     rng = np.random.default_rng(seed)
@@ -40,7 +47,7 @@ def test_connect_with_direct_terms_solves_the_signal_equations(seed):
     np.testing.assert_allclose(closed(s)[:, 0], [g[1, 0] * h * b + g[1, 1], h * b], rtol=1e-7)
 
 
-@given(st.integers(0, 2 ** 31), st.integers(0, 4), st.integers(0, 3))
+@given(st.integers(0, 2**31), st.integers(0, 4), st.integers(0, 3))
 @settings(max_examples=40, deadline=None)
 def test_lft_formulas(seed, n, n_k):
     rng = np.random.default_rng(seed)
@@ -61,13 +68,16 @@ def test_lft_keeps_the_outer_names():
     assert closed.inputs == ("w",) and closed.outputs == ("z",)
 
 
-@pytest.mark.parametrize(("build", "message"), [
-    (lambda: connect([gain([[1.0]], ["a"], ["b"])], [], ["b"]), "'a' is read by part 0 but driven by nothing"),
-    (lambda: connect([gain([[1.0]], ["a"], ["b"]), gain([[1.0]], ["a"], ["b"])], ["a"], ["b"]), "driven twice"),
-    (lambda: connect([gain([[1.0]], ["a"], ["b"])], ["a"], ["c"]), r"output \['c'\] is driven by nothing"),
-    (lambda: connect([gain([[1.0]], ["a"], ["b"])], ["a", "a"], ["b"]), "named twice"),
-    (lambda: lft_lower(gain(np.eye(2)), gain(np.eye(3))), "does not fit"),
-])
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: connect([gain([[1.0]], ["a"], ["b"])], [], ["b"]), "'a' is read by part 0 but driven by nothing"),
+        (lambda: connect([gain([[1.0]], ["a"], ["b"]), gain([[1.0]], ["a"], ["b"])], ["a"], ["b"]), "driven twice"),
+        (lambda: connect([gain([[1.0]], ["a"], ["b"])], ["a"], ["c"]), r"output \['c'\] is driven by nothing"),
+        (lambda: connect([gain([[1.0]], ["a"], ["b"])], ["a", "a"], ["b"]), "named twice"),
+        (lambda: lft_lower(gain(np.eye(2)), gain(np.eye(3))), "does not fit"),
+    ],
+)
 def test_wrong_wiring_names_the_signal(build, message):
     with pytest.raises(InputError, match=message):
         build()

@@ -17,8 +17,9 @@ G = control.tf([1.0, 2.0], [1.0, 3.0, 5.0])
 OMEGA = np.geomspace(0.1, 10, 7)
 
 
-@pytest.mark.parametrize("given", [G, control.ss(G), as_system(G), tf([1.0, 2.0], [1.0, 3.0, 5.0]),
-                                   control.frd(G, OMEGA)])
+@pytest.mark.parametrize(
+    "given", [G, control.ss(G), as_system(G), tf([1.0, 2.0], [1.0, 3.0, 5.0]), control.frd(G, OMEGA)]
+)
 def test_responses_agree(given):
     np.testing.assert_allclose(response_of(given, OMEGA)[:, 0, 0], np.squeeze(G(1j * OMEGA)), rtol=1e-10)
 
@@ -49,11 +50,17 @@ def test_synthesis_takes_python_control_and_gives_it_back():
     assert peak.upper == pytest.approx(made.gamma, rel=2e-3)
 
 
-@pytest.mark.parametrize("given, words", [
-    (control.frd(G, OMEGA), "has no states|none"), ("G", "expected a StateSpace"), (None, "expected a StateSpace"),
-    (control.tf([1.0, 0.0, 0.0], [1.0, 1.0]), "proper system"), (np.array([["a"]]), "proper system"),
-    ([[1.0], [1.0, 2.0]], "proper system"),
-])
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        (control.frd(G, OMEGA), "has no states|none"),
+        ("G", "expected a StateSpace"),
+        (None, "expected a StateSpace"),
+        (control.tf([1.0, 0.0, 0.0], [1.0, 1.0]), "proper system"),
+        (np.array([["a"]]), "proper system"),
+        ([[1.0], [1.0, 2.0]], "proper system"),
+    ],
+)
 def test_what_is_no_system_is_refused_in_one_line(given, words):
     with pytest.raises(InputError, match=words) as caught:
         as_system(given)

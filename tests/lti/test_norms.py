@@ -17,20 +17,21 @@ def random_stable(rng, n, n_y, n_u, direct=1.0, margin=None):
     A = rng.standard_normal((n, n))
     shift = rng.uniform(1e-4, 1.0) if margin is None else margin
     A -= (max(np.linalg.eigvals(A).real, default=0.0) + shift) * np.eye(n)
-    return StateSpace(A, rng.standard_normal((n, n_u)), rng.standard_normal((n_y, n)),
-                      direct * rng.standard_normal((n_y, n_u)))
+    return StateSpace(
+        A, rng.standard_normal((n, n_u)), rng.standard_normal((n_y, n)), direct * rng.standard_normal((n_y, n_u))
+    )
 
 
 @pytest.mark.parametrize("zeta", [0.3, 1e-2, 1e-4, 1e-7])
 @pytest.mark.parametrize("w0", [1e-3, 1.0, 1e5])
 def test_resonance_in_closed_form(w0, zeta):
     """|w0^2 / (s^2 + 2 zeta w0 s + w0^2)| peaks at 1 / (2 zeta sqrt(1 - zeta^2)), w = w0 sqrt(1 - 2 zeta^2)."""
-    peak = hinf_norm(tf([w0 ** 2], [1, 2 * zeta * w0, w0 ** 2]))
-    assert peak.gain == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), rel=1e-6)
-    assert peak.omega == pytest.approx(w0 * np.sqrt(1 - 2 * zeta ** 2), rel=1e-3)
+    peak = hinf_norm(tf([w0**2], [1, 2 * zeta * w0, w0**2]))
+    assert peak.gain == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta**2)), rel=1e-6)
+    assert peak.omega == pytest.approx(w0 * np.sqrt(1 - 2 * zeta**2), rel=1e-3)
 
 
-@given(st.integers(0, 2 ** 31), st.integers(1, 12), st.sampled_from([0.0, 1.0]))
+@given(st.integers(0, 2**31), st.integers(1, 12), st.sampled_from([0.0, 1.0]))
 @settings(max_examples=60, deadline=None)
 def test_hinf_norm_agrees_with_slicot(seed, n, direct):
     G = random_stable(np.random.default_rng(seed), n, 2, 3, direct)
@@ -38,7 +39,7 @@ def test_hinf_norm_agrees_with_slicot(seed, n, direct):
     assert hinf_norm(G).gain == pytest.approx(expected, rel=1.1e-6)
 
 
-@given(st.integers(0, 2 ** 31), st.integers(1, 12), st.sampled_from([0.0, 1.0]))
+@given(st.integers(0, 2**31), st.integers(1, 12), st.sampled_from([0.0, 1.0]))
 @settings(max_examples=40, deadline=None)
 def test_a_level_is_compared_as_by_slicot(seed, n, direct):
     G = random_stable(np.random.default_rng(seed), n, 2, 3, direct)
@@ -47,7 +48,7 @@ def test_a_level_is_compared_as_by_slicot(seed, n, direct):
     assert not norm_is_below(StateSpace(-G.A, G.B, G.C, G.D), 10 * expected)
 
 
-@given(st.integers(0, 2 ** 31))
+@given(st.integers(0, 2**31))
 @settings(max_examples=20, deadline=None)
 def test_sampled_norm_agrees_with_slicot_and_its_own_frequency(seed):
     G = discretise(random_stable(np.random.default_rng(seed), 4, 2, 2), 0.1, "zoh")
@@ -72,7 +73,7 @@ def test_many_close_resonances():
     rng = np.random.default_rng(3)
     G = tf([1], [1, 1])
     for w0 in np.sort(rng.uniform(5, 50, 20)):
-        G = G + tf([w0], [1, 2e-4 * w0, w0 ** 2]).renamed(["u0"], ["y0"])
+        G = G + tf([w0], [1, 2e-4 * w0, w0**2]).renamed(["u0"], ["y0"])
     peak = hinf_norm(G)
     omega = np.concatenate([np.abs(p.imag) + np.linspace(-3, 3, 2001) * abs(p.real) for p in G.poles() if p.imag > 0])
     on_grid = np.max(np.abs(G.frequency_response(omega)))
@@ -113,8 +114,9 @@ def test_largest_singular_value_is_that_of_the_decomposition(rng, shape, size):
     M[0] = 0.0
     M[1, :, -1] = M[1, :, 0]
     np.testing.assert_allclose(largest_singular_value(M), np.linalg.svd(M, compute_uv=False)[..., 0], rtol=1e-7)
-    np.testing.assert_allclose(largest_singular_value(M[2:]), np.linalg.svd(M[2:], compute_uv=False)[..., 0],
-                               rtol=1e-13)
+    np.testing.assert_allclose(
+        largest_singular_value(M[2:]), np.linalg.svd(M[2:], compute_uv=False)[..., 0], rtol=1e-13
+    )
 
 
 def test_a_matrix_without_entries_has_no_gain():

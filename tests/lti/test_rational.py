@@ -19,14 +19,18 @@ SECTIONS = st.lists(st.tuples(st.floats(0.01, 1e3), st.floats(0.02, 3.0)), min_s
 @given(pole_pairs=SECTIONS, zero_pairs=SECTIONS, singles=st.lists(st.floats(0.01, 1e3), min_size=0, max_size=3))
 @settings(max_examples=60, deadline=None)
 def test_a_cascade_has_the_response_of_its_factors(pole_pairs, zero_pairs, singles):
-    zero_pairs = zero_pairs[:len(pole_pairs)]
+    zero_pairs = zero_pairs[: len(pole_pairs)]
     function = Rational(2.5, tuple(zero_pairs), tuple(pole_pairs), (), tuple(singles))
     system = function.system("a", "b")
     omega = np.geomspace(1e-3, 1e4, 40)
     assert system.nstates == function.order
     # Far below the peak a state-space sum loses digits of the sum, whatever its realisation.
-    np.testing.assert_allclose(system.frequency_response(omega)[:, 0, 0], function(1j * omega), rtol=1e-6,
-                               atol=1e-12 * np.max(function.magnitude(omega)))
+    np.testing.assert_allclose(
+        system.frequency_response(omega)[:, 0, 0],
+        function(1j * omega),
+        rtol=1e-6,
+        atol=1e-12 * np.max(function.magnitude(omega)),
+    )
 
 
 def test_the_inverse_exchanges_zeros_and_poles():
@@ -45,9 +49,11 @@ def test_a_cascade_equals_the_polynomial_fraction_and_keeps_zeros_at_the_origin(
 
 @pytest.mark.parametrize("order", [2, 4, 5])
 def test_a_fit_finds_the_function_that_made_the_magnitude(order):
-    functions = {2: Rational(2.0, ((1.0, 0.2),), ((5.0, 0.4),)),
-                 4: Rational(0.5, ((1.0, 0.1), (30.0, 0.5)), ((4.0, 0.3), (10.0, 0.25))),
-                 5: Rational(0.5, ((1.0, 0.1), (30.0, 0.5)), ((4.0, 0.3), (10.0, 0.25)), (0.5,), (2.0,))}
+    functions = {
+        2: Rational(2.0, ((1.0, 0.2),), ((5.0, 0.4),)),
+        4: Rational(0.5, ((1.0, 0.1), (30.0, 0.5)), ((4.0, 0.3), (10.0, 0.25))),
+        5: Rational(0.5, ((1.0, 0.1), (30.0, 0.5)), ((4.0, 0.3), (10.0, 0.25)), (0.5,), (2.0,)),
+    }
     omega = np.geomspace(0.05, 500, 200)
     fit = magnitude_fit(omega, functions[order].magnitude(omega), order)
     assert fit.error_max_dB < 1e-3
@@ -62,7 +68,7 @@ def test_errors_of_a_fit_are_what_they_say():
         fit = magnitude_fit(omega, magnitude, order)
         error = 20 * np.log10(fit.function.magnitude(omega) / magnitude)
         assert fit.error_max_dB == pytest.approx(np.max(np.abs(error)))
-        assert fit.error_rms_dB == pytest.approx(np.sqrt(np.mean(error ** 2)))
+        assert fit.error_rms_dB == pytest.approx(np.sqrt(np.mean(error**2)))
         assert fit.function.order == order
 
 
@@ -84,24 +90,34 @@ def test_a_cover_of_a_half_order_slope_equals_the_chebyshev_bound_found_otherwis
     assert np.min(ratio) >= 1 - 1e-9
 
     def spread(x):
-        value = sum(np.log(omega ** 2 + np.exp(2 * z)) - np.log(omega ** 2 + np.exp(2 * p))
-                    for z, p in x.reshape(-1, 2)) / 2 - np.log(omega) / 2
+        value = (
+            sum(np.log(omega**2 + np.exp(2 * z)) - np.log(omega**2 + np.exp(2 * p)) for z, p in x.reshape(-1, 2)) / 2
+            - np.log(omega) / 2
+        )
         return 20 / np.log(10) * (np.max(value) - np.min(value))
+
     corners = np.log(np.geomspace(0.05, 20, 2 * order)).reshape(-1, 2)
     other = minimize(spread, corners.ravel(), method="Nelder-Mead", options={"maxiter": 4000, "fatol": 1e-6})
     assert fit.error_max_dB < 1.02 * other.fun
 
 
-@pytest.mark.parametrize(("make", "field"), [
-    (lambda: Rational(0.0), "gain"), (lambda: Rational(1.0, pole_pairs=((1.0, -0.1),)), "pole_pairs"),
-    (lambda: Rational(1.0, real_poles=(np.nan,)), "real_poles"), (lambda: Rational(1.0, real_zeros=(1.0,)), "improper"),
-    (lambda: cascade([-1.0], [], 1.0), "improper"), (lambda: cascade([], [1j], 1.0), "conjugate"),
-    (lambda: Rational(1.0, real_poles=(1.0,)).inverse(), "improper"),
-    (lambda: magnitude_fit(np.ones(3), np.ones(3), 1), "omega"),
-    (lambda: magnitude_fit(np.arange(1, 4.0), np.array([1.0, -1.0, 1.0]), 1), "magnitude"),
-    (lambda: magnitude_fit(np.arange(1, 4.0), np.ones(2), 1), "omega"),
-    (lambda: magnitude_fit(np.arange(1, 4.0), np.ones(3), 1, 2), "order"),
-    (lambda: covering_fit(np.arange(1, 4.0), 2 * np.ones(3), np.ones(3), 1), "lower")])
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Rational(0.0), "gain"),
+        (lambda: Rational(1.0, pole_pairs=((1.0, -0.1),)), "pole_pairs"),
+        (lambda: Rational(1.0, real_poles=(np.nan,)), "real_poles"),
+        (lambda: Rational(1.0, real_zeros=(1.0,)), "improper"),
+        (lambda: cascade([-1.0], [], 1.0), "improper"),
+        (lambda: cascade([], [1j], 1.0), "conjugate"),
+        (lambda: Rational(1.0, real_poles=(1.0,)).inverse(), "improper"),
+        (lambda: magnitude_fit(np.ones(3), np.ones(3), 1), "omega"),
+        (lambda: magnitude_fit(np.arange(1, 4.0), np.array([1.0, -1.0, 1.0]), 1), "magnitude"),
+        (lambda: magnitude_fit(np.arange(1, 4.0), np.ones(2), 1), "omega"),
+        (lambda: magnitude_fit(np.arange(1, 4.0), np.ones(3), 1, 2), "order"),
+        (lambda: covering_fit(np.arange(1, 4.0), 2 * np.ones(3), np.ones(3), 1), "lower"),
+    ],
+)
 def test_wrong_input_is_refused_by_name(make, field):
     with pytest.raises(InputError, match=field):
         make()

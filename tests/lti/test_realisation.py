@@ -19,7 +19,7 @@ def random_stable(rng, n, n_y=2, n_u=2):
     return StateSpace(A, rng.standard_normal((n, n_u)), rng.standard_normal((n_y, n)), rng.standard_normal((n_y, n_u)))
 
 
-@given(st.integers(0, 2 ** 31), st.integers(2, 9))
+@given(st.integers(0, 2**31), st.integers(2, 9))
 @settings(max_examples=40, deadline=None)
 def test_truncation_error_is_within_its_bound(seed, n):
     """||G - G_k|| <= 2 (sigma_k+1 + ... + sigma_n), and at least sigma_k+1 (Enns 1984; Glover 1984)."""
@@ -49,7 +49,7 @@ def test_gramians_of_an_unstable_system_are_refused():
         balanced_truncation(tf([1], [1, -1]), 1)
 
 
-@given(st.integers(0, 2 ** 31))
+@given(st.integers(0, 2**31))
 @settings(max_examples=30, deadline=None)
 def test_balance_is_exact_and_evens_out(seed):
     rng = np.random.default_rng(seed)
@@ -64,11 +64,18 @@ def test_balance_is_exact_and_evens_out(seed):
 
 def test_minimal_removes_what_is_hidden(rng):
     G = random_stable(rng, 3)
-    hidden = StateSpace(np.block([[G.A, rng.standard_normal((3, 2)), np.zeros((3, 2))],
-                                  [np.zeros((2, 3)), -np.eye(2), np.zeros((2, 2))],
-                                  [rng.standard_normal((2, 5)), -2 * np.eye(2)]]),
-                        np.vstack([G.B, np.zeros((2, 2)), rng.standard_normal((2, 2))]),
-                        np.hstack([G.C, rng.standard_normal((2, 2)), np.zeros((2, 2))]), G.D)
+    hidden = StateSpace(
+        np.block(
+            [
+                [G.A, rng.standard_normal((3, 2)), np.zeros((3, 2))],
+                [np.zeros((2, 3)), -np.eye(2), np.zeros((2, 2))],
+                [rng.standard_normal((2, 5)), -2 * np.eye(2)],
+            ]
+        ),
+        np.vstack([G.B, np.zeros((2, 2)), rng.standard_normal((2, 2))]),
+        np.hstack([G.C, rng.standard_normal((2, 2)), np.zeros((2, 2))]),
+        G.D,
+    )
     smaller = minimal(hidden)
     assert smaller.nstates == 3
     np.testing.assert_allclose(smaller(0.5j), G(0.5j), rtol=1e-8)

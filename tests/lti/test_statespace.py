@@ -19,8 +19,15 @@ coefficients = st.lists(st.floats(0.1, 50), min_size=1, max_size=5)
 def random_system(rng, n, n_y, n_u, names=("", "")):
     A = rng.standard_normal((n, n))
     A -= (max(np.linalg.eigvals(A).real, default=0.0) + rng.uniform(0.05, 1.0)) * np.eye(n)
-    return StateSpace(A, rng.standard_normal((n, n_u)), rng.standard_normal((n_y, n)), rng.standard_normal((n_y, n_u)),
-                      0.0, [f"{names[0]}u{k}" for k in range(n_u)], [f"{names[1]}y{k}" for k in range(n_y)])
+    return StateSpace(
+        A,
+        rng.standard_normal((n, n_u)),
+        rng.standard_normal((n_y, n)),
+        rng.standard_normal((n_y, n_u)),
+        0.0,
+        [f"{names[0]}u{k}" for k in range(n_u)],
+        [f"{names[1]}y{k}" for k in range(n_y)],
+    )
 
 
 @given(coefficients, coefficients, st.floats(1e-3, 1e3))
@@ -37,7 +44,7 @@ def test_tf_evaluates_as_the_ratio_of_its_polynomials(num, den, w):
 
 def test_tf_of_several_channels_is_that_of_python_control(rng):
     den = [[1.0, 3.0, 2.0], [1.0, 0.2], [4.0]]
-    columns = [0, 1, 0]                                     # denominators by input: two columns share theirs
+    columns = [0, 1, 0]  # denominators by input: two columns share theirs
     nums = [[rng.standard_normal(rng.integers(1, len(den[k]) + 1)) for k in columns] for _ in range(2)]
     dens = [[den[k] for k in columns] for _ in range(2)]
     G = tf(nums, dens, ["a", "b", "c"], ["x", "y"])
@@ -45,22 +52,29 @@ def test_tf_of_several_channels_is_that_of_python_control(rng):
     other = control.tf(nums, dens)
     for s in (0.3j, 5.0j, 1.0 + 2.0j):
         np.testing.assert_allclose(G(s), other(s), rtol=1e-10)
-    dens[1][0] = [1.0, 7.0, 1.0]                             # an entry with a denominator of its own
+    dens[1][0] = [1.0, 7.0, 1.0]  # an entry with a denominator of its own
     assert tf(nums, dens).nstates == 7
     np.testing.assert_allclose(tf(nums, dens)(2j), control.tf(nums, dens)(2j), rtol=1e-10)
     np.testing.assert_allclose(tf([[[1.0], [2.0, 1.0]]], [1.0, 3.0])(2j), [[1 / (3 + 2j), (4j + 1) / (3 + 2j)]])
 
 
-@pytest.mark.parametrize("num, den, message", [
-    ([[1.0, 2.0]], [1.0, 1.0], "expected coefficients"), ([[[1.0], [1.0]], [[1.0]]], [1.0, 1.0], "tables of 2 rows"),
-    ([[[1.0]], [[1.0, 0.0]]], [[[1.0]], [[1.0]]], "improper"), ([], [1.0], "expected coefficients"),
-    ([[[1.0]]], [[[0.0]]], "denominator is zero"), ("ab", [1.0], "expected coefficients")])
+@pytest.mark.parametrize(
+    "num, den, message",
+    [
+        ([[1.0, 2.0]], [1.0, 1.0], "expected coefficients"),
+        ([[[1.0], [1.0]], [[1.0]]], [1.0, 1.0], "tables of 2 rows"),
+        ([[[1.0]], [[1.0, 0.0]]], [[[1.0]], [[1.0]]], "improper"),
+        ([], [1.0], "expected coefficients"),
+        ([[[1.0]]], [[[0.0]]], "denominator is zero"),
+        ("ab", [1.0], "expected coefficients"),
+    ],
+)
 def test_tables_that_are_no_transfer_function(num, den, message):
     with pytest.raises(InputError, match=message):
         tf(num, den)
 
 
-@given(st.integers(0, 2 ** 31), st.integers(0, 5))
+@given(st.integers(0, 2**31), st.integers(0, 5))
 @settings(max_examples=30, deadline=None)
 def test_algebra_is_that_of_the_transfer_matrices(seed, n):
     rng = np.random.default_rng(seed)
@@ -107,11 +121,14 @@ def test_pickle(rng):
     assert back.inputs == G.inputs
 
 
-@pytest.mark.parametrize(("matrices", "message"), [
-    (([[np.nan]], [[1]], [[1]], [[0]]), "matrix A"),
-    (([[1]], [[1, 2]], [[1]], [[0]]), "shapes do not fit"),
-    (([[1, 2]], [[1]], [[1]], [[0]]), "shapes do not fit"),
-])
+@pytest.mark.parametrize(
+    ("matrices", "message"),
+    [
+        (([[np.nan]], [[1]], [[1]], [[0]]), "matrix A"),
+        (([[1]], [[1, 2]], [[1]], [[0]]), "shapes do not fit"),
+        (([[1, 2]], [[1]], [[1]], [[0]]), "shapes do not fit"),
+    ],
+)
 def test_wrong_matrices(matrices, message):
     with pytest.raises(InputError, match=message):
         StateSpace(*matrices)
@@ -142,14 +159,29 @@ def test_slow_states_are_not_lost_beside_fast_ones(rng):
 
 def test_arithmetic_with_numbers_matrices_and_python_control():
     rng = np.random.default_rng(6)
-    made = [control.StateSpace(np.diag([-1.0, -3.0]), rng.standard_normal((2, 2)), rng.standard_normal((2, 2)),
-                               0.1 * rng.standard_normal((2, 2))) for _ in range(2)]
+    made = [
+        control.StateSpace(
+            np.diag([-1.0, -3.0]),
+            rng.standard_normal((2, 2)),
+            rng.standard_normal((2, 2)),
+            0.1 * rng.standard_normal((2, 2)),
+        )
+        for _ in range(2)
+    ]
     P, K = (StateSpace.from_control(one) for one in made)
     M, s = rng.standard_normal((2, 2)), 0.7j
-    for found, true in ((P @ made[1], made[0] * made[1]), (P + made[1], made[0] + made[1]), (M @ P, M @ made[0](s)),
-                        (P @ M, made[0](s) @ M), (2 * P, 2 * made[0](s)), (P / 4, made[0](s) / 4),
-                        (M - P, M - made[0](s)), (P.feedback(made[1]), made[0].feedback(made[1])),
-                        (P.feedback(K, 1), made[0].feedback(made[1], 1)), (P.feedback(M), made[0].feedback(M))):
+    for found, true in (
+        (P @ made[1], made[0] * made[1]),
+        (P + made[1], made[0] + made[1]),
+        (M @ P, M @ made[0](s)),
+        (P @ M, made[0](s) @ M),
+        (2 * P, 2 * made[0](s)),
+        (P / 4, made[0](s) / 4),
+        (M - P, M - made[0](s)),
+        (P.feedback(made[1]), made[0].feedback(made[1])),
+        (P.feedback(K, 1), made[0].feedback(made[1], 1)),
+        (P.feedback(M), made[0].feedback(M)),
+    ):
         np.testing.assert_allclose(found(s), true(s) if callable(true) else true, rtol=1e-9)
     one = tf([1.0], [1.0, 1.0])
     assert (1 - one)(0)[0, 0] == pytest.approx(0.0) and one.feedback().dcgain()[0, 0] == pytest.approx(0.5)

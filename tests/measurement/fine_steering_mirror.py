@@ -18,7 +18,16 @@ def mirror(data: Path, level_mV: int) -> Campaign:
     n, _, count, periods = u.shape
     records = []
     for k in range(count):
-        header = RecordHeader(f"{level_mV}mV_{k}", RATE_HZ, n * periods, ("u1", "u2", "u3"), ("y1", "y2", "y3"),
-                              "multisine", level_mV / 1000, period_s=n / RATE_HZ, y_unit="m")
+        header = RecordHeader(
+            f"{level_mV}mV_{k}",
+            RATE_HZ,
+            n * periods,
+            ("u1", "u2", "u3"),
+            ("y1", "y2", "y3"),
+            "multisine",
+            level_mV / 1000,
+            period_s=n / RATE_HZ,
+            y_unit="m",
+        )
         records.append(Record(header, *(np.concatenate([x[:, :, k, p] for p in range(periods)]) for x in (u, y))))
     return Campaign("fine steering mirror", tuple(records))

@@ -16,7 +16,7 @@ class Modal:
         self.D = direct * rng.standard_normal((n_y, n_u))
         self.parts = []
         for f in modes_Hz:
-            p = np.exp((-damping + 1j * np.sqrt(1 - damping ** 2)) * 2 * np.pi * f / rate_Hz)
+            p = np.exp((-damping + 1j * np.sqrt(1 - damping**2)) * 2 * np.pi * f / rate_Hz)
             self.parts.append((np.poly([p, p.conj()]).real, rng.standard_normal((n_y, n_u)) * abs(1 - p) ** 2))
 
     def response(self, frequency_Hz):
@@ -37,10 +37,18 @@ def campaign(experiments, rate_Hz, excitation="noise", period_s=None, levels=Non
     records = []
     for k, (u, y) in enumerate(experiments):
         floor = None if floors is None else floors[k]
-        header = RecordHeader(f"{k:02d}", rate_Hz, u.shape[0], tuple(f"u{j + 1}" for j in range(u.shape[1])),
-                              tuple(f"y{j + 1}" for j in range(y.shape[1])), excitation,
-                              1.0 if levels is None else levels[k], 0.0, period_s,
-                              floor_names=() if floor is None else ("vx", "vy", "vz")[:floor.shape[1]])
+        header = RecordHeader(
+            f"{k:02d}",
+            rate_Hz,
+            u.shape[0],
+            tuple(f"u{j + 1}" for j in range(u.shape[1])),
+            tuple(f"y{j + 1}" for j in range(y.shape[1])),
+            excitation,
+            1.0 if levels is None else levels[k],
+            0.0,
+            period_s,
+            floor_names=() if floor is None else ("vx", "vy", "vz")[: floor.shape[1]],
+        )
         records.append(Record(header, u, y, floor))
     return Campaign("test", tuple(records))
 

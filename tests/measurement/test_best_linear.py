@@ -24,7 +24,7 @@ def experiments(rng, plant, n_u, realisations, periods, noise=0.0, lead=0, ampli
             u = np.tile(period, (periods + lead, 1))
             y = plant(u)
             white = noise * rng.standard_normal(y.shape)
-            runs.append((u[lead * N:], (y + (white if factor is None else white @ factor.T))[lead * N:]))
+            runs.append((u[lead * N :], (y + (white if factor is None else white @ factor.T))[lead * N :]))
     return campaign(runs, RATE, "multisine", N / RATE)
 
 
@@ -45,7 +45,7 @@ def test_noise_and_no_distortion_for_a_linear_system():
         data = experiments(rng, system.simulate, 2, 4, 3, noise, lead=4, factor=factor)
         got = best_linear_approximation(data, transient="none", smooth_lines=0)
         assert got.dof == 6
-        exact = noise ** 2 * factor @ factor.T / 3  # of the mean of three periods
+        exact = noise**2 * factor @ factor.T / 3  # of the mean of three periods
         for part in (got.noise, got.measurement_noise):
             assert np.allclose(part.mean(axis=0), exact, atol=0.08 * exact[0, 0])
         assert np.abs(got.distortion.mean(axis=0)).max() < 0.1 * exact[0, 0]
@@ -55,7 +55,7 @@ def test_noise_and_no_distortion_for_a_linear_system():
 
 def hammerstein(system, cubic):
     """y = G (u + cubic u^3): its best linear approximation and distortion come from many noise-free realisations."""
-    return lambda u: system.simulate(u + cubic * u ** 3)
+    return lambda u: system.simulate(u + cubic * u**3)
 
 
 def test_noise_and_distortion_of_a_cubic_system_separate():
@@ -75,7 +75,8 @@ def test_noise_and_distortion_of_a_cubic_system_separate():
     measured = np.real(np.einsum("nii->i", got.distortion)) / len(LINES)
     assert measured == pytest.approx(distortion, rel=0.15)
     assert np.real(np.einsum("nii->i", got.measurement_noise)) / len(LINES) == pytest.approx(
-        np.full(2, noise ** 2 / 4), rel=0.05)
+        np.full(2, noise**2 / 4), rel=0.05
+    )
     # The gain that Gaussian inputs see: 1 + 3 cubic sigma^2 for each input (Bussgang).
     exact = system.response(got.frequency_Hz) * (1 + 3 * cubic)
     strong = np.abs(exact) > 0.3 * np.abs(exact).max()
@@ -104,7 +105,7 @@ def test_repeated_records_are_not_realisations(rng):
     noisy = [(r.u, r.y + 0.01 * rng.standard_normal(r.y.shape)) for r in first.records for _ in range(2)]
     got = best_linear_approximation(campaign(noisy, RATE, "multisine", N / RATE), transient="none")
     assert got.distortion is None and "2 experiments" in got.method
-    assert np.real(np.einsum("nii->ni", got.noise)).mean() == pytest.approx(0.01 ** 2 / 4, rel=0.1)
+    assert np.real(np.einsum("nii->ni", got.noise)).mean() == pytest.approx(0.01**2 / 4, rel=0.1)
 
 
 def test_transient_from_rest_is_removed_with_two_periods():
@@ -122,7 +123,7 @@ def test_transient_from_rest_is_removed_with_two_periods():
     assert np.mean((np.abs(got.value - exact) ** 2 / got.variance())[away]) == pytest.approx(1.1, abs=0.4)
     # Noise from the lines between, the leverage of the interpolation included: nearly noise^2 / 2 (1 + 3 / 8).
     diagonal = np.real(np.einsum("nii->ni", got.measurement_noise))[away]
-    assert 0.5 < np.median(diagonal) / noise ** 2 < 1.0
+    assert 0.5 < np.median(diagonal) / noise**2 < 1.0
 
 
 def test_transient_of_a_sharp_mode_is_removed_as_a_rational_function():
@@ -137,7 +138,7 @@ def test_transient_of_a_sharp_mode_is_removed_as_a_rational_function():
     data = campaign(runs, 200.0, "multisine", 10.0)
     exact = system.response(np.arange(5, 801) / 10)
     error = {t: np.abs(best_linear_approximation(data, transient=t).value - exact) for t in ("none", "auto")}
-    rms = {t: np.sqrt(np.mean(e ** 2)) for t, e in error.items()}
+    rms = {t: np.sqrt(np.mean(e**2)) for t, e in error.items()}
     assert rms["auto"] < rms["none"] / 10, rms
     got = best_linear_approximation(data)
     assert np.mean(squared_error(got, exact)) < 1.3
@@ -177,6 +178,7 @@ def test_periods_that_still_settle_are_dropped(damping):
             steady = system.simulate(np.tile(record.u[:N], (40, 1)))[-N:]
             worst = max(worst, np.abs(np.fft.rfft(clean[drop:].mean(axis=0) - steady, axis=0)[LINES]).max())
         return worst / np.sqrt(N) / (noise / np.sqrt(count - drop))
+
     assert left(dropped) < 1.5
     assert dropped <= 1 or left(dropped - 2) > 1.5
     assert np.mean(squared_error(got, system.response(got.frequency_Hz))) < 2.0
@@ -185,8 +187,9 @@ def test_periods_that_still_settle_are_dropped(damping):
 def test_settled_records_lose_no_period():
     rng = np.random.default_rng(13)
     system = Modal(rng, 3, 1, [20.0], 0.05, RATE)
-    lost = [best_linear_approximation(experiments(rng, system.simulate, 1, 2, 4, 0.1, lead=5)).method
-            for _ in range(20)]
+    lost = [
+        best_linear_approximation(experiments(rng, system.simulate, 1, 2, 4, 0.1, lead=5)).method for _ in range(20)
+    ]
     assert sum(", 0 periods dropped" in words for words in lost) >= 19
 
 
@@ -195,12 +198,19 @@ def test_noise_of_a_measured_input_is_taken_over():
     rng = np.random.default_rng(14)
     system = Modal(rng, 2, 2, [40.0], 0.3, RATE)
     data = experiments(rng, system.simulate, 2, 6, 4, 0.0, lead=2)
-    noisy = campaign([(r.u + 0.05 * rng.standard_normal(r.u.shape), r.y + 0.02 * rng.standard_normal(r.y.shape))
-                      for r in data.records], RATE, "multisine", N / RATE)
+    noisy = campaign(
+        [
+            (r.u + 0.05 * rng.standard_normal(r.u.shape), r.y + 0.02 * rng.standard_normal(r.y.shape))
+            for r in data.records
+        ],
+        RATE,
+        "multisine",
+        N / RATE,
+    )
     got = best_linear_approximation(noisy, transient="none")
     assert got.frequency_Hz == pytest.approx(LINES * RATE / N)  # noise alone is no excitation
     G = system.response(got.frequency_Hz)
-    exact = (0.02 ** 2 + 0.05 ** 2 * np.sum(np.abs(G) ** 2, axis=2)) / 4
+    exact = (0.02**2 + 0.05**2 * np.sum(np.abs(G) ** 2, axis=2)) / 4
     assert np.mean(np.real(np.einsum("nii->ni", got.measurement_noise)) / exact) == pytest.approx(1, rel=0.05)
     assert np.mean(squared_error(got, G)) == pytest.approx(1.05, abs=0.15)
 
@@ -215,12 +225,12 @@ def test_zippered_multisines_give_one_response_for_each_input(rng):
         spectra[::2, 0], spectra[1::2, 1] = 0, 0
         u = np.tile(np.fft.irfft(spectra, N, axis=0), (5, 1))
         y = system.simulate(u)
-        runs.append((u[3 * N:], (y + 0.01 * rng.standard_normal(y.shape))[3 * N:]))
+        runs.append((u[3 * N :], (y + 0.01 * rng.standard_normal(y.shape))[3 * N :]))
     data = campaign(runs, RATE, "multisine", N / RATE)
     parts = {r.inputs: r for r in best_linear_approximations(data, transient="none")}
     assert set(parts) == {("u1",), ("u2",)}
     for j, part in enumerate((parts["u1",], parts["u2",])):
-        exact = system.response(part.frequency_Hz)[:, :, j:j + 1]
+        exact = system.response(part.frequency_Hz)[:, :, j : j + 1]
         assert np.mean(squared_error(part, exact)) == pytest.approx(1.2, abs=0.4)
     with pytest.raises(InputError, match="different lines excite different inputs"):
         best_linear_approximation(data, transient="none")
@@ -232,7 +242,7 @@ def test_inputs_one_after_the_other(rng):
     runs = []
     for k in range(4):
         u = np.tile(multisine(rng, N, LINES, 1)[0], (4, 1)) @ np.eye(2)[k % 2][None]
-        runs.append((u[2 * N:], system.simulate(u)[2 * N:]))
+        runs.append((u[2 * N :], system.simulate(u)[2 * N :]))
     data = campaign(runs, RATE, "multisine", N / RATE)
     got = best_linear_approximation(data, transient="none")
     assert got.inputs == ("u1", "u2") and np.allclose(got.value, system.response(got.frequency_Hz), atol=1e-6)
@@ -248,8 +258,18 @@ def test_what_cannot_be_estimated_is_said(rng):
     noise = campaign([(rng.standard_normal((400, 1)), rng.standard_normal((400, 1)))], RATE)
     with pytest.raises(InputError, match="multisine records"):
         best_linear_approximation(noise)
-    two = Campaign("test", tuple(campaign([(r.u * k, r.y) for r, k in zip(data.records, (1, 1, 3, 3), strict=True)],
-                                          RATE, "multisine", N / RATE, levels=[0.01, 0.01, 0.03, 0.03]).records))
+    two = Campaign(
+        "test",
+        tuple(
+            campaign(
+                [(r.u * k, r.y) for r, k in zip(data.records, (1, 1, 3, 3), strict=True)],
+                RATE,
+                "multisine",
+                N / RATE,
+                levels=[0.01, 0.01, 0.03, 0.03],
+            ).records
+        ),
+    )
     wrong = campaign([(rng.standard_normal((4 * N, 1)), rng.standard_normal((4 * N, 1)))], RATE, "multisine", N / RATE)
     with pytest.raises(InputError, match="check the period"):
         best_linear_approximation(wrong)

@@ -21,7 +21,7 @@ def above_noise_dB(levels, kind):
 
 def odd_multisine(rng, detection=True):
     """Odd lines but for one of each group of four, chosen at random."""
-    left_out = {int(rng.choice(ODD[k:k + 4])) for k in range(0, ODD.size - 4, 4)} if detection else set()
+    left_out = {int(rng.choice(ODD[k : k + 4])) for k in range(0, ODD.size - 4, 4)} if detection else set()
     spectrum = np.zeros(N // 2 + 1, complex)
     for line in ODD:
         if line not in left_out:
@@ -40,11 +40,11 @@ def record(rng, plant, noise, periods=4, detection=True):
 def test_parts_of_a_static_nonlinearity(even, odd):
     """y = u + even u^2 + odd u^3: noise-free parts by direct computation, u^3 less its regression on u."""
     rng = np.random.default_rng(1)
-    data = record(rng, lambda u: np.hstack([u + even * u ** 2 + odd * u ** 3, u]), 0.01)
+    data = record(rng, lambda u: np.hstack([u + even * u**2 + odd * u**3, u]), 0.01)
     got = distortion_levels(data, "00", transient="none")
     u = data.records[0].u[:N, 0]
     band = slice(ODD[0], ODD[-1] + 1)
-    square, cube = (np.fft.rfft(x)[band] / N for x in (u ** 2, u ** 3 - (u @ u ** 3) / (u @ u) * u))
+    square, cube = (np.fft.rfft(x)[band] / N for x in (u**2, u**3 - (u @ u**3) / (u @ u) * u))
     assert got.rms("even")[0] == pytest.approx(even * np.sqrt(2 * np.sum(np.abs(square) ** 2)), rel=0.05, abs=0.002)
     # Detection lines are a fourth of the odd ones: their share is known to about 1 / sqrt(49).
     assert got.rms("odd")[0] == pytest.approx(odd * np.sqrt(2 * np.sum(np.abs(cube) ** 2)), rel=0.2, abs=0.002)
@@ -92,11 +92,11 @@ def test_the_identification_report_states_it():
     from avis_ctrl.report.identification.measurements import distortion
 
     rng = np.random.default_rng(1)
-    data = record(rng, lambda u: np.hstack([u + 0.1 * u ** 2, u]), 0.01)
+    data = record(rng, lambda u: np.hstack([u + 0.1 * u**2, u]), 0.01)
     shown = distortion(data)
     [(name, even, odd)] = shown.rows
     size, _, channel = even.partition(" % ")
-    square = np.fft.rfft(data.records[0].u[:N, 0] ** 2)[ODD[0]:ODD[-1] + 1] / N  # u itself has unit variance
+    square = np.fft.rfft(data.records[0].u[:N, 0] ** 2)[ODD[0] : ODD[-1] + 1] / N  # u itself has unit variance
     assert float(size) == pytest.approx(10 * np.sqrt(2 * np.sum(np.abs(square) ** 2)), rel=0.05)
     assert channel == "(y1)"
     assert name == "00" and (odd == "below the noise" or float(odd.partition(" ")[0]) < 1.0)

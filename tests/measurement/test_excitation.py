@@ -63,15 +63,17 @@ def test_flat_spectra_of_schroeders_phases_have_a_crest_factor_near_1_7():
 
 
 @settings(max_examples=15, deadline=None)
-@given(n=st.integers(2, 12), seed=st.integers(0, 2 ** 32 - 1))
+@given(n=st.integers(2, 12), seed=st.integers(0, 2**32 - 1))
 def test_crest_factor_is_never_worse_than_at_the_start(n, seed):
     rng = np.random.default_rng(seed)
     lines, amplitude = np.sort(rng.choice(np.arange(1, 30), n, replace=False)), rng.uniform(0.1, 3.0, n)
     drawn = rng.uniform(0, 2 * np.pi, n)
     turns = rng.uniform(0, np.pi, 3)
     found = low_crest_phases(lines, amplitude, drawn, 128, turns)
-    peaks = [max(np.max(np.abs(synthesise(lines, amplitude, phase + turn, 128))) for turn in turns)
-             for phase in (found, drawn)]
+    peaks = [
+        max(np.max(np.abs(synthesise(lines, amplitude, phase + turn, 128))) for turn in turns)
+        for phase in (found, drawn)
+    ]
     assert peaks[0] <= peaks[1]
 
 
@@ -83,9 +85,9 @@ def test_experiments_are_orthogonal_at_every_line_and_silent_elsewhere(n_u):
     lines = np.round(signals.line_Hz * 2.0).astype(int)
     assert np.array_equal(lines, np.arange(2, 121))
     for r in range(2):
-        of_one = np.moveaxis(U[r * n_u:(r + 1) * n_u, lines], 0, -1)  # (lines, inputs, experiments)
+        of_one = np.moveaxis(U[r * n_u : (r + 1) * n_u, lines], 0, -1)  # (lines, inputs, experiments)
         gram = of_one @ np.conj(np.swapaxes(of_one, 1, 2))
-        power = 0.5 ** 2 / lines.size / 2  # of each input's line: rms^2 = 2 sum |U|^2
+        power = 0.5**2 / lines.size / 2  # of each input's line: rms^2 = 2 sum |U|^2
         assert np.allclose(gram, n_u * power * np.eye(n_u), atol=1e-9 * power)
     assert np.max(np.abs(np.delete(U, lines, axis=1))) < 1e-12
     assert np.allclose(signals.rms_V, 0.5) and np.all(signals.peak_V <= 10.0)
@@ -105,7 +107,7 @@ def test_odd_lines_and_detection_lines():
     lines, left_out = choose_lines(wanted(lines="odd_detection", group=4), np.random.default_rng(1))
     assert np.array_equal(np.sort(np.concatenate([lines, left_out])), odd)
     for start in range(0, odd.size - 3, 4):
-        assert np.isin(odd[start:start + 4], left_out).sum() == 1
+        assert np.isin(odd[start : start + 4], left_out).sum() == 1
     assert len({int(np.flatnonzero(odd == k)[0]) % 4 for k in left_out}) > 1
     u = multisine(wanted(lines="odd_detection")).u
     # Only odd lines: the second half of the period is the first with its sign changed.
@@ -135,8 +137,11 @@ def test_the_held_voltage_is_flat_where_the_hold_is_compensated():
         fine = np.repeat(signals.u[0, :, 1], 200)
         held = np.abs(np.fft.rfft(fine))[np.round(signals.line_Hz * 2).astype(int)]
         assert np.allclose(held / held[0], 1.0, rtol=1e-5) if compensated else held[-1] < 0.8 * held[0]
-    again = multisine(MultisineSettings(**{key: tuple(value) if isinstance(value, list) else value
-                                           for key, value in signals.settings.items()}))
+    again = multisine(
+        MultisineSettings(
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in signals.settings.items()}
+        )
+    )
     assert np.array_equal(again.u, signals.u)  # the settings reproduce the signals
 
 
@@ -169,8 +174,10 @@ def test_noise_is_gaussian_flat_in_its_band_and_independent():
 
 
 def test_a_seed_gives_one_signal():
-    for make, given_ in ((multisine, wanted(2, lines="odd_detection")),
-                         (noise, NoiseSettings(("a",), 1000.0, 5.0, (1.0, 100.0), 10.0, 1.0))):
+    for make, given_ in (
+        (multisine, wanted(2, lines="odd_detection")),
+        (noise, NoiseSettings(("a",), 1000.0, 5.0, (1.0, 100.0), 10.0, 1.0)),
+    ):
         first, again, other = (make(replace(given_, seed=seed)) for seed in (3, 3, 4))
         assert np.array_equal(first.u, again.u) and not np.array_equal(first.u, other.u)
 
@@ -190,7 +197,7 @@ def test_files_give_back_the_samples_the_seed_and_the_settings(tmp_path):
             assert group.attrs["excitation"] == "multisine" and group.attrs["sample_rate_Hz"] == 500.0
             assert group.attrs["level_V"] == pytest.approx(0.5) and list(group["u"].attrs["names"]) == ["A1", "A2"]
     lines = (tmp_path / "u.csv").read_text().splitlines()
-    assert "# seed = 9" in lines and "# rig = \"mine\"" in lines
+    assert "# seed = 9" in lines and '# rig = "mine"' in lines
     header, *rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     table = np.array(rows, float)
     assert header == ["record", "time_s", "A1", "A2"]
@@ -198,14 +205,19 @@ def test_files_give_back_the_samples_the_seed_and_the_settings(tmp_path):
     content = loadmat(tmp_path / "u.mat", simplify_cells=True)
     assert np.array_equal(np.moveaxis(content["u"], -1, 0), thrice) and content["seed"] == 9
     assert list(content["names"]) == ["A1", "A2"] and json.loads(content["settings"])["lines"] == "full"
-    for name, periods, expected in (("u.txt", 1, "ends in"), ("u.h5", 0, "periods"), ("no/such/u.h5", 1, "written"),
-                                    ("no/such/u.csv", 1, "written"), ("no/such/u.mat", 1, "written")):
+    for name, periods, expected in (
+        ("u.txt", 1, "ends in"),
+        ("u.h5", 0, "periods"),
+        ("no/such/u.h5", 1, "written"),
+        ("no/such/u.csv", 1, "written"),
+        ("no/such/u.mat", 1, "written"),
+    ):
         with pytest.raises(InputError, match=expected):
             write_signals(signals, tmp_path / name, periods=periods)
     with pytest.raises(InputError, match="fit into memory"):
         NoiseSettings(("a",), 1000.0, 1e9, (1.0, 100.0), 10.0, 1.0)
     with pytest.raises(InputError, match=r"write \.h5 instead"):
-        write_signals(signals, tmp_path / "u.mat", periods=10 ** 9)
+        write_signals(signals, tmp_path / "u.mat", periods=10**9)
     one = noise(NoiseSettings(("a",), 1000.0, 5.0, (1.0, 100.0), 10.0, 1.0))
     with pytest.raises(InputError, match="not periodic"):
         write_signals(one, tmp_path / "n.h5", periods=2)
@@ -213,16 +225,29 @@ def test_files_give_back_the_samples_the_seed_and_the_settings(tmp_path):
     assert np.isnan(loadmat(tmp_path / "n.mat")["period_s"])
 
 
-WRONG = [({"inputs": ()}, "inputs"), ({"inputs": ("a", "a")}, "inputs"), ({"sample_rate_Hz": -1.0}, "sample_rate_Hz"),
-         ({"period_s": np.nan}, "period_s"), ({"period_s": 1.0001}, "whole number of samples"),
-         ({"band_Hz": (0.0, 10.0)}, "band_Hz"), ({"band_Hz": (20.0, 10.0)}, "band_Hz"),
-         ({"band_Hz": (1.0, 250.0)}, "below half the sample rate"), ({"band_Hz": (1.1, 1.2)}, "at least 1 line"),
-         ({"band_Hz": (1.0, 1.5), "scheme": "zippered"}, "at least 3 lines"), ({"lines": "even"}, "lines"),
-         ({"scheme": "none"}, "scheme"), ({"spacing": 0}, "spacing"), ({"dealt": -1}, "dealt"),
-         ({"period_s": 1e6}, "fit into memory"), ({"realisations": 10 ** 9}, "fit into memory"),
-         ({"group": 1}, "group"),
-         ({"realisations": 1.5}, "realisations"), ({"seed": -1}, "seed"), ({"rms_V": 0.0}, "rms_V"),
-         ({"limit_V": np.inf}, "limit_V")]
+WRONG = [
+    ({"inputs": ()}, "inputs"),
+    ({"inputs": ("a", "a")}, "inputs"),
+    ({"sample_rate_Hz": -1.0}, "sample_rate_Hz"),
+    ({"period_s": np.nan}, "period_s"),
+    ({"period_s": 1.0001}, "whole number of samples"),
+    ({"band_Hz": (0.0, 10.0)}, "band_Hz"),
+    ({"band_Hz": (20.0, 10.0)}, "band_Hz"),
+    ({"band_Hz": (1.0, 250.0)}, "below half the sample rate"),
+    ({"band_Hz": (1.1, 1.2)}, "at least 1 line"),
+    ({"band_Hz": (1.0, 1.5), "scheme": "zippered"}, "at least 3 lines"),
+    ({"lines": "even"}, "lines"),
+    ({"scheme": "none"}, "scheme"),
+    ({"spacing": 0}, "spacing"),
+    ({"dealt": -1}, "dealt"),
+    ({"period_s": 1e6}, "fit into memory"),
+    ({"realisations": 10**9}, "fit into memory"),
+    ({"group": 1}, "group"),
+    ({"realisations": 1.5}, "realisations"),
+    ({"seed": -1}, "seed"),
+    ({"rms_V": 0.0}, "rms_V"),
+    ({"limit_V": np.inf}, "limit_V"),
+]
 
 
 @pytest.mark.parametrize(("changes", "expected"), WRONG, ids=[str(k) for k in range(len(WRONG))])
@@ -230,7 +255,7 @@ def test_wrong_settings_are_answered_in_one_line(changes, expected):
     with pytest.raises(InputError, match=expected) as caught:
         multisine(wanted(3, **changes))
     assert "\n" not in str(caught.value)
-    for name in ({"sample_rate_Hz", "band_Hz", "inputs", "seed"} & set(changes)):
+    for name in {"sample_rate_Hz", "band_Hz", "inputs", "seed"} & set(changes):
         if changes.get("scheme") is None and changes[name] != (1.1, 1.2):
             with pytest.raises(InputError, match=name):
                 noise(replace(NoiseSettings(("a",), 500.0, 5.0, (1.0, 100.0), 10.0, 1.0), **{name: changes[name]}))
@@ -243,7 +268,9 @@ def test_the_gradient_of_the_norm_leads_to_a_stationary_peak():
     # A shift in time takes the first phase to zero.
     grid = np.stack(np.meshgrid([0.0], turn, turn, indexing="ij"), -1).reshape(-1, 3)
     least = np.abs(synthesise(lines, one, grid, 96)).max(axis=1).min()
-    found = [np.abs(synthesise(lines, one, low_crest_phases(lines, one, start, 96), 96)).max()
-             for start in np.random.default_rng(2).uniform(0, 2 * np.pi, (8, 3))]
+    found = [
+        np.abs(synthesise(lines, one, low_crest_phases(lines, one, start, 96), 96)).max()
+        for start in np.random.default_rng(2).uniform(0, 2 * np.pi, (8, 3))
+    ]
     # The last norm, p = 256, still differs from the peak by up to 96^(1/256) - 1 = 1.8 %.
     assert min(found) < 1.018 * least

@@ -20,8 +20,10 @@ MODES_HZ = (805.0, 921.0, 1315.0, 1671.0, 2274.0)
 @pytest.fixture(scope="module")
 def measured(data):
     """Both levels; recorded in the steady state, so there is no transient to remove."""
-    return {level: best_linear_approximation(mirror(data, level), band_Hz=(2, 3000), transient="none")
-            for level in (100, 300)}
+    return {
+        level: best_linear_approximation(mirror(data, level), band_Hz=(2, 3000), transient="none")
+        for level in (100, 300)
+    }
 
 
 def power(covariance):
@@ -36,9 +38,18 @@ def test_two_realisations_of_three_orthogonal_experiments_are_found(measured):
         assert got.dof == 15  # 6 - 3 on each of five lines
 
 
-@pytest.mark.parametrize(("level", "band", "expected_dB"), [
-    (100, (100, 750), 10.7), (100, (750, 850), 15.9), (100, (900, 2400), 4.8),
-    (300, (2, 100), 22.2), (300, (100, 750), 23.3), (300, (750, 850), 15.5), (300, (900, 2400), 19.5)])
+@pytest.mark.parametrize(
+    ("level", "band", "expected_dB"),
+    [
+        (100, (100, 750), 10.7),
+        (100, (750, 850), 15.9),
+        (100, (900, 2400), 4.8),
+        (300, (2, 100), 22.2),
+        (300, (100, 750), 23.3),
+        (300, (750, 850), 15.5),
+        (300, (900, 2400), 19.5),
+    ],
+)
 def test_distortion_stands_above_noise(measured, level, band, expected_dB):
     """Measured ratios of distortion to noise of the mean of two periods. Below 100 Hz at 100 mV noise hides it."""
     got = measured[level].between(*band)
@@ -73,7 +84,7 @@ def test_gain_at_low_frequency_grows_with_the_level(measured):
     assert np.all(gain[300] / gain[100] > 1.03) and np.all(gain[300] / gain[100] < 1.13)
     spread = np.sqrt(sum(m.variance().mean(axis=0) / len(m.value) for m in low.values()))
     assert np.all(gain[300] - gain[100] > 1.5 * spread)
-    assert np.sum(gain[300] - gain[100]) > 20 * np.sqrt(np.sum(spread ** 2))
+    assert np.sum(gain[300] - gain[100]) > 20 * np.sqrt(np.sum(spread**2))
 
 
 def test_the_first_mode_falls_with_the_level(measured):

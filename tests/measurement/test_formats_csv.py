@@ -23,9 +23,15 @@ def path(tmp_path):
     return tmp_path / "a.csv"
 
 
-@given(arrays(float, st.tuples(st.integers(2, 30), st.just(2)), elements=FINITE), st.sampled_from(",;\t"),
-       st.booleans(), st.sampled_from(["\n", "\r\n", "\r"]), st.booleans(),
-       st.sampled_from(["utf-8", "utf-8-sig", "utf-16"]), st.integers(1, 7))
+@given(
+    arrays(float, st.tuples(st.integers(2, 30), st.just(2)), elements=FINITE),
+    st.sampled_from(",;\t"),
+    st.booleans(),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+    st.booleans(),
+    st.sampled_from(["utf-8", "utf-8-sig", "utf-16"]),
+    st.integers(1, 7),
+)
 @settings(max_examples=60, deadline=None)
 def test_numbers_survive_every_spelling(tmp_path_factory, table, separator, comma, newline, final, encoding, chunk):
     path = tmp_path_factory.getbasetemp() / "spelling.csv"
@@ -65,8 +71,10 @@ def shifted(at, by):
 
 
 STAMPS = {
-    "backwards": (np.concatenate([np.arange(100), np.arange(90, 190)]) / 100,
-                  r"not later than the one before: 1, the first at data row 101: 0.9 s after 0.99 s"),
+    "backwards": (
+        np.concatenate([np.arange(100), np.arange(90, 190)]) / 100,
+        r"not later than the one before: 1, the first at data row 101: 0.9 s after 0.99 s",
+    ),
     "still": (np.repeat(np.arange(100), 2) / 100, r"not later than the one before: 100, the first at data row 2: "),
     "gap": (np.delete(np.arange(200), [50, 51, 120]) / 100, r"gaps: 2, the first before data row 51: 0.03 s instead"),
     "uneven": (shifted(30, 0.003), r"1 are more than 0.1 of a sample off, the worst at data row 31 by 0.3 samples"),
@@ -138,7 +146,7 @@ GOOD = ["t,A1,S1"] + [f"{i / 4},{i % 2},{i}" for i in range(8)]
 
 
 def edited(line, text):
-    return "\n".join([*GOOD[:line], text, *GOOD[line + 1:]])
+    return "\n".join([*GOOD[:line], text, *GOOD[line + 1 :]])
 
 
 WRONG = {

@@ -21,8 +21,9 @@ from avis_ctrl.measurement.formats import read_measurements, write_campaign, wri
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-NAMES = st.lists(st.text("ABCxyz0123456789_ é", min_size=1).map(str.strip).filter(bool), min_size=1, max_size=3,
-                 unique=True)
+NAMES = st.lists(
+    st.text("ABCxyz0123456789_ é", min_size=1).map(str.strip).filter(bool), min_size=1, max_size=3, unique=True
+)
 
 
 @st.composite
@@ -32,13 +33,27 @@ def campaigns(draw):
     for i in range(draw(st.integers(1, 3))):
         samples = draw(st.integers(3, 12))
         floor = draw(st.booleans())
-        header = RecordHeader(f"{9 - i:02d}", rate, samples, tuple(u_names), tuple(y_names),
-                              draw(st.sampled_from(["noise", "rest", "multisine"])), draw(st.floats(0, 1e3)),
-                              draw(st.floats(-1e9, 1e9)), period_s=2 / rate, y_unit="m/s",
-                              floor_names=("vx", "vy", "vz") if floor else ())
-        records.append(Record(header, draw(arrays(float, (samples, len(u_names)), elements=FINITE)),
-                              draw(arrays(float, (samples, len(y_names)), elements=FINITE)),
-                              draw(arrays(float, (samples, 3), elements=FINITE)) if floor else None))
+        header = RecordHeader(
+            f"{9 - i:02d}",
+            rate,
+            samples,
+            tuple(u_names),
+            tuple(y_names),
+            draw(st.sampled_from(["noise", "rest", "multisine"])),
+            draw(st.floats(0, 1e3)),
+            draw(st.floats(-1e9, 1e9)),
+            period_s=2 / rate,
+            y_unit="m/s",
+            floor_names=("vx", "vy", "vz") if floor else (),
+        )
+        records.append(
+            Record(
+                header,
+                draw(arrays(float, (samples, len(u_names)), elements=FINITE)),
+                draw(arrays(float, (samples, len(y_names)), elements=FINITE)),
+                draw(arrays(float, (samples, 3), elements=FINITE)) if floor else None,
+            )
+        )
     return Campaign("rig ä", tuple(records))
 
 
@@ -94,6 +109,7 @@ def test_every_sample_enters_the_digest_once_however_long_the_pieces_are():
         def load(self, start=0, stop=None):
             loaded.append((start, stop))
             return super().load(start, stop)
+
     u, y = np.arange(7.0)[:, None], np.ones((7, 1))
     digest(Campaign("avis", (Watched(header, u, y),)), longest=3)
     assert loaded == [(0, 3), (3, 7)]
@@ -111,8 +127,11 @@ def plain_file(path, **changes):
         for name in ("00", "01"):
             group = file.create_group(f"records/{name}")
             group.attrs.update({"sample_rate_Hz": 100.0, "excitation": "noise", "level_V": 0.5, "start_s": 0.0})
-            for role, names, unit in (("u", ["A1", "A2"], "V"), ("y", ["S1", "S2", "S3"], "V"),
-                                      ("floor", ["vx", "vy", "vz"], "m/s")):
+            for role, names, unit in (
+                ("u", ["A1", "A2"], "V"),
+                ("y", ["S1", "S2", "S3"], "V"),
+                ("floor", ["vx", "vy", "vz"], "m/s"),
+            ):
                 group[role] = rng.normal(size=(40, len(names)))
                 group[role].attrs.update({"names": names, "unit": unit})
         for change in changes.values():
@@ -137,6 +156,7 @@ def test_values_as_other_writers_store_them(path):
         record["u"].attrs["names"] = np.array([b"A1", b"A2"])
         record["y"].attrs["names"] = "S1,S2,S3"
         record["y"].attrs["unit"] = np.array([b"V"])
+
     plain_file(path, edit=spellings)
     campaign = read_measurements(path)
     assert campaign.rig == "avis" and campaign.u_names == ("A1", "A2") and campaign.y_names == ("S1", "S2", "S3")
@@ -150,6 +170,7 @@ def test_one_dimensional_y_is_one_channel_and_units_become_si(path):
         del file["records/01"], file["records/00/y"]
         file["records/00/y"] = y
         file["records/00/y"].attrs.update({"names": "S1", "unit": "mm/s"})
+
     record = read_measurements(plain_file(path, edit=edit)).records[0]
     assert record.header.y_unit == "m/s" and record.header.y_names == ("S1",)
     np.testing.assert_allclose(record.load(5, 9).y, 1e-3 * y[5:9, None], rtol=1e-15)
@@ -169,6 +190,7 @@ def test_records_keep_their_natural_order(path):
     def edit(file):
         for name in ("10", "2"):
             file.copy("records/00", f"records/{name}")
+
     names = [record.header.name for record in read_measurements(plain_file(path, edit=edit)).records]
     assert names == ["00", "01", "2", "10"]
 
@@ -176,6 +198,7 @@ def test_records_keep_their_natural_order(path):
 def at(target, field, value):
     def edit(file):
         file[target].attrs[field] = value
+
     return edit
 
 
@@ -185,6 +208,7 @@ def without(target, field=None):
             del file[target]
         else:
             del file[target].attrs[field]
+
     return edit
 
 
@@ -197,6 +221,7 @@ def data(role, value, names=None, unit="V"):
         else:
             file[f"records/00/{role}"] = value
         file[f"records/00/{role}"].attrs.update({"names": names_, "unit": unit})
+
     return edit
 
 
@@ -248,6 +273,7 @@ def test_a_wrong_campaign_is_refused_in_one_line(path, case):
 def test_samples_that_are_no_numbers_are_named_by_place(path, value):
     def edit(file):
         file["records/01/y"][33, 2] = value
+
     record = read_measurements(plain_file(path, edit=edit)).records[1]
     record.load(0, 33)
     with pytest.raises(InputError, match=rf"a.h5: record 01: y = {value}: .* infinite: 1, .* sample 33 of .* S3"):
@@ -257,6 +283,7 @@ def test_samples_that_are_no_numbers_are_named_by_place(path, value):
 def test_a_constant_channel_is_read(path):
     def edit(file):
         file["records/00/y"][:, 1] = 3.0
+
     assert np.ptp(read_measurements(plain_file(path, edit=edit)).records[0].load().y[:, 1]) == 0.0
 
 
@@ -316,14 +343,27 @@ def test_two_records_of_one_name_cannot_be_written(path):
 
 # Frequency responses
 
+
 def covariance_response(rng, n=5, n_y=3, n_u=2):
     def hermitian(m):
         factor = rng.normal(size=(n, m, m)) + 1j * rng.normal(size=(n, m, m))
         return factor @ factor.conj().transpose(0, 2, 1)
+
     value = rng.normal(size=(n, n_y, n_u)) + 1j * rng.normal(size=(n, n_y, n_u))
-    return FrequencyResponse(np.sort(rng.uniform(1, 9, n)), value, hermitian(n_y), hermitian(n_u), ("A1", "A2"),
-                             ("S1", "S2", "S3"), "V", "m/s", 12.0, hermitian(n_y), hermitian(n_y),
-                             method="local polynomial")
+    return FrequencyResponse(
+        np.sort(rng.uniform(1, 9, n)),
+        value,
+        hermitian(n_y),
+        hermitian(n_u),
+        ("A1", "A2"),
+        ("S1", "S2", "S3"),
+        "V",
+        "m/s",
+        12.0,
+        hermitian(n_y),
+        hermitian(n_y),
+        method="local polynomial",
+    )
 
 
 def same(one, two):
@@ -338,8 +378,15 @@ def test_frequency_responses_are_read_as_written(path, rng):
     response = covariance_response(rng)
     write_frequency_response(path, response, "avis")
     same(read_measurements(path), response)
-    entries = replace(response, noise=None, gram=None, measurement_noise=None, distortion=None, dof=np.inf,
-                      entry_variance=rng.uniform(0, 1, response.value.shape))
+    entries = replace(
+        response,
+        noise=None,
+        gram=None,
+        measurement_noise=None,
+        distortion=None,
+        dof=np.inf,
+        entry_variance=rng.uniform(0, 1, response.value.shape),
+    )
     write_frequency_response(path, entries)
     same(read_measurements(path), entries)
 
@@ -351,16 +398,18 @@ def response_file(path, rng, edit):
         group["frequency_Hz"] = np.arange(1.0, 6.0)
         group["value"] = rng.normal(size=(5, 2, 1)) + 0j
         group["coherence"] = rng.uniform(0.5, 1, (5, 2, 1))
-        group.attrs.update({"inputs": ["A1"], "outputs": ["S1", "S2"], "input_unit": "V", "output_unit": "mV",
-                            "averages": 20})
+        group.attrs.update(
+            {"inputs": ["A1"], "outputs": ["S1", "S2"], "input_unit": "V", "output_unit": "mV", "averages": 20}
+        )
         edit(file)
     return path
 
 
 @pytest.mark.parametrize(("units", "factor"), [(("V", "mV"), 1e-3), (("mV", "V"), 1e3), (("mV", "mm/s"), 1.0)])
 def test_a_response_with_coherence_gets_variances_in_si(path, rng, units, factor):
-    response = read_measurements(response_file(path, rng, lambda file: file["frf"].attrs.update(
-        input_unit=units[0], output_unit=units[1])))
+    response = read_measurements(
+        response_file(path, rng, lambda file: file["frf"].attrs.update(input_unit=units[0], output_unit=units[1]))
+    )
     with h5py.File(path) as file:
         c, value = file["frf/coherence"][()], file["frf/value"][()] * factor
     np.testing.assert_allclose(response.value, value)
@@ -370,10 +419,12 @@ def test_a_response_with_coherence_gets_variances_in_si(path, rng, units, factor
 def test_coherence_tells_the_errors_of_averaged_responses(rng):
     """Monte Carlo: H1 of random inputs, E|error|^2 known from the draws themselves."""
     from avis_ctrl.measurement.formats.response import coherence_variance
+
     trials, averages, G = 20000, 12, 2.0 - 1.0j
 
     def complex_normal():
         return (rng.normal(size=(trials, averages)) + 1j * rng.normal(size=(trials, averages))) / np.sqrt(2)
+
     u = complex_normal()
     y = G * u + 1.5 * complex_normal()
     uu, yy, yu = ((np.abs(u) ** 2).sum(1), (np.abs(y) ** 2).sum(1), (y * u.conj()).sum(1))
@@ -383,7 +434,7 @@ def test_coherence_tells_the_errors_of_averaged_responses(rng):
     # Standard error of the ratio: below 1 % each for 20000 draws; the rule with n_d itself would be 8 % low.
     assert abs(np.mean(stated) / true - 1) < 0.04
     # Closed form: sigma^2 E[1 / sum|u|^2] = 1.5^2 / (n_d - 1).
-    assert abs(true / (1.5 ** 2 / (averages - 1)) - 1) < 0.03
+    assert abs(true / (1.5**2 / (averages - 1)) - 1) < 0.03
 
 
 def group_edit(action):
@@ -394,6 +445,7 @@ def put(name, value):
     def edit(group):
         del group[name]
         group[name] = value
+
     return group_edit(edit)
 
 
@@ -429,6 +481,7 @@ def test_a_stated_deviation_stands_in_for_unknown_errors_and_lines_of_no_coheren
 
     def one_zero(group):
         group["coherence"][2, 1, 0] = 0.0
+
     response = read_measurements(response_file(path, rng, group_edit(one_zero)))
     assert list(response.frequency_Hz) == [1.0, 2.0, 4.0, 5.0] and "1 lines of coherence 0" in response.method
 
@@ -462,8 +515,13 @@ def large_file(path):
 @pytest.mark.parametrize("skip", [6, pytest.param(1, marks=pytest.mark.slow)])
 def test_ten_gigabytes_are_read_in_pieces_with_less_than_two(path, skip):
     samples = large_file(path)
-    done = subprocess.run([sys.executable, "-c", READ_IN_PIECES, str(path), str(skip)], capture_output=True, text=True,
-                          check=True, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"})
+    done = subprocess.run(
+        [sys.executable, "-c", READ_IN_PIECES, str(path), str(skip)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )
     total, peak_kB = map(int, done.stdout.split())
     assert total == samples if skip == 1 else total > samples / 10
     assert peak_kB < 2e6, f"{peak_kB} kB"

@@ -24,16 +24,19 @@ from avis_ctrl.measurement.formats import (
 )
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
-CSV = "# excitation = noise\r\nt [s];A1 [V];S1 [mV]\r\n" + "".join(f"{i / 8:g};{i % 3},5;-1,{i}\r\n".replace(".", ",")
-                                                                  for i in range(12))
+CSV = "# excitation = noise\r\nt [s];A1 [V];S1 [mV]\r\n" + "".join(
+    f"{i / 8:g};{i % 3},5;-1,{i}\r\n".replace(".", ",") for i in range(12)
+)
 
 
 def time_function(name, values, binary):
     """A data set 58 or 58b of a real, single precision, even time response."""
-    head = ["NONE"] * 5 + [f"{1:5d}{0:10d}{0:5d}{0:10d} {name:10s}{1:10d}{3:4d} {'NONE':10s}{0:10d}{0:4d}",
-                           f"{2:10d}{len(values):10d}{1:10d}{0.0:13.5E}{0.125:13.5E}{0.0:13.5E}",
-                           f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':20s} {'s':20s}",
-                           f"{1:10d}{0:5d}{0:5d}{0:5d} {'Voltage':20s} {'V':20s}"]
+    head = ["NONE"] * 5 + [
+        f"{1:5d}{0:10d}{0:5d}{0:10d} {name:10s}{1:10d}{3:4d} {'NONE':10s}{0:10d}{0:4d}",
+        f"{2:10d}{len(values):10d}{1:10d}{0.0:13.5E}{0.125:13.5E}{0.0:13.5E}",
+        f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':20s} {'s':20s}",
+        f"{1:10d}{0:5d}{0:5d}{0:5d} {'Voltage':20s} {'V':20s}",
+    ]
     head += [f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':20s} {'NONE':20s}"] * 2
     if binary:
         body = np.asarray(values, "<f4").tobytes()
@@ -58,11 +61,28 @@ def valid(tmp_path_factory):
     u, y = rng.normal(size=(60, 2)), rng.normal(size=(60, 3))
     header = RecordHeader("00", 100.0, 60, ("A1", "A2"), ("S1", "S2", "S3"), "noise", 1.0)
     write_campaign(folder / "h5", Campaign("avis", (Record(header, u, y),)))
-    write_frequency_response(folder / "frf", FrequencyResponse(
-        np.arange(1.0, 9.0), rng.normal(size=(8, 1, 1)) + 0j, None, None, ("A1",), ("S1",),
-        entry_variance=np.ones((8, 1, 1))))
-    fields = {"sample_rate_Hz": 100.0, "excitation": "noise", "level_V": 1.0, "start_s": 0.0, "u": u, "y": y,
-              "u_names": np.array(["A1", "A2"], object), "y_names": np.array(["S1", "S2", "S3"], object)}
+    write_frequency_response(
+        folder / "frf",
+        FrequencyResponse(
+            np.arange(1.0, 9.0),
+            rng.normal(size=(8, 1, 1)) + 0j,
+            None,
+            None,
+            ("A1",),
+            ("S1",),
+            entry_variance=np.ones((8, 1, 1)),
+        ),
+    )
+    fields = {
+        "sample_rate_Hz": 100.0,
+        "excitation": "noise",
+        "level_V": 1.0,
+        "start_s": 0.0,
+        "u": u,
+        "y": y,
+        "u_names": np.array(["A1", "A2"], object),
+        "y_names": np.array(["S1", "S2", "S3"], object),
+    }
     scipy.io.savemat(folder / "mat", {"records": [fields, fields], "rig": "avis"})
     scipy.io.savemat(folder / "zip", {"u": u, "y": y, "fs": 100.0}, do_compression=True)
     Matlab73(folder / "v73", {"records": [fields, fields], "rig": "avis"})
@@ -103,7 +123,7 @@ def test_the_valid_files_are_valid(valid, tmp_path, kind):
 def test_cut_anywhere(valid, tmp_path_factory, kind, data):
     path = tmp_path_factory.getbasetemp() / f"cut_{kind}"
     content = valid[kind]
-    path.write_bytes(content[:data.draw(st.integers(0, len(content) - 1))])
+    path.write_bytes(content[: data.draw(st.integers(0, len(content) - 1))])
     read_whole(path)
 
 
@@ -121,9 +141,21 @@ def test_bytes_changed_anywhere(valid, tmp_path_factory, kind, data):
     read_whole(path)
 
 
-@given(content=st.binary(max_size=300), head=st.sampled_from([
-    b"", b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM", b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n",
-    b"    -1\n    58\n", b"    -1\n    58b     1     2          11         100\n", b"t,u1,y1\n", b"\xff\xfe"]))
+@given(
+    content=st.binary(max_size=300),
+    head=st.sampled_from(
+        [
+            b"",
+            b"MATLAB 5.0 MAT-file" + b" " * 105 + b"\x00\x01IM",
+            b"MATLAB 7.3 MAT-file",
+            b"\x89HDF\r\n\x1a\n",
+            b"    -1\n    58\n",
+            b"    -1\n    58b     1     2          11         100\n",
+            b"t,u1,y1\n",
+            b"\xff\xfe",
+        ]
+    ),
+)
 @settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
 def test_garbage_behind_a_good_beginning(tmp_path_factory, content, head):
     path = tmp_path_factory.getbasetemp() / "garbage"
@@ -144,8 +176,9 @@ def test_what_is_no_measurement_at_all(tmp_path):
     path.write_bytes(b"")
     assert refusal(path) == f"{path}: the file is empty (0 bytes)"
     path.write_bytes(np.random.default_rng(1).bytes(5000))
-    assert refusal(path) == (f"{path}: expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of "
-                             "them")
+    assert refusal(path) == (
+        f"{path}: expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of them"
+    )
     path.write_text("just words\nand more\n")
     assert "line 1 = 'just words': not a measurement file: a text" in refusal(path)
     assert "cannot be opened" in refusal(tmp_path / ("long" * 100))
@@ -162,12 +195,15 @@ def test_the_content_tells_the_format_not_the_name(valid, tmp_path):
 
 def test_messages_of_cut_files(valid, tmp_path):
     path = tmp_path / "a"
-    parts = {"h5": (0.5, "the HDF5 file is cut short (Unable to"),
-             "mat": (0.5, "variable at byte 128: it states 6704 bytes; 3312 are left"),
-             "uff": (0.7, "data set 2 (byte "), "58b": (0.3, "of 240 bytes of data are there"),
-             "csv": (0.95, "expected 3 columns, as in the header; there are 1")}
+    parts = {
+        "h5": (0.5, "the HDF5 file is cut short (Unable to"),
+        "mat": (0.5, "variable at byte 128: it states 6704 bytes; 3312 are left"),
+        "uff": (0.7, "data set 2 (byte "),
+        "58b": (0.3, "of 240 bytes of data are there"),
+        "csv": (0.95, "expected 3 columns, as in the header; there are 1"),
+    }
     for kind, (share, message) in parts.items():
-        path.write_bytes(valid[kind][:int(share * len(valid[kind]))])
+        path.write_bytes(valid[kind][: int(share * len(valid[kind]))])
         assert message in refusal(path), kind
 
 
@@ -211,8 +247,9 @@ def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
     path.write_bytes(content.replace(f"{2:10d}{12:10d}".encode(), f"{2:10d}{999999999:10d}".encode()))
     assert "expected 3999999996 bytes for 999999999 values" in refusal(path)
     path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
-    assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refusal(path, excitation="rest",
-                                                                                              columns={"y": "A1"})
+    assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refusal(
+        path, excitation="rest", columns={"y": "A1"}
+    )
 
 
 @pytest.mark.parametrize("kind", ["mat", "zip", "csv", "uff", "58b"])
@@ -221,8 +258,10 @@ def test_formats_that_are_read_whole_are_refused_beyond_memory_by_the_size_on_di
     path.write_bytes(valid[kind] + b"\n" * 5000 if kind == "csv" else valid[kind])
     with path.open("r+b") as stream:
         stream.truncate(3_000_000_000)  # a hole: takes no place on disk
-    assert refusal(path) == (f"{path}: has 3 GB; this format is read whole, up to 1.5 GB: convert the file to an HDF5 "
-                             "campaign (/records/00/u and y), which is read in pieces")
+    assert refusal(path) == (
+        f"{path}: has 3 GB; this format is read whole, up to 1.5 GB: convert the file to an HDF5 "
+        "campaign (/records/00/u and y), which is read in pieces"
+    )
 
 
 def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeypatch):

@@ -20,8 +20,11 @@ def path(tmp_path):
 
 
 def record(rng, samples=200, **more):
-    return {"u": rng.normal(size=(samples, 2)), "y": rng.normal(size=(samples, 3)),
-            "t": np.arange(samples)[:, None] / 100.0} | more
+    return {
+        "u": rng.normal(size=(samples, 2)),
+        "y": rng.normal(size=(samples, 3)),
+        "t": np.arange(samples)[:, None] / 100.0,
+    } | more
 
 
 @both
@@ -37,8 +40,14 @@ def test_records_of_u_y_and_t_are_enough(path, rng, version):
     assert first.level_V == pytest.approx(np.sqrt(np.mean(one["u"] ** 2)), rel=1e-12) and second.level_V == 0.0
     assert isinstance(campaign.records[0], StoredRecord) == (version == "v7.3")
     np.testing.assert_array_equal(campaign.records[0].load().y, one["y"])
-    for said in ("rig not stated", "u_names not stated", "unit of y not stated; taken as V", "100 Hz by t",
-                 "'rest': u is zero", "it follows the record before it"):
+    for said in (
+        "rig not stated",
+        "u_names not stated",
+        "unit of y not stated; taken as V",
+        "100 Hz by t",
+        "'rest': u is zero",
+        "it follows the record before it",
+    ):
         assert any(said in note for note in campaign.notes), said
     assert read_measurements(path, rig="avis").rig == "avis"
 
@@ -97,18 +106,25 @@ def test_everything_that_is_missing_is_said_at_once(path, rng, version):
     with pytest.raises(InputError) as caught:
         read_measurements(path)
     assert str(caught.value).startswith(f"{path}: records: missing: ") and "\n" not in str(caught.value)
-    for said in ("fs or a time vector t (record 00)", "y, the sensor signals (record 01)",
-                 "period_s, the period in s of a multisine (not 0 or NaN) (record 00)"):
+    for said in (
+        "fs or a time vector t (record 00)",
+        "y, the sensor signals (record 01)",
+        "period_s, the period in s of a multisine (not 0 or NaN) (record 00)",
+    ):
         assert said in str(caught.value)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"t": np.zeros((200, 1))}, "record 00: t: expected increasing time stamps"),
-    ({"sample_rate_Hz": 99.0}, "record 00: sample_rate_Hz = 99.0: expected 100 Hz, the rate of the time stamps"),
-    ({"period_s": -1.0}, "record 00: period_s = -1.0: expected a positive period"),
-    ({"excitation": "chirp"}, "record 00: excitation = 'chirp': expected one of multisine"),
-    ({"y": np.zeros((100, 3))}, "record 00: expected equally many samples; u is 200x2, y is 100x3, t has 200"),
-], ids=["time", "rate", "period", "excitation", "length"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"t": np.zeros((200, 1))}, "record 00: t: expected increasing time stamps"),
+        ({"sample_rate_Hz": 99.0}, "record 00: sample_rate_Hz = 99.0: expected 100 Hz, the rate of the time stamps"),
+        ({"period_s": -1.0}, "record 00: period_s = -1.0: expected a positive period"),
+        ({"excitation": "chirp"}, "record 00: excitation = 'chirp': expected one of multisine"),
+        ({"y": np.zeros((100, 3))}, "record 00: expected equally many samples; u is 200x2, y is 100x3, t has 200"),
+    ],
+    ids=["time", "rate", "period", "excitation", "length"],
+)
 def test_what_is_wrong_is_still_refused(path, rng, change, message):
     scipy.io.savemat(path, {"records": record(rng, **change)})
     with pytest.raises(InputError, match=message) as caught:
@@ -124,8 +140,9 @@ def test_channels_named_by_the_caller(tmp_path, rng, kind):
     one = record(rng)
     path = tmp_path / {"csv": "a.csv", "hdf5": "a.h5"}.get(kind, "a.mat")
     if kind == "csv":
-        np.savetxt(path, np.hstack([one["t"], one["u"], one["y"]]), delimiter=",", comments="",
-                   header="t,u1,u2,y1,y2,y3")
+        np.savetxt(
+            path, np.hstack([one["t"], one["u"], one["y"]]), delimiter=",", comments="", header="t,u1,u2,y1,y2,y3"
+        )
     else:
         scipy.io.savemat(tmp_path / "a.mat", one if kind == "flat" else {"records": one})
     if kind == "hdf5":
@@ -161,8 +178,9 @@ def test_names_tell_which_way_round_a_matrix_is(path, rng):
 
 
 def test_frequency_responses_get_names_too(path, rng):
-    scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 8.0), "H": rng.normal(size=(7, 3, 2)),
-                            "variance": np.ones((7, 3, 2))})
+    scipy.io.savemat(
+        path, {"frequency_Hz": np.arange(1.0, 8.0), "H": rng.normal(size=(7, 3, 2)), "variance": np.ones((7, 3, 2))}
+    )
     response = read_measurements(path, NAMES)
     assert response.inputs == ("A", "B") and response.outputs == ("p", "q", "r")
 

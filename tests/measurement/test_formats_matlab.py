@@ -20,9 +20,20 @@ def cells(names):
 
 
 def fields(rng, **changes):
-    record = {"sample_rate_Hz": 100.0, "excitation": "multisine", "level_V": 1.0, "start_s": 0.0, "period_s": 0.2,
-              "u": rng.normal(size=(60, 2)), "y": rng.normal(size=(60, 3)), "floor": rng.normal(size=(60, 3)),
-              "u_names": cells(["A1", "A2"]), "y_names": cells(["S1", "S2", "S3"]), "u_unit": "V", "y_unit": "m/s"}
+    record = {
+        "sample_rate_Hz": 100.0,
+        "excitation": "multisine",
+        "level_V": 1.0,
+        "start_s": 0.0,
+        "period_s": 0.2,
+        "u": rng.normal(size=(60, 2)),
+        "y": rng.normal(size=(60, 3)),
+        "floor": rng.normal(size=(60, 3)),
+        "u_names": cells(["A1", "A2"]),
+        "y_names": cells(["S1", "S2", "S3"]),
+        "u_unit": "V",
+        "y_unit": "m/s",
+    }
     return {key: value for key, value in (record | changes).items() if value is not MISSING}
 
 
@@ -86,8 +97,9 @@ def path(tmp_path):
 @pytest.mark.parametrize("transposed", [False, True])
 def test_records_of_a_struct_array(path, rng, version, transposed):
     one, two = fields(rng), fields(rng, excitation="noise", period_s=np.zeros((0, 0)), floor=np.zeros((0, 0)))
-    stored = [record | {key: record[key].T for key in ("u", "y", "floor")} if transposed else record
-              for record in (one, two)]
+    stored = [
+        record | {key: record[key].T for key in ("u", "y", "floor")} if transposed else record for record in (one, two)
+    ]
     save(path, version, {"records": stored, "rig": "avis", "format": "avis-campaign"})
     campaign = read_measurements(path)
     assert campaign.rig == "avis" and campaign.y_names == ("S1", "S2", "S3") and campaign.y_unit == "m/s"
@@ -117,8 +129,9 @@ def test_names_as_the_rows_of_a_char_matrix(path, rng, version):
     if version == "v7.3":
         with h5py.File(path, "r+") as file:
             del file["records/u_names"]
-            file["records/u_names"] = np.array([[ord(letter) for letter in name.ljust(3)] for name in names],
-                                               np.uint16).T
+            file["records/u_names"] = np.array(
+                [[ord(letter) for letter in name.ljust(3)] for name in names], np.uint16
+            ).T
             file["records/u_names"].attrs["MATLAB_class"] = np.bytes_("char")
     assert list(read_measurements(path).u_names) == names
 
@@ -169,9 +182,19 @@ def test_frequency_responses(path, rng, version, lines):
     G = rng.normal(size=(7, 3, 2)) + (0 if version == "v7.3" else 1j * rng.normal(size=(7, 3, 2)))
     coherence = rng.uniform(0.4, 0.9, (7, 3, 2))
     turn = (lambda a: a) if lines == "first" else (lambda a: np.moveaxis(a, 0, 2))
-    save(path, version, {"frequency_Hz": np.arange(1.0, 8.0), "H": turn(G), "coherence": turn(coherence),
-                         "averages": 25.0, "inputs": cells(["A1", "A2"]), "outputs": cells(["S1", "S2", "S3"]),
-                         "output_unit": "mm/s"})
+    save(
+        path,
+        version,
+        {
+            "frequency_Hz": np.arange(1.0, 8.0),
+            "H": turn(G),
+            "coherence": turn(coherence),
+            "averages": 25.0,
+            "inputs": cells(["A1", "A2"]),
+            "outputs": cells(["S1", "S2", "S3"]),
+            "output_unit": "mm/s",
+        },
+    )
     response = read_measurements(path)
     np.testing.assert_allclose(response.value, 1e-3 * G, rtol=1e-14)
     np.testing.assert_allclose(response.entry_variance, 1e-6 * np.abs(G) ** 2 * (1 - coherence) / (coherence * 24))
@@ -183,8 +206,9 @@ def test_channels_without_names_are_numbered(path, rng, named):
     """The shape of H tells how many there are, where only the others have names."""
     names = {"inputs": ["A1", "A2"], "outputs": ["S1", "S2", "S3"]}
     G = rng.normal(size=(7, 3, 2))
-    scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 8.0), "H": G, "variance": np.ones((7, 3, 2)),
-                            named: cells(names[named])})
+    scipy.io.savemat(
+        path, {"frequency_Hz": np.arange(1.0, 8.0), "H": G, "variance": np.ones((7, 3, 2)), named: cells(names[named])}
+    )
     response = read_measurements(path)
     expected = {"inputs": ["u1", "u2"], "outputs": ["y1", "y2", "y3"]} | {named: names[named]}
     assert [list(response.inputs), list(response.outputs)] == [expected["inputs"], expected["outputs"]]
@@ -192,18 +216,30 @@ def test_channels_without_names_are_numbered(path, rng, named):
 
 
 def test_as_many_lines_as_channels_are_refused(path, rng):
-    scipy.io.savemat(path, {"frequency_Hz": np.arange(1.0, 3.0), "H": rng.normal(size=(2, 2, 2)),
-                            "variance": np.ones((2, 2, 2)), "inputs": cells(["a", "b"]), "outputs": cells(["c", "d"])})
+    scipy.io.savemat(
+        path,
+        {
+            "frequency_Hz": np.arange(1.0, 3.0),
+            "H": rng.normal(size=(2, 2, 2)),
+            "variance": np.ones((2, 2, 2)),
+            "inputs": cells(["a", "b"]),
+            "outputs": cells(["c", "d"]),
+        },
+    )
     with pytest.raises(InputError, match="the dimension of frequency is ambiguous"):
         read_measurements(path)
 
 
 WRONG = {
-    "no rate": ({"sample_rate_Hz": MISSING},
-                "records: missing: sample_rate_Hz, fs or a time vector t; the records have excitation, floor"),
+    "no rate": (
+        {"sample_rate_Hz": MISSING},
+        "records: missing: sample_rate_Hz, fs or a time vector t; the records have excitation, floor",
+    ),
     "no y": ({"y": MISSING}, "records: missing: y, the sensor signals; the records have"),
-    "all at once": ({"y": MISSING, "sample_rate_Hz": MISSING, "period_s": 0.0},
-                    "missing: y, the sensor signals; sample_rate_Hz, fs or a time vector t; period_s, the period"),
+    "all at once": (
+        {"y": MISSING, "sample_rate_Hz": MISSING, "period_s": 0.0},
+        "missing: y, the sensor signals; sample_rate_Hz, fs or a time vector t; period_s, the period",
+    ),
     "names": ({"y_names": cells(["S1", "S2"])}, "expected 2 channels, as many as names; it is 60x3"),
     "same names": ({"y_names": cells(["S1", "S1", "S2"])}, "expected different names"),
     "lengths": ({"y": np.zeros((59, 3))}, "expected equally many samples; u is 60x2, y is 59x3, floor is 60x3"),

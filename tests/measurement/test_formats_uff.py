@@ -11,16 +11,33 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats import read_measurements
 
 
-def data_set(values, *, kind=1, name="NONE", node=0, direction=0, reference=("NONE", 0, 0), start=0.0, step=0.01,
-             ordinate=(12, "NONE"), denominator=(0, "NONE"), abscissa=(17, "s"), order=None, double=True, uneven=None,
-             line1="NONE"):
+def data_set(
+    values,
+    *,
+    kind=1,
+    name="NONE",
+    node=0,
+    direction=0,
+    reference=("NONE", 0, 0),
+    start=0.0,
+    step=0.01,
+    ordinate=(12, "NONE"),
+    denominator=(0, "NONE"),
+    abscissa=(17, "s"),
+    order=None,
+    double=True,
+    uneven=None,
+    line1="NONE",
+):
     """A data set 58 (order None) or 58b (order "<" or ">"), field by field from the definition's Fortran formats."""
     values = np.asarray(values)
     parts = [values.real, values.imag] if np.iscomplexobj(values) else [values]
     code = {(1, False): 2, (1, True): 4, (2, False): 5, (2, True): 6}[len(parts), double]
     lines = [line1, "NONE", "NONE", "NONE", "NONE"]
-    lines.append(f"{kind:5d}{0:10d}{0:5d}{0:10d} {name:<10s}{node:10d}{direction:4d} {reference[0]:<10s}"
-                 f"{reference[1]:10d}{reference[2]:4d}")
+    lines.append(
+        f"{kind:5d}{0:10d}{0:5d}{0:10d} {name:<10s}{node:10d}{direction:4d} {reference[0]:<10s}"
+        f"{reference[1]:10d}{reference[2]:4d}"
+    )
     lines.append(f"{code:10d}{len(values):10d}{uneven is None:10d}{start:13.5E}{step:13.5E}{0.0:13.5E}")
     for type_, unit in (abscissa, ordinate, denominator, (0, "NONE")):
         lines.append(f"{type_:10d}{0:5d}{0:5d}{0:5d} {'NONE':<20s} {unit:<20s}")
@@ -43,8 +60,14 @@ def data_set(values, *, kind=1, name="NONE", node=0, direction=0, reference=("NO
 
 
 def units(length, force=1.0):
-    return (f"    -1\n   164\n{9:10d}{'own units':<20s}{1:10d}\n" + f"{length:25.17E}{force:25.17E}{1.0:25.17E}\n"
-            f"{0.0:25.17E}\n    -1\n").replace("E", "D").encode()
+    return (
+        (
+            f"    -1\n   164\n{9:10d}{'own units':<20s}{1:10d}\n" + f"{length:25.17E}{force:25.17E}{1.0:25.17E}\n"
+            f"{0.0:25.17E}\n    -1\n"
+        )
+        .replace("E", "D")
+        .encode()
+    )
 
 
 @pytest.fixture
@@ -56,8 +79,10 @@ def path(tmp_path):
 @pytest.mark.parametrize("double", [True, False])
 def test_time_responses(path, rng, order, double):
     u, y = rng.normal(size=(2, 50))
-    path.write_bytes(data_set(u, name="Az1", ordinate=(1, "V"), order=order, double=double)
-                     + data_set(y, name="Sz1", ordinate=(12, "m/s^2"), order=order, double=double))
+    path.write_bytes(
+        data_set(u, name="Az1", ordinate=(1, "V"), order=order, double=double)
+        + data_set(y, name="Sz1", ordinate=(12, "m/s^2"), order=order, double=double)
+    )
     campaign = read_measurements(path, rig="avis", excitation="noise")
     record = campaign.records[0].load()
     assert (campaign.u_names, campaign.y_names, campaign.y_unit) == (("Az1",), ("Sz1",), "m/s^2")
@@ -73,12 +98,27 @@ def test_time_responses(path, rng, order, double):
 def test_frequency_responses_with_coherence(path, rng, order, double, even):
     n, coherence = 9, rng.uniform(0.3, 0.99, (2, 9))
     G = rng.normal(size=(2, n)) + 1j * rng.normal(size=(2, n))
-    common = {"start": 2.0, "step": 0.5, "abscissa": (18, "Hz"), "order": order, "double": double,
-              "uneven": None if even else 2.0 + 0.5 * np.arange(n), "reference": ("Az1", 1, 3)}
+    common = {
+        "start": 2.0,
+        "step": 0.5,
+        "abscissa": (18, "Hz"),
+        "order": order,
+        "double": double,
+        "uneven": None if even else 2.0 + 0.5 * np.arange(n),
+        "reference": ("Az1", 1, 3),
+    }
     content = b""
     for i, direction in enumerate((3, -1)):
-        content += data_set(G[i], kind=4, node=3, direction=direction, ordinate=(11, "mm/s"), denominator=(1, "V"),
-                            line1="FRF 40 averages", **common)
+        content += data_set(
+            G[i],
+            kind=4,
+            node=3,
+            direction=direction,
+            ordinate=(11, "mm/s"),
+            denominator=(1, "V"),
+            line1="FRF 40 averages",
+            **common,
+        )
         content += data_set(coherence[i], kind=6, node=3, direction=direction, ordinate=(0, "NONE"), **common)
     path.write_bytes(content)
     response = read_measurements(path)
@@ -100,14 +140,16 @@ def test_a_stated_rate_must_agree_with_the_increment(path, rng):
 def test_units_by_data_type_and_data_set_164(path):
     """The factor of length is file units per metre: 1000 for millimetres."""
     y = np.arange(1.0, 9.0)
-    path.write_bytes(units(1000.0) + data_set(y, name="S1", ordinate=(11, "NONE")) + data_set(y, name="A1",
-                                                                                          ordinate=(13, "NONE")))
+    path.write_bytes(
+        units(1000.0) + data_set(y, name="S1", ordinate=(11, "NONE")) + data_set(y, name="A1", ordinate=(13, "NONE"))
+    )
     campaign = read_measurements(path, excitation="noise")
     record = campaign.records[0].load()
     assert (campaign.y_unit, record.header.u_unit) == ("m/s", "N")
     np.testing.assert_allclose(record.y[:, 0], 1e-3 * y)
-    path.write_bytes(units(1000.0) + data_set(y, name="S1", ordinate=(11, "m/s")) + data_set(y, name="A1",
-                                                                                         ordinate=(1, "V")))
+    path.write_bytes(
+        units(1000.0) + data_set(y, name="S1", ordinate=(11, "m/s")) + data_set(y, name="A1", ordinate=(1, "V"))
+    )
     with pytest.raises(InputError, match=r"by data set 164 it is 0.001 m/s; state the right one with y_unit"):
         read_measurements(path)
     assert read_measurements(path, y_unit="mm/s").records[0].y[0, 0] == pytest.approx(1e-3)
@@ -119,8 +161,10 @@ def test_units_by_data_type_and_data_set_164(path):
 def test_what_another_function_refers_to_is_an_input(path, rng):
     """A reference without node is none: the response beside it may be at node 0, as where nodes were never given."""
     u, y = rng.normal(size=(2, 20))
-    path.write_bytes(data_set(u, node=7, direction=-3, ordinate=(1, "V"))
-                     + data_set(y, ordinate=(12, "m/s^2"), reference=("NONE", 7, -3)))
+    path.write_bytes(
+        data_set(u, node=7, direction=-3, ordinate=(1, "V"))
+        + data_set(y, ordinate=(12, "m/s^2"), reference=("NONE", 7, -3))
+    )
     campaign = read_measurements(path, excitation="noise")
     assert (campaign.u_names, campaign.y_names) == (("node 7 -Z",), ("node 0",))
 
@@ -138,11 +182,30 @@ def test_pyuff_writes_ascii_that_is_read_alike(path, rng):
     G = rng.normal(size=12) + 1j * rng.normal(size=12)
     writer = pyuff.UFF(str(path))
     for node in (1, 2):
-        writer.write_sets(pyuff.prepare_58(
-            func_type=4, rsp_node=node, rsp_dir=3, ref_node=7, ref_dir=-3, data=G * node, x=np.arange(12) * 0.25,
-            id1="FRF", rsp_ent_name="NONE", ref_ent_name="NONE", abscissa_spacing=1, binary=0, ord_data_type=6,
-            abscissa_spec_data_type=18, ordinate_spec_data_type=12, orddenom_spec_data_type=13,
-            abscissa_axis_units_lab="Hz", ordinate_axis_units_lab="m/s^2", orddenom_axis_units_lab="N"), "add")
+        writer.write_sets(
+            pyuff.prepare_58(
+                func_type=4,
+                rsp_node=node,
+                rsp_dir=3,
+                ref_node=7,
+                ref_dir=-3,
+                data=G * node,
+                x=np.arange(12) * 0.25,
+                id1="FRF",
+                rsp_ent_name="NONE",
+                ref_ent_name="NONE",
+                abscissa_spacing=1,
+                binary=0,
+                ord_data_type=6,
+                abscissa_spec_data_type=18,
+                ordinate_spec_data_type=12,
+                orddenom_spec_data_type=13,
+                abscissa_axis_units_lab="Hz",
+                ordinate_axis_units_lab="m/s^2",
+                orddenom_axis_units_lab="N",
+            ),
+            "add",
+        )
     response = read_measurements(path, relative_standard_deviation=0.02)
     assert (response.inputs, response.outputs) == (("node 7 -Z",), ("node 1 +Z", "node 2 +Z"))
     read = pyuff.UFF(str(path)).read_sets(1)
@@ -157,8 +220,19 @@ def test_pyuff_writes_ascii_that_is_read_alike(path, rng):
 def test_numbers_that_run_together_are_told_apart_by_their_width(path, double):
     """-1.0E+100 fills its field."""
     G = -1e100 * (1 + 1j) * np.arange(1.0, 9.0)
-    path.write_bytes(data_set(G, kind=4, node=1, ordinate=(12, "m/s^2"), denominator=(13, "N"), abscissa=(18, "Hz"),
-                              double=double, start=1.0, step=1.0))
+    path.write_bytes(
+        data_set(
+            G,
+            kind=4,
+            node=1,
+            ordinate=(12, "m/s^2"),
+            denominator=(13, "N"),
+            abscissa=(18, "Hz"),
+            double=double,
+            start=1.0,
+            step=1.0,
+        )
+    )
     assert b"E+100-" in path.read_bytes()
     response = read_measurements(path, relative_standard_deviation=0.1)
     np.testing.assert_allclose(response.value[:, 0, 0], G, rtol=1e-5)
@@ -187,8 +261,10 @@ REFUSED = {
     "missing record": ([(ONES, A), (ONES, A), (ONES, S)], "channel S1: missing in record 01"),
     "complex": ([(ONES + 0j, A), (ONES, S)], "record 00: u: expected real samples"),
     "no unit": ([(ONES, A), (ONES, {"name": "S1", "ordinate": (0, "NONE")})], "not stated .* pass y_unit"),
-    "missing entry": ([(ONES + 0j, FRF | {"reference": ("A1", 0, 0)}),
-                       (ONES + 0j, FRF | {"reference": ("A2", 0, 0), "node": 2})], "2 are missing, the first is"),
+    "missing entry": (
+        [(ONES + 0j, FRF | {"reference": ("A1", 0, 0)}), (ONES + 0j, FRF | {"reference": ("A2", 0, 0), "node": 2})],
+        "2 are missing, the first is",
+    ),
     "twice": ([(ONES + 0j, FRF), (ONES + 0j, FRF)], "expected each pair of response and reference once"),
     "grid": ([(ONES + 0j, FRF), (ONES + 0j, FRF | {"node": 2, "step": 0.3})], "expected the 8 frequencies"),
     "step": ([(ONES, A | {"step": 0.0})], "expected a positive increment"),

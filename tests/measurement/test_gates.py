@@ -215,6 +215,7 @@ def test_dependence_on_the_level():
 
 def test_lines_beside_the_band_are_not_compared():
     """At 121 Hz, where 80 Hz end the band, one level's records hold a line that the drives did not put there."""
+
     def beside(u, y):
         return u, y + 0.02 * (np.abs(u).max() > 0.5) * np.sin(2 * np.pi * 121.0 * np.arange(len(y)) / RATE)[:, None]
 
@@ -222,8 +223,9 @@ def test_lines_beside_the_band_are_not_compared():
     assert "level dependence" not in gates(found)
 
 
-@pytest.mark.parametrize(("T", "said"), [(46358975614.2, "far more than noise explains"),
-                                         (3.04, "3.0 times the 1 % limit of noise alone")])
+@pytest.mark.parametrize(
+    ("T", "said"), [(46358975614.2, "far more than noise explains"), (3.04, "3.0 times the 1 % limit of noise alone")]
+)
 def test_statistics_are_said_in_words_that_one_can_read(T, said):
     assert significance(T).startswith(said)
 
@@ -292,13 +294,14 @@ def test_every_flipped_channel_is_named(which, k):
 def test_half_of_the_channels_flipped_could_be_the_other_half(rng, flips):
     """Two drives and two sensors by a random response of eight samples; a sensor is flipped, and a drive with it."""
     h, u = rng.standard_normal((8, 2, 2)), rng.standard_normal((16000, 2))
-    y = sum(np.vstack([np.zeros((k, 2)), u[:len(u) - k]]) @ h[k].T for k in range(8))
+    y = sum(np.vstack([np.zeros((k, 2)), u[: len(u) - k]]) @ h[k].T for k in range(8))
     y += 0.01 * rng.standard_normal(y.shape)
     y[:, 0] *= -1
     u[:, 0] *= (-1) ** (flips - 1)
     header = RecordHeader("00", RATE, len(u), ("u1", "u2"), ("y1", "y2"), "noise", 1.0)
-    expectation = Expectation(response=lambda omega, inputs: np.tensordot(
-        np.exp(-1j * np.outer(omega, np.arange(8)) / RATE), h, 1))
+    expectation = Expectation(
+        response=lambda omega, inputs: np.tensordot(np.exp(-1j * np.outer(omega, np.arange(8)) / RATE), h, 1)
+    )
     found = channel_alarms(Campaign("", (Record(header, u, y),)), expectation)
     assert [f.gate for f in found] == ["polarity"] * flips
     assert all(("all other channels are reversed" in f.sentence) == (flips == 2) for f in found)
@@ -385,8 +388,10 @@ def test_parameter_errors_are_no_channel_faults():
 def test_sensors_that_a_motion_makes_read_alike_are_no_copies():
     """A table driven along one axis after the other: symmetric sensors agree in some records, a copy in all."""
     rng = np.random.default_rng(12)
-    one, two = (signal.sosfilt(signal.butter(2, [2, 40], "bandpass", fs=RATE, output="sos"), rng.standard_normal(6000))
-                for _ in range(2))
+    one, two = (
+        signal.sosfilt(signal.butter(2, [2, 40], "bandpass", fs=RATE, output="sos"), rng.standard_normal(6000))
+        for _ in range(2)
+    )
     shapes = np.array([[1.0, 1.0, 0.3], [1.0, -1.0, 0.5]])
 
     def campaign(doubled: bool, records: int) -> Campaign:
@@ -401,8 +406,12 @@ def test_sensors_that_a_motion_makes_read_alike_are_no_copies():
     def said(measured: Campaign, model=None) -> list[tuple[str, tuple[str, ...]]]:
         found = examine(measured, Expectation(response=model))
         return [(f.severity, f.channels) for f in found if "times" in f.sentence and len(f.channels) == 2]
+
     assert said(campaign(False, 2)) == []
     assert said(campaign(True, 2)) == [("stop", ("y1", "y3"))]
     assert said(campaign(False, 1)) == [("stop", ("y1", "y2")), ("stop", ("y1", "y3")), ("stop", ("y2", "y3"))]
     assert said(campaign(False, 1), lambda omega, inputs: np.tensordot(np.ones(len(omega)), shapes.T, 0)) == [
-        ("note", ("y1", "y2")), ("note", ("y1", "y3")), ("note", ("y2", "y3"))]
+        ("note", ("y1", "y2")),
+        ("note", ("y1", "y3")),
+        ("note", ("y2", "y3")),
+    ]

@@ -62,7 +62,7 @@ def test_two_samples_at_the_end_of_the_range_are_clipped_and_one_is_not(samples)
     y = campaign.records[0].y.copy()
     y[:, 1] *= 10
     k, top = int(np.argmax(y[:, 1])), float(np.max(y[:, 1]))
-    y[k:k + samples, 1] = top
+    y[k : k + samples, 1] = top
     found = examine(changed(campaign, 0, y=y), known(y_range_V=(-10.0, top), response=None))
     (said,) = [f for f in found if f.gate == "clipping"]
     assert said.severity == ("ok" if samples == 1 else "warning")

@@ -227,8 +227,8 @@ def test_hum_names_mains_channel_and_size(rng, mains, off):
     assert float(said[2]) == pytest.approx(0.4 / np.sqrt(2), rel=0.1)
     # Over the louder of 16 bins on either side, three bins away from the tolerance of one bin.
     P, middle = signal.welch(y[:, 2], 1000, "hann", 4000, 0, detrend="linear")[1], round(4 * mains)
-    floor = max(P[middle - 20:middle - 4].mean(), P[middle + 5:middle + 21].mean())
-    assert found[0].value == pytest.approx(P[middle - 1:middle + 2].max() / floor)
+    floor = max(P[middle - 20 : middle - 4].mean(), P[middle + 5 : middle + 21].mean())
+    assert found[0].value == pytest.approx(P[middle - 1 : middle + 2].max() / floor)
 
 
 @pytest.mark.parametrize("excitation", ["multisine", "noise"])
@@ -239,8 +239,9 @@ def test_signal_to_noise_is_what_was_put_in(rng, excitation):
     U[lines] = np.sqrt(N) * np.exp(2j * np.pi * rng.random(lines.size))  # the power of white noise of r.m.s. 1
     u = np.tile(np.fft.irfft(U, N), 6) if excitation == "multisine" else rng.standard_normal(60000)
     y = u[:, None] * [1.0, 0.1] + 0.1 * rng.standard_normal((len(u), 2))
-    header = RecordHeader("00", 1000.0, len(u), ("u",), ("a", "b"), excitation, 1.0, 0.0,
-                          N / 1000 if excitation == "multisine" else None)
+    header = RecordHeader(
+        "00", 1000.0, len(u), ("u",), ("a", "b"), excitation, 1.0, 0.0, N / 1000 if excitation == "multisine" else None
+    )
     campaign = Campaign("x", (Record(header, u[:, None], y),))
     (said,) = [f for f in examine(campaign) if f.gate == "signal to noise" and f.picture.series]
     for series, dB in zip(said.picture.series, (20.0, 0.0), strict=True):

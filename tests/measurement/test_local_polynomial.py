@@ -79,9 +79,11 @@ def test_the_same_estimate_as_the_full_least_squares_of_the_book(rng):
 def test_the_default_window_is_the_smallest_with_equations_to_spare():
     """Lines less unknowns, counted: of G and of each record's transient; 2 n_y + 4 are left."""
     for records, n_u, n_y, order in product((1, 2, 5), (0, 1, 8), (1, 6), (2, 3)):
+
         def spare(w, records=records, n_u=n_u, n_y=n_y, order=order):
             unknowns = (order + 1) * n_u + (order + 1) * records
             return records * (2 * w + 1) - unknowns - (2 * n_y + 4)
+
         w = least_half_width(records, n_u, n_y, order)
         assert spare(w) >= 0 and w > order
         assert w == order + 1 or spare(w - 1) < 0
@@ -103,7 +105,7 @@ def test_records_taken_in_one_by_one_give_the_same_as_together(rng):
     Y = rng.standard_normal((5, 100, 3)) + 1j * rng.standard_normal((5, 100, 3))
     fit = LocalFit(f, 2, 3, 2, 5, 5.0)
     for r in range(5):
-        fit.add(U[r:r + 1], Y[r:r + 1], f)
+        fit.add(U[r : r + 1], Y[r : r + 1], f)
     one, together = fit.estimate(), local_model(U, Y, f, half_width=5)
     for field in ("value", "noise", "gram"):
         assert np.allclose(getattr(one, field), getattr(together, field), rtol=1e-9, atol=1e-12), field
@@ -117,8 +119,9 @@ def test_covariance_covers_what_it_claims():
     mixing, noise = np.array([[1.0, 0.0], [0.8, 0.6]]), 0.2
     ratio, scaled, entries = [], [], []
     for _ in range(200):
-        got = local_polynomial(noisy(system, rng, 600, 3, noise, mixing), band_Hz=(10.0, 80.0),
-                               frequency_Hz=np.linspace(12, 78, 5))
+        got = local_polynomial(
+            noisy(system, rng, 600, 3, noise, mixing), band_Hz=(10.0, 80.0), frequency_Hz=np.linspace(12, 78, 5)
+        )
         error = got.value - system.response(got.frequency_Hz)
         entries.append(squared_error(got, system.response(got.frequency_Hz)))
         # Column j of G along S: e S^(1/2) has independent columns of covariance C.
@@ -134,14 +137,16 @@ def test_covariance_covers_what_it_claims():
     assert np.mean(ratio) == pytest.approx(4 * dof / (dof - 2), rel=0.08)
     # 1/sqrt(N) scaling: variance of a line is that of a sample; trace test of chi-square at 1000 estimates.
     mean = np.mean(scaled, axis=(0, 1))
-    assert np.allclose(mean, noise ** 2 * mixing @ mixing.T, atol=4 * noise ** 2 / np.sqrt(1000 * dof) * 2)
+    assert np.allclose(mean, noise**2 * mixing @ mixing.T, atol=4 * noise**2 / np.sqrt(1000 * dof) * 2)
 
 
 def hann_error(system, u, y, keep):
     """SISO H1 of a single record with a Hann window in the frequency domain (no averaging): for comparison only."""
+
     def smooth(x):
         X = np.fft.rfft(x[:, 0])
         return X[1:-1] - 0.5 * (X[:-2] + X[2:])
+
     return (smooth(y) / smooth(u))[keep]
 
 
@@ -207,7 +212,7 @@ def test_no_more_than_a_piece_is_in_memory(rng):
 def test_units_do_not_matter(a, b):
     """Volts or nanometres: G, C and S follow the units of the channels exactly."""
     rng = np.random.default_rng(1)
-    f, scale_u, scale_y = np.arange(1, 41.0), np.array([1.0, 10.0 ** a]), np.array([10.0 ** b, 1.0])
+    f, scale_u, scale_y = np.arange(1, 41.0), np.array([1.0, 10.0**a]), np.array([10.0**b, 1.0])
     U = rng.standard_normal((3, 40, 2)) + 1j * rng.standard_normal((3, 40, 2))
     Y = rng.standard_normal((3, 40, 2)) + 1j * rng.standard_normal((3, 40, 2))
     one, other = (local_model(*pair, f) for pair in ((U, Y), (U * scale_u, Y * scale_y)))
@@ -324,7 +329,7 @@ def test_silence_is_measured_against_the_band(rng):
     with pytest.raises(ComputationError, match="are not excited") as caught:
         local_model(U, U, np.arange(60.0), np.array([45.0]), order, w)
     d = np.arange(-w, w + 1.0)
-    powers, here = d[:, None] ** np.arange(order + 1), U[:, 45 - w:45 + w + 1, 0].ravel()
+    powers, here = d[:, None] ** np.arange(order + 1), U[:, 45 - w : 45 + w + 1, 0].ravel()
     others = np.hstack([here[:, None] * np.tile(powers[:, 1:], (records, 1)), np.kron(np.eye(records), powers)])
     own = np.linalg.norm(here - others @ np.linalg.lstsq(others, here, rcond=1e-25)[0])
     rms = np.sqrt(np.mean(np.abs(U) ** 2))
@@ -344,12 +349,21 @@ def test_an_input_silent_in_part_of_the_band_is_named_with_the_frequencies(rng):
     assert local_polynomial(data, band_Hz=(5, 45)).inputs == ("u1", "u2")
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"band_Hz": (50.0, 20.0)}, "band_Hz"), ({"band_Hz": (5.0, 120.0)}, "100 Hz"), ({"order": 9}, "order"),
-    ({"order": 2.5}, "whole order"),
-    ({"half_width": 1}, "half_width"), ({"band_Hz": (5.0, 5.5)}, "longer records"),
-    ({"half_width": 0}, "half_width"), ({"longest_piece": 0}, "longest_piece"),
-    ({"frequency_Hz": np.array([5.0, 99.99])}, "frequency_Hz"), ({"half_width": 2, "order": 3}, "degrees of freedom")])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"band_Hz": (50.0, 20.0)}, "band_Hz"),
+        ({"band_Hz": (5.0, 120.0)}, "100 Hz"),
+        ({"order": 9}, "order"),
+        ({"order": 2.5}, "whole order"),
+        ({"half_width": 1}, "half_width"),
+        ({"band_Hz": (5.0, 5.5)}, "longer records"),
+        ({"half_width": 0}, "half_width"),
+        ({"longest_piece": 0}, "longest_piece"),
+        ({"frequency_Hz": np.array([5.0, 99.99])}, "frequency_Hz"),
+        ({"half_width": 2, "order": 3}, "degrees of freedom"),
+    ],
+)
 def test_wrong_requests_are_answered(rng, change, words):
     data = noisy(Modal(rng, 2, 2, [25.0], 0.3, RATE), rng, 1000, 1)
     with pytest.raises(InputError, match=words):

@@ -61,8 +61,9 @@ def compare(path):
     return theirs
 
 
-NUMBERS = st.sampled_from(TYPES).flatmap(lambda kind: arrays(np.dtype(kind), array_shapes(max_dims=3, min_side=0,
-                                                                                         max_side=4)))
+NUMBERS = st.sampled_from(TYPES).flatmap(
+    lambda kind: arrays(np.dtype(kind), array_shapes(max_dims=3, min_side=0, max_side=4))
+)
 TEXT = st.text(st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"]), min_size=1, max_size=12)
 LEAVES = st.one_of(NUMBERS, TEXT, st.floats(), st.integers(-9, 9))
 FIELDS = st.text("abcXYZ_0123456789", min_size=1, max_size=9).map(lambda name: "v" + name)
@@ -75,9 +76,15 @@ def boxed(items):
     return cell
 
 
-VALUES = st.recursive(LEAVES, lambda inner: st.one_of(
-    st.lists(inner, max_size=4).map(boxed), st.dictionaries(FIELDS, inner, min_size=1, max_size=4),
-    st.lists(st.fixed_dictionaries({"a": inner, "b": inner}), min_size=1, max_size=3)), max_leaves=8)
+VALUES = st.recursive(
+    LEAVES,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4).map(boxed),
+        st.dictionaries(FIELDS, inner, min_size=1, max_size=4),
+        st.lists(st.fixed_dictionaries({"a": inner, "b": inner}), min_size=1, max_size=3),
+    ),
+    max_leaves=8,
+)
 
 
 @given(st.dictionaries(FIELDS, VALUES, min_size=1, max_size=4), st.booleans(), st.sampled_from(["row", "column"]))
@@ -94,6 +101,7 @@ def test_files_that_matlab_wrote(data, name):
 
 
 # Files put together from the document, in both byte orders.
+
 
 def element(order, kind, content, small=False):
     if small:
@@ -140,22 +148,30 @@ def path(tmp_path):
 @orders
 def test_every_class_in_both_byte_orders(path, order):
     text = "äb€".encode("utf-16-le" if order == "<" else "utf-16-be")
-    field_names = element(order, 5, struct.pack(order + "i", 8), small=True) + element(order, 1, b"a".ljust(8, b"\0") +
-                                                                                      b"longer".ljust(8, b"\0"))
-    path.write_bytes(file(
-        order, double(order, "plain"), compressed(order, double(order, "packed")),
-        matrix(order, "few", 6, (1, 2), numbers(order, 2, "u1", [3, 200], small=True), small=True),
-        matrix(order, "complex", 6, (2, 1), numbers(order, 9, "f8", [1, 2]), numbers(order, 3, "i2", [-3, 4]), flags=8),
-        matrix(order, "single", 7, (1, 3), numbers(order, 7, "f4", [1.5, -2.5, 0.25])),
-        matrix(order, "logical", 9, (1, 3), numbers(order, 2, "u1", [1, 0, 1]), flags=2),
-        matrix(order, "long", 14, (1, 2), numbers(order, 12, "i8", [-(1 << 60), 7])),
-        matrix(order, "shorter", 12, (1, 2), numbers(order, 4, "u2", [65535, 1], small=True)),
-        matrix(order, "text", 4, (1, 3), element(order, 17, text)),
-        matrix(order, "rows", 4, (2, 2), numbers(order, 4, "u2", [97, 99, 98, 100])),
-        matrix(order, "utf8", 4, (1, 3), element(order, 16, "äb€".encode())),
-        matrix(order, "cell", 1, (2, 2), *(double(order, "", (1, 1), [i]) for i in range(4))),
-        matrix(order, "structs", 2, (1, 2), field_names, *(double(order, "", (1, 1), [i]) for i in range(4))),
-        matrix(order, "cube", 6, (2, 1, 2), numbers(order, 9, "f8", range(4)))))
+    field_names = element(order, 5, struct.pack(order + "i", 8), small=True) + element(
+        order, 1, b"a".ljust(8, b"\0") + b"longer".ljust(8, b"\0")
+    )
+    path.write_bytes(
+        file(
+            order,
+            double(order, "plain"),
+            compressed(order, double(order, "packed")),
+            matrix(order, "few", 6, (1, 2), numbers(order, 2, "u1", [3, 200], small=True), small=True),
+            matrix(
+                order, "complex", 6, (2, 1), numbers(order, 9, "f8", [1, 2]), numbers(order, 3, "i2", [-3, 4]), flags=8
+            ),
+            matrix(order, "single", 7, (1, 3), numbers(order, 7, "f4", [1.5, -2.5, 0.25])),
+            matrix(order, "logical", 9, (1, 3), numbers(order, 2, "u1", [1, 0, 1]), flags=2),
+            matrix(order, "long", 14, (1, 2), numbers(order, 12, "i8", [-(1 << 60), 7])),
+            matrix(order, "shorter", 12, (1, 2), numbers(order, 4, "u2", [65535, 1], small=True)),
+            matrix(order, "text", 4, (1, 3), element(order, 17, text)),
+            matrix(order, "rows", 4, (2, 2), numbers(order, 4, "u2", [97, 99, 98, 100])),
+            matrix(order, "utf8", 4, (1, 3), element(order, 16, "äb€".encode())),
+            matrix(order, "cell", 1, (2, 2), *(double(order, "", (1, 1), [i]) for i in range(4))),
+            matrix(order, "structs", 2, (1, 2), field_names, *(double(order, "", (1, 1), [i]) for i in range(4))),
+            matrix(order, "cube", 6, (2, 1, 2), numbers(order, 9, "f8", range(4))),
+        )
+    )
     tree = compare(path)
     np.testing.assert_array_equal(tree["complex"], [[1 - 3j], [2 + 4j]])
     assert tree["text"] == tree["utf8"] == "äb€" and tree["rows"] == ["ab", "cd"]
@@ -164,14 +180,29 @@ def test_every_class_in_both_byte_orders(path, order):
 
 @orders
 def test_what_holds_no_measurement_is_refused_only_where_it_is_used(path, order):
-    path.write_bytes(file(order, matrix(order, "handle", 16, (1, 1), element(order, 14, b"")),
-                          matrix(order, "old", 3, (1, 1), element(order, 1, b"inline")),
-                          element(order, 14, element(order, 6, struct.pack(order + "II", 17, 0)) +
-                                  element(order, 1, b"new") + element(order, 1, b"MCOS")),
-                          double(order, "u", (6, 1)), double(order, "y", (6, 1)), double(order, "fs", (1, 1), [9.0])))
+    path.write_bytes(
+        file(
+            order,
+            matrix(order, "handle", 16, (1, 1), element(order, 14, b"")),
+            matrix(order, "old", 3, (1, 1), element(order, 1, b"inline")),
+            element(
+                order,
+                14,
+                element(order, 6, struct.pack(order + "II", 17, 0))
+                + element(order, 1, b"new")
+                + element(order, 1, b"MCOS"),
+            ),
+            double(order, "u", (6, 1)),
+            double(order, "y", (6, 1)),
+            double(order, "fs", (1, 1), [9.0]),
+        )
+    )
     tree = variables(path)
     assert {name: tree[name].kind for name in ("handle", "old", "new")} == {
-        "handle": "function handle", "old": "MATLAB object", "new": "MATLAB object"}
+        "handle": "function handle",
+        "old": "MATLAB object",
+        "new": "MATLAB object",
+    }
     assert read_measurements(path).records[0].load().u[5, 0] == 6.0
     with pytest.raises(InputError, match="handle = 'a function handle': expected a real matrix"):
         read_measurements(path, {"u": "u", "y": "handle"})
@@ -186,10 +217,15 @@ def test_deep_and_wide_structures_cost_nothing(path):
     deep = double("<", "")
     for _ in range(400):
         deep = matrix("<", "", 1, (1, 1), deep)
-    path.write_bytes(file("<", matrix("<", "deep", 1, (1, 1), deep),
-                          matrix("<", "wide", 1, (MOST_CELLS + 1, 1), *[element("<", 14, b"")] * (MOST_CELLS + 1)),
-                          matrix("<", "none", 2, (1 << 30, 1), element("<", 5, struct.pack("<i", 8)),
-                                 element("<", 1, b"")), matrix("<", "rows", 4, (1 << 30, 0), element("<", 16, b""))))
+    path.write_bytes(
+        file(
+            "<",
+            matrix("<", "deep", 1, (1, 1), deep),
+            matrix("<", "wide", 1, (MOST_CELLS + 1, 1), *[element("<", 14, b"")] * (MOST_CELLS + 1)),
+            matrix("<", "none", 2, (1 << 30, 1), element("<", 5, struct.pack("<i", 8)), element("<", 1, b"")),
+            matrix("<", "rows", 4, (1 << 30, 0), element("<", 16, b"")),
+        )
+    )
     tree = variables(path)
     assert isinstance(tree["wide"], Unreadable) and isinstance(tree["none"], Unreadable) and tree["rows"] == ""
     inner, depth = tree["deep"], 0
@@ -210,13 +246,16 @@ def damaged_zip(order):
     return bytes(content)
 
 
-FLAGS, DIMENSIONS, NAME = (lambda o: element(o, 6, struct.pack(o + "II", 6, 0)),
-                           lambda o: element(o, 5, struct.pack(o + "ii", 2, 3)), lambda o: element(o, 1, b"u"))
+FLAGS, DIMENSIONS, NAME = (
+    lambda o: element(o, 6, struct.pack(o + "II", 6, 0)),
+    lambda o: element(o, 5, struct.pack(o + "ii", 2, 3)),
+    lambda o: element(o, 1, b"u"),
+)
 WRONG = {
     "bytes": (lambda o: matrix(o, "u", 6, (2, 4), numbers(o, 9, "f8", range(6))), "48 bytes for 8 numbers of 8 bytes"),
     "huge": (lambda o: matrix(o, "u", 6, (1 << 20, 1 << 20), numbers(o, 9, "f8", [1])), r"\[1048576, 1048576\] are no"),
     "negative": (lambda o: matrix(o, "u", 6, (-2, -3), numbers(o, 9, "f8", range(6))), r"\[-2, -3\] are not possible"),
-    "empty, huge": (lambda o: matrix(o, "u", 6, (0, *[2 ** 31 - 1] * 9), numbers(o, 9, "f8", [])), "are not possible"),
+    "empty, huge": (lambda o: matrix(o, "u", 6, (0, *[2**31 - 1] * 9), numbers(o, 9, "f8", [])), "are not possible"),
     "one dimension": (lambda o: matrix(o, "u", 6, (6,), numbers(o, 9, "f8", range(6))), r"\[6\] are not possible"),
     "wide": (lambda o: matrix(o, "u", 8, (1, 2), numbers(o, 9, "f8", [1, 2])), "int8 is not stored as float64"),
     "range": (lambda o: matrix(o, "u", 8, (1, 2), numbers(o, 2, "u1", [1, 200])), "values beyond int8"),
@@ -225,18 +264,37 @@ WRONG = {
     "no imaginary part": (lambda o: matrix(o, "u", 6, (1, 1), numbers(o, 9, "f8", [1]), flags=8), "imaginary part: mi"),
     "class": (lambda o: matrix(o, "u", 99, (1, 1), numbers(o, 9, "f8", [1])), "class 99 does not exist"),
     "more": (lambda o: matrix(o, "u", 6, (1, 1), *[numbers(o, 9, "f8", [1])] * 2), "16 bytes follow the last part"),
-    "element beyond": (lambda o: element(o, 14, FLAGS(o) + DIMENSIONS(o) + NAME(o) + struct.pack(o + "II", 9, 4000)),
-                       "real part: 4000 bytes are stated, 0 are left"),
+    "element beyond": (
+        lambda o: element(o, 14, FLAGS(o) + DIMENSIONS(o) + NAME(o) + struct.pack(o + "II", 9, 4000)),
+        "real part: 4000 bytes are stated, 0 are left",
+    ),
     "small element": (lambda o: matrix(o, "u", 6, (1, 1), struct.pack(o + "II", 5 << 16 | 2, 0)), "5 bytes are stated"),
     "order": (lambda o: element(o, 14, DIMENSIONS(o) + FLAGS(o) + NAME(o)), "array flags: of type 5, not 6"),
     "cells": (lambda o: matrix(o, "u", 1, (1 << 15, 1 << 15), double(o, "")), "1073741824 parts are stated"),
     "cell of numbers": (lambda o: matrix(o, "u", 1, (1, 1), numbers(o, 9, "f8", [1])), "cell 1: of type 9, not 14"),
-    "field names": (lambda o: matrix(o, "u", 2, (1, 1), element(o, 5, struct.pack(o + "i", 3)), element(o, 1, b"abcd"),
-                                     double(o, "")), r"field names: 4 bytes in names of \[3\]"),
-    "no width": (lambda o: matrix(o, "u", 2, (1, 1), element(o, 5, struct.pack(o + "i", 0)), element(o, 1, b"a"),
-                                  double(o, "")), "field names: 1 bytes in names of"),
-    "equal fields": (lambda o: matrix(o, "u", 2, (1, 1), element(o, 5, struct.pack(o + "i", 1)), element(o, 1, b"aa"),
-                                      double(o, ""), double(o, "")), "empty or equal ones"),
+    "field names": (
+        lambda o: matrix(
+            o, "u", 2, (1, 1), element(o, 5, struct.pack(o + "i", 3)), element(o, 1, b"abcd"), double(o, "")
+        ),
+        r"field names: 4 bytes in names of \[3\]",
+    ),
+    "no width": (
+        lambda o: matrix(o, "u", 2, (1, 1), element(o, 5, struct.pack(o + "i", 0)), element(o, 1, b"a"), double(o, "")),
+        "field names: 1 bytes in names of",
+    ),
+    "equal fields": (
+        lambda o: matrix(
+            o,
+            "u",
+            2,
+            (1, 1),
+            element(o, 5, struct.pack(o + "i", 1)),
+            element(o, 1, b"aa"),
+            double(o, ""),
+            double(o, ""),
+        ),
+        "empty or equal ones",
+    ),
     "name": (lambda o: double(o, "a\nb"), r"name: 'a\\nb' is not a name"),
     "text": (lambda o: matrix(o, "u", 4, (1, 5), element(o, 16, b"abc")), "characters: 3 for dimensions 1x5"),
     "twice": (lambda o: double(o, "u") + double(o, "u"), "variable at byte 240: the name 'u' comes twice"),
@@ -264,7 +322,7 @@ def test_what_does_not_fit_together_in_one_line(path, case, order):
 def test_headers(path):
     good = file("<", double("<", "u"))
     for at, value, message in ((124, b"\x00\x02", "expected version 0x0100"), (126, b"XX", "expected version 0x0100")):
-        path.write_bytes(good[:at] + value + good[at + 2:])
+        path.write_bytes(good[:at] + value + good[at + 2 :])
         with pytest.raises(InputError, match=message):
             read_measurements(path)
     path.write_bytes(good[:100])
@@ -317,9 +375,22 @@ print(tally["valid"], tally["refused"])
 @pytest.mark.parametrize("cases", [1500, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_random_damage_never_ends_the_process(path, rng, cases):
     names = [np.array(["A1", "A2"], object), np.array(["S1"], object)]
-    scipy.io.savemat(path, {"records": {"sample_rate_Hz": 100.0, "excitation": "noise", "level_V": 1.0, "start_s": 0.0,
-                                        "u": rng.normal(size=(9, 2)), "y": rng.normal(size=(9, 1)),
-                                        "u_names": names[0], "y_names": names[1]}, "rig": "avis"})
+    scipy.io.savemat(
+        path,
+        {
+            "records": {
+                "sample_rate_Hz": 100.0,
+                "excitation": "noise",
+                "level_V": 1.0,
+                "start_s": 0.0,
+                "u": rng.normal(size=(9, 2)),
+                "y": rng.normal(size=(9, 1)),
+                "u_names": names[0],
+                "y_names": names[1],
+            },
+            "rig": "avis",
+        },
+    )
     done = subprocess.run([sys.executable, "-c", FUZZ, str(path), "7", str(cases)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     valid, refused = map(int, done.stdout.split())

@@ -15,16 +15,24 @@ from avis_ctrl.measurement.frequency_response.resonance import resonance
 def modes(f, parameters, rng, n_y=2, n_u=2):
     """Sum of R w^2 / (s^2 + 2 zeta w s + w^2)."""
     s = 2j * np.pi * f
-    return sum((w ** 2 / (s ** 2 + 2 * z * w * s + w ** 2))[:, None, None] * rng.standard_normal((n_y, n_u))
-               for w, z in ((2 * np.pi * f0, z) for f0, z in parameters))
+    return sum(
+        (w**2 / (s**2 + 2 * z * w * s + w**2))[:, None, None] * rng.standard_normal((n_y, n_u))
+        for w, z in ((2 * np.pi * f0, z) for f0, z in parameters)
+    )
 
 
 def measured(f, G, noise, rng, claimed=None):
     n, n_y, n_u = G.shape
     e = noise * (rng.standard_normal(G.shape) + 1j * rng.standard_normal(G.shape)) / np.sqrt(2)
     C = np.broadcast_to((claimed or noise) ** 2 * np.eye(n_y), (n, n_y, n_y))
-    return FrequencyResponse(f, G + e, C, np.broadcast_to(np.eye(n_u), (n, n_u, n_u)),
-                             tuple(f"u{j}" for j in range(n_u)), tuple(f"y{i}" for i in range(n_y)))
+    return FrequencyResponse(
+        f,
+        G + e,
+        C,
+        np.broadcast_to(np.eye(n_u), (n, n_u, n_u)),
+        tuple(f"u{j}" for j in range(n_u)),
+        tuple(f"y{i}" for i in range(n_y)),
+    )
 
 
 @pytest.mark.parametrize("damping", [0.002, 0.02, 0.06])
@@ -54,7 +62,7 @@ def test_residues_of_a_known_mode(rng):
     G = modes(f, [(50.0, z)], np.random.default_rng(1))
     R = np.random.default_rng(1).standard_normal((2, 2))
     got = resonance(measured(f, G, 1e-6, rng), 50.0)
-    assert np.allclose(got.residue, w ** 2 * R / (2j * w * np.sqrt(1 - z ** 2)), rtol=0.01)
+    assert np.allclose(got.residue, w**2 * R / (2j * w * np.sqrt(1 - z**2)), rtol=0.01)
 
 
 def test_where_there_is_no_mode(rng):

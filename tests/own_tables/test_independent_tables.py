@@ -273,8 +273,9 @@ def test_nominal_table_is_that_of_the_rig_file(name):
         assert np.allclose(mine, other, rtol=0, atol=1e-4 * abs(other).max())  # directions have four digits
     for mine in own.sensors:
         other = next(one for one in rig.sensors() if one.name == mine.name)
-        assert mine.position_m == pytest.approx(other.position) and mine.direction == pytest.approx(other.direction,
-                                                                                                    abs=1e-4)
+        assert mine.position_m == pytest.approx(other.position) and mine.direction == pytest.approx(
+            other.direction, abs=1e-4
+        )
         assert mine.noise_rms_V == other.noise_rms_V
         order, (A, B, C, D) = mine.filter()  # of acceleration, floor excluded; a position sensor's of displacement
         for f in (0.3, 1.0, 20.0, 200.0):
@@ -284,8 +285,12 @@ def test_nominal_table_is_that_of_the_rig_file(name):
             assert response == pytest.approx(expected, rel=1e-9), mine.name
     said = rig.acquisition, rig.ambient
     assert (own.sample_rate_Hz, own.adc_bits, own.adc_range_V, own.loop_delay_s, own.floor_velocity_rms_m_per_s) == (
-        said[0].sample_rate_Hz, said[0].adc_bits, said[0].adc_range_V, said[0].loop_delay_s,
-        said[1].floor_velocity_rms_m_per_s)
+        said[0].sample_rate_Hz,
+        said[0].adc_bits,
+        said[0].adc_range_V,
+        said[0].loop_delay_s,
+        said[1].floor_velocity_rms_m_per_s,
+    )
 
 
 def test_units_of_the_controllers_states_change_no_eigenvalue():

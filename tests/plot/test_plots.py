@@ -34,8 +34,11 @@ def curve(ax, k=0):
     return tuple(np.asarray(part, float) for part in ax.lines[k].get_data())
 
 
-@pytest.mark.parametrize("system", [LAG, control.ss(LAG), tf([2.0], [0.5, 1.0]), control.frd(LAG, OMEGA)],
-                         ids=["TransferFunction", "StateSpace of python-control", "StateSpace", "FRD"])
+@pytest.mark.parametrize(
+    "system",
+    [LAG, control.ss(LAG), tf([2.0], [0.5, 1.0]), control.frd(LAG, OMEGA)],
+    ids=["TransferFunction", "StateSpace of python-control", "StateSpace", "FRD"],
+)
 def test_bode_and_sigma_of_a_lag_in_closed_form(system):
     top, bottom = plot.bode(system, None if hasattr(system, "frdata") else OMEGA)
     f, dB = curve(top)
@@ -63,8 +66,13 @@ def test_frequencies_may_be_in_hertz():
 def test_axes_given_are_the_axes_returned():
     _, pair = plt.subplots(2)
     assert plot.bode(LAG, ax=pair) is pair
-    for draw in (lambda ax: plot.sigma(LAG, ax=ax), lambda ax: plot.vc_curves(ax=ax), lambda ax: plot.mu(peak(), ax),
-                 lambda ax: plot.dk_history(history(), ax), lambda ax: plot.order([(3, 1.2)], ax)):
+    for draw in (
+        lambda ax: plot.sigma(LAG, ax=ax),
+        lambda ax: plot.vc_curves(ax=ax),
+        lambda ax: plot.mu(peak(), ax),
+        lambda ax: plot.dk_history(history(), ax),
+        lambda ax: plot.order([(3, 1.2)], ax),
+    ):
         _, one = plt.subplots()
         assert draw(one) is one
     with pytest.raises(InputError, match="expected 2 axes"):
@@ -74,8 +82,8 @@ def test_axes_given_are_the_axes_returned():
 def test_singular_values_of_several_channels():
     G = control.ss(np.diag([-1.0, -2.0]), np.eye(2), np.diag([3.0, 1.0]), np.zeros((2, 2)))
     ax = plot.sigma(G, OMEGA)
-    np.testing.assert_allclose(curve(ax, 0)[1], 20 * np.log10(3 / np.sqrt(1 + OMEGA ** 2)), atol=1e-9)
-    np.testing.assert_allclose(curve(ax, 1)[1], 20 * np.log10(1 / np.sqrt(4 + OMEGA ** 2)), atol=1e-9)
+    np.testing.assert_allclose(curve(ax, 0)[1], 20 * np.log10(3 / np.sqrt(1 + OMEGA**2)), atol=1e-9)
+    np.testing.assert_allclose(curve(ax, 1)[1], 20 * np.log10(1 / np.sqrt(4 + OMEGA**2)), atol=1e-9)
     assert len(plot.bode(G, OMEGA)[0].get_legend().get_texts()) == 4
 
 
@@ -144,8 +152,12 @@ def test_what_is_no_system_is_refused():
 
 def test_mu_of_a_synthesis_names_the_call_that_has_the_curves():
     # A lag with uncertain gain and a disturbance; its output and half the effort are to be small, y has noise.
-    P = StateSpace([[-1.0]], [[0.3, 1.0, 0.0, 1.0]], [[0.0], [1.0], [0.0], [1.0]],
-                   [[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0.5], [0, 0, 0.1, 0]])
+    P = StateSpace(
+        [[-1.0]],
+        [[0.3, 1.0, 0.0, 1.0]],
+        [[0.0], [1.0], [0.0], [1.0]],
+        [[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0.5], [0, 0, 0.1, 0]],
+    )
     found = musyn(P, [ComplexScalar(1, "gain")], 1, 1, max_iterations=2, polish=False)
     with pytest.raises(InputError, match=r"mu_peak\(result.closed_loop, result.blocks\)"):
         plot.mu(found)

@@ -26,14 +26,27 @@ from avis_ctrl.study.plant import DesignPlant, build_plant
 DESIGN = Path(__file__).parents[2] / "designs" / "avis_z_phix.toml"
 GAINS = {"passive": None, "skyhook": 8e3, "skyhook_classical": 3e4, "hinf": 1.2e4, "mu": 1.5e4}
 KINDS = {"skyhook_classical": "skyhook"}
-TITLES = {"skyhook": "skyhook, tuned", "skyhook_classical": "skyhook, critical damping", "hinf": "H-infinity, nominal",
-          "mu": "mu synthesis"}
+TITLES = {
+    "skyhook": "skyhook, tuned",
+    "skyhook_classical": "skyhook, critical damping",
+    "hinf": "H-infinity, nominal",
+    "mu": "mu synthesis",
+}
 
 
 def _bound(upper: float, frequencies: np.ndarray) -> Bound:
-    curve = 0.9 * np.exp(-np.log(frequencies / 20) ** 2)
-    return Bound(upper, 0.9, 20.0, True, None, ("mass at -10 %", "isolator2.k_z at +15 %"), frequencies,
-                 np.where(np.isinf(upper), np.inf, curve), 0.98 * curve)
+    curve = 0.9 * np.exp(-(np.log(frequencies / 20) ** 2))
+    return Bound(
+        upper,
+        0.9,
+        20.0,
+        True,
+        None,
+        ("mass at -10 %", "isolator2.k_z at +15 %"),
+        frequencies,
+        np.where(np.isinf(upper), np.inf, curve),
+        0.98 * curve,
+    )
 
 
 def _controller(name: str, plant: DesignPlant) -> ControllerResult:
@@ -48,26 +61,68 @@ def _controller(name: str, plant: DesignPlant) -> ControllerResult:
     bound = _bound(upper, np.geomspace(1, 2000, 50))
     bands = 10.0 ** (np.arange(20) / 10)
     volts = dict.fromkeys(plant.actuators, 0.01 if K is not None else 0.0)
-    site = SiteResponse(dict.fromkeys(plant.axes, 2e-6), dict.fromkeys(plant.axes, 1e-7), bands, 3e-6 / bands,
-                        np.stack([2e-6 / bands] * n, axis=1), "VC-E", None, volts, volts)
+    site = SiteResponse(
+        dict.fromkeys(plant.axes, 2e-6),
+        dict.fromkeys(plant.axes, 1e-7),
+        bands,
+        3e-6 / bands,
+        np.stack([2e-6 / bands] * n, axis=1),
+        "VC-E",
+        None,
+        volts,
+        volts,
+    )
     fastest = 0.0 if K is None else 60.0
-    return ControllerResult(name, TITLES.get(name, name), KINDS.get(name, name), K, name != "skyhook_classical", 1.1,
-                            bound, bound, bound, bound,
-                            Transmissibility(omega, T, sigma, 0.8 * sigma, 1.2 * sigma), 1e-5 * sigma,
-                            site, float(sigma.max()), fastest)
+    return ControllerResult(
+        name,
+        TITLES.get(name, name),
+        KINDS.get(name, name),
+        K,
+        name != "skyhook_classical",
+        1.1,
+        bound,
+        bound,
+        bound,
+        bound,
+        Transmissibility(omega, T, sigma, 0.8 * sigma, 1.2 * sigma),
+        1e-5 * sigma,
+        site,
+        float(sigma.max()),
+        fastest,
+    )
 
 
 @pytest.fixture(scope="session")
 def fabricated() -> DesignResult:
     design, rig = read_design(DESIGN), load_rig("avis")
     plant = build_plant(design, rig)
-    requirements = (Requirement("upper bound of mu", 1.0, 0.93, "", True, "at most", "guaranteed at every frequency"),
-                    Requirement("worst-case peak", 4.0, np.inf, "dB", False, "at most"),
-                    Requirement("advantage over the skyhook", 6.0, 7.25, "dB", True, "at least"))
+    requirements = (
+        Requirement("upper bound of mu", 1.0, 0.93, "", True, "at most", "guaranteed at every frequency"),
+        Requirement("worst-case peak", 4.0, np.inf, "dB", False, "at most"),
+        Requirement("advantage over the skyhook", 6.0, 7.25, "dB", True, "at least"),
+    )
     history = tuple(Iteration(k, 1.0 + 1 / k, 1.0 + 0.9 / k, 10 + k, 0.01, k, 0.2, "K-step") for k in range(1, 4))
-    provenance = {"avis_ctrl": "0.1.0", "design_file": "avis_z_phix.toml", "inputs_sha256": "0123456789abcdef" * 4,
-                  "seed": 1, "date": "2025-01-02T03:04:05+00:00", "seconds": 12.5}
+    provenance = {
+        "avis_ctrl": "0.1.0",
+        "design_file": "avis_z_phix.toml",
+        "inputs_sha256": "0123456789abcdef" * 4,
+        "seed": 1,
+        "date": "2025-01-02T03:04:05+00:00",
+        "seconds": 12.5,
+    }
     controllers = tuple(_controller(name, plant) for name in GAINS)
     mu = controllers[-1].transmissibility
-    return DesignResult(design, rig, plant, controllers, history, requirements, reduction_error(rig, design.keep),
-                        SixDofCheck(mu.omega, mu.sigma, 0.1 * mu.sigma, 0.0), None, provenance, 12.5, ("a remark",))
+    return DesignResult(
+        design,
+        rig,
+        plant,
+        controllers,
+        history,
+        requirements,
+        reduction_error(rig, design.keep),
+        SixDofCheck(mu.omega, mu.sigma, 0.1 * mu.sigma, 0.0),
+        None,
+        provenance,
+        12.5,
+        ("a remark",),
+    )

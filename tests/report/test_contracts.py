@@ -19,8 +19,18 @@ from avis_ctrl.study.uncertainty_file import UncertaintyFile
 
 PAGES = Path(__file__).resolve().parents[2] / "docs" / "contracts"
 # Keyed by names of the table or of the study; what is inside `simulation` and `provenance` is for people.
-OPEN = {"parameters", "simulation", "provenance", "worst_cases", "values", "companions", "culprit", "design", "matrix",
-        "gamma_slicot"}
+OPEN = {
+    "parameters",
+    "simulation",
+    "provenance",
+    "worst_cases",
+    "values",
+    "companions",
+    "culprit",
+    "design",
+    "matrix",
+    "gamma_slicot",
+}
 
 
 def named(page: str) -> set[str]:

@@ -27,8 +27,11 @@ def examples() -> dict:
 
 
 def test_the_map_has_every_package():
-    there = {path.name.removesuffix(".py") for path in (ROOT / "avis_ctrl").iterdir()
-             if (path.suffix == ".py" or (path / "__init__.py").is_file()) and path.stem != "__init__"}
+    there = {
+        path.name.removesuffix(".py")
+        for path in (ROOT / "avis_ctrl").iterdir()
+        if (path.suffix == ".py" or (path / "__init__.py").is_file()) and path.stem != "__init__"
+    }
     first = " ".join(re.findall(r"^\| (`.*?) \|", TEXT, re.M))
     assert set(re.findall(r"`(\w+)`", first)) == there
 

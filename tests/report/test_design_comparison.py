@@ -24,10 +24,15 @@ matplotlib.use("Agg")
 def folders(fabricated, tmp_path_factory):
     """The same result twice; of the second the requested peak, a requirement and mu differ."""
     base = tmp_path_factory.mktemp("compared")
-    design = fabricated.design.model_copy(update={
-        "title": "softer", "transmissibility": fabricated.design.transmissibility.model_copy(update={"peak_dB": 6.0})})
-    controllers = tuple(replace(c, mu=replace(c.mu, upper=0.71)) if c.name == "mu" else c
-                        for c in fabricated.controllers)
+    design = fabricated.design.model_copy(
+        update={
+            "title": "softer",
+            "transmissibility": fabricated.design.transmissibility.model_copy(update={"peak_dB": 6.0}),
+        }
+    )
+    controllers = tuple(
+        replace(c, mu=replace(c.mu, upper=0.71)) if c.name == "mu" else c for c in fabricated.controllers
+    )
     for name, one in (("a", fabricated), ("b", replace(fabricated, design=design, controllers=controllers))):
         write_study(one, open_folder(base / name))
     return base / "a", base / "b"
@@ -38,8 +43,10 @@ def test_what_was_requested_and_found_differently(folders, fabricated):
     assert found.titles == (fabricated.design.title, "softer")
     assert found.requested == (("transmissibility.peak_dB", "3.5", "6"),)
     assert ("mu, upper bound", "0.93", "0.71") in found.found
-    assert f"{sum(r.met for r in fabricated.requirements)} of {len(fabricated.requirements)}" in dict(
-        (name, first) for name, first, _ in found.found)["requirements met"]
+    assert (
+        f"{sum(r.met for r in fabricated.requirements)} of {len(fabricated.requirements)}"
+        in dict((name, first) for name, first, _ in found.found)["requirements met"]
+    )
     assert found.note.startswith("mu of the two cannot be compared: it refers to different transmissibility")
     assert "softer" in found._repr_html_()
 
@@ -56,10 +63,14 @@ def test_the_command_prints_both(folders):
     assert done.exit_code == 0 and "transmissibility.peak_dB" in done.output and "0.71" in done.output
 
 
-@pytest.mark.parametrize("spoil, words", [
-    (lambda path: None, "study.json"), (lambda path: (path / "study.json").write_text("{"), "expected a JSON file"),
-    (lambda path: (path / "study.json").write_text('{"format": "avis-study"}'), "expected a design"),
-])
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda path: None, "study.json"),
+        (lambda path: (path / "study.json").write_text("{"), "expected a JSON file"),
+        (lambda path: (path / "study.json").write_text('{"format": "avis-study"}'), "expected a design"),
+    ],
+)
 def test_a_folder_that_is_no_design_is_one_line(folders, tmp_path, spoil, words):
     (tmp_path / "result.json").write_text((folders[0] / "result.json").read_text())
     spoil(tmp_path)

@@ -22,9 +22,15 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.design_result import DesignResult
 
 
-@pytest.mark.parametrize(("low", "high", "labels"), [
-    (0.1, 100.0, ["0.1", "1", "10", "100"]), (1.0, 100.0, ["1", "2", "5", "10", "20", "50", "100"]),
-    (0.05, 30.0, ["0.1", "1", "10"]), (1e-9, 1e-6, ["1e-9", "1e-8", "1e-7", "1e-6"])])
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [
+        (0.1, 100.0, ["0.1", "1", "10", "100"]),
+        (1.0, 100.0, ["1", "2", "5", "10", "20", "50", "100"]),
+        (0.05, 30.0, ["0.1", "1", "10"]),
+        (1e-9, 1e-6, ["1e-9", "1e-8", "1e-7", "1e-6"]),
+    ],
+)
 def test_ticks(low: float, high: float, labels: list[str]) -> None:
     assert ticks_log(low, high)[1] == labels
 
@@ -48,11 +54,20 @@ def test_what_is_not_finite_is_said_in_words() -> None:
     assert np.isnan(in_dB([0.0, np.inf, np.nan])).all()
 
 
-@pytest.mark.parametrize(("typed", "printed"), [
-    ("-17.2 % at -3 deg", "−17.2 % at −3 deg"), ("log evidence 4.14e+03 behind", "log evidence 4140 behind"),
-    ("1.853e+04 N s/m", "18530 N s/m"), ("5.814e+05 rad/s", "5.814e5 rad/s"), ("below 3.1e-05 s", "below 3.1e−5 s"),
-    ("41860 +- 160 N/m", "41860 ± 160 N/m"), ("2026-11-25, pages 71-109", "2026-11-25, pages 71-109"),
-    ("run1e-3.h5", "run1e-3.h5"), ("avis gap --design", "avis gap --design")])
+@pytest.mark.parametrize(
+    ("typed", "printed"),
+    [
+        ("-17.2 % at -3 deg", "−17.2 % at −3 deg"),
+        ("log evidence 4.14e+03 behind", "log evidence 4140 behind"),
+        ("1.853e+04 N s/m", "18530 N s/m"),
+        ("5.814e+05 rad/s", "5.814e5 rad/s"),
+        ("below 3.1e-05 s", "below 3.1e−5 s"),
+        ("41860 +- 160 N/m", "41860 ± 160 N/m"),
+        ("2026-11-25, pages 71-109", "2026-11-25, pages 71-109"),
+        ("run1e-3.h5", "run1e-3.h5"),
+        ("avis gap --design", "avis gap --design"),
+    ],
+)
 def test_signs_and_powers_are_typeset_and_names_are_not(typed, printed):
     assert words.typeset(typed) == printed
 
@@ -69,8 +84,15 @@ def test_rig_drawing_names_every_point(name: str) -> None:
 def test_block_diagram_shows_every_part_and_signal(fabricated: DesignResult) -> None:
     plant = fabricated.plant
     diagram, families = BlockDiagram(plant), Families(plant)
-    assert diagram.chain == ["K", "delay and amplifier *", "allocation", "actuator chain *", "rig", "sensor chain *",
-                             "sum *"]
+    assert diagram.chain == [
+        "K",
+        "delay and amplifier *",
+        "allocation",
+        "actuator chain *",
+        "rig",
+        "sensor chain *",
+        "sum *",
+    ]
     assert {families.of(part.name) for part in plant.full.parts} <= set(diagram.nodes)
     assert sum(p.count for p in families.parts) == len(plant.full.parts)
     assert sorted(m for s in families.signals for m in s.members) == sorted(s.name for s in plant.full.signals)
@@ -82,8 +104,10 @@ def test_block_diagram_shows_every_part_and_signal(fabricated: DesignResult) -> 
 
 def test_boxes_of_the_block_diagram_do_not_overlap(fabricated: DesignResult) -> None:
     diagram = BlockDiagram(fabricated.plant)
-    boxes = [(x - w / 2, x + w / 2, y - diagram._height(n) / 2, y + diagram._height(n) / 2)
-             for n, (x, y, w) in diagram.nodes.items()]
+    boxes = [
+        (x - w / 2, x + w / 2, y - diagram._height(n) / 2, y + diagram._height(n) / 2)
+        for n, (x, y, w) in diagram.nodes.items()
+    ]
     for k, (l1, r1, t1, b1) in enumerate(boxes):
         assert not any(l1 < r2 and l2 < r1 and t1 < b2 and t2 < b1 for l2, r2, t2, b2 in boxes[:k])
 
@@ -96,8 +120,19 @@ def test_canvas_escapes() -> None:
 
 def test_both_backends_draw_labels_units_and_legend() -> None:
     x = np.geomspace(1, 10, 5)
-    figure = Figure("f", "caption", (Panel(Axis("frequency [Hz]", "log", (1.0, 10.0)), Axis("gain [V]"), (
-        Curve(x, x, "first", Style("#0072b2")), Curve(x, 2 * x, "second", Style("#d55e00", "dash"))), (), "panel"),))
+    figure = Figure(
+        "f",
+        "caption",
+        (
+            Panel(
+                Axis("frequency [Hz]", "log", (1.0, 10.0)),
+                Axis("gain [V]"),
+                (Curve(x, x, "first", Style("#0072b2")), Curve(x, 2 * x, "second", Style("#d55e00", "dash"))),
+                (),
+                "panel",
+            ),
+        ),
+    )
     drawn = " ".join(ElementTree.fromstring(svg(figure)).itertext())
     for text in ("frequency [Hz]", "gain [V]", "first", "second", "panel", "10"):
         assert text in drawn

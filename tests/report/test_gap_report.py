@@ -29,8 +29,16 @@ from avis_ctrl.report.pieces import Mark, Paragraph, Section, Table
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay, selections
 
-NAMED = {"gap_spectrum", "ladder", "gap_responses", "heat_map", "gap_records", "gap_coherence", "gap_coherence_lowest",
-"gap_mu"}
+NAMED = {
+    "gap_spectrum",
+    "ladder",
+    "gap_responses",
+    "heat_map",
+    "gap_records",
+    "gap_coherence",
+    "gap_coherence_lowest",
+    "gap_mu",
+}
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +112,15 @@ def test_each_verdict_has_its_words_and_colour(found, verdict):
     part = section(one, "result")
     first = part.pieces[0]
     look = (first.good, first.half)
-    assert look == {"none": (True, False), "explained": (True, False), "partly explained": (None, True),
-                    "unexplained": (False, False)}[verdict]
+    assert (
+        look
+        == {
+            "none": (True, False),
+            "explained": (True, False),
+            "partly explained": (None, True),
+            "unexplained": (False, False),
+        }[verdict]
+    )
     claims = {name: sum(text in prose(part) for text in (claim,)) for name, claim in wording.CLAIMS.items()}
     assert claims == {name: int(name == verdict) for name in VERDICTS}
     assert f"Verdict: {verdict}." in prose(part)
@@ -113,8 +128,12 @@ def test_each_verdict_has_its_words_and_colour(found, verdict):
     classes = [a.get("class") for tag, a in Reader(gap_html(one).encode()).elements if tag == "p"]
     assert css in classes
     # Without a named effect nothing of an updated model is drawn or tabled.
-    labels = {entry.label for name in ("before_after", "where") for f in figures(section(one, name)).values()
-              for entry in f.legend()}
+    labels = {
+        entry.label
+        for name in ("before_after", "where")
+        for f in figures(section(one, name)).values()
+        for entry in f.legend()
+    }
     assert ("updated" in labels) == bool(one.gap.effects)
     assert len(figures(section(one, "where"))["heat_map"].panels) == 1 + bool(one.gap.effects)
 
@@ -149,8 +168,11 @@ def test_ladder_and_noise_line(found):
     np.testing.assert_allclose(bars.y, [31.0, 12.0, 1.04])
     line = next(c for c in drawn.curves if c.label == "noise alone")
     np.testing.assert_allclose(line.y, 1.01)
-    assert drawn.y.scale == "log" and [word for _, word in drawn.x.ticks] == ["nominal", "re-identified",
-                                                                             "+ com offset"]
+    assert drawn.y.scale == "log" and [word for _, word in drawn.x.ticks] == [
+        "nominal",
+        "re-identified",
+        "+ com offset",
+    ]
     rows = tables(section(found, "before_after"))[0].rows
     assert [row[0] for row in rows] == ["nominal", "re-identified", "+ com offset", "noise alone"]
     assert [row[3] for row in rows] == ["900.0", "140.0", "1.030", "1"]
@@ -163,11 +185,16 @@ def test_sizes_are_rounded_to_their_deviation(found):
         assert float(rows[name][4].removeprefix("± ")) == pytest.approx(p.std, rel=0.06)
 
 
-@pytest.mark.parametrize(("one", "text"), [
-    (Reported(92.0, 1.0, "Hz"), "(92.0 ± 1.0) Hz"), (Reported(0.93, 0.004, "1"), "0.9300 ± 0.0040"),
-    (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)"),
-    (Reported(0.00132638, 4.6e-7, "s"), "(1.32638 ± 0.00046) ms"), (Reported(0.0121, 0.0002, "m"),
-                                                                    "(0.01210 ± 0.00020) m")])
+@pytest.mark.parametrize(
+    ("one", "text"),
+    [
+        (Reported(92.0, 1.0, "Hz"), "(92.0 ± 1.0) Hz"),
+        (Reported(0.93, 0.004, "1"), "0.9300 ± 0.0040"),
+        (Reported(5.0, float("nan"), "Hz"), "5.0000 Hz (no standard deviation)"),
+        (Reported(0.00132638, 4.6e-7, "s"), "(1.32638 ± 0.00046) ms"),
+        (Reported(0.0121, 0.0002, "m"), "(0.01210 ± 0.00020) m"),
+    ],
+)
 def test_a_quantity_in_words(one, text):
     assert wording.quantity(one) == text
 
@@ -228,8 +255,10 @@ def test_responses_show_the_gap_and_that_it_closes(found):
     assert isinstance(seen, GapOverlay)
     pairs = worst_pairs(seen)
     assert len({i for i, _ in pairs}) == len(pairs) == 3
-    far = [np.mean(np.abs(seen.measured - G) ** 2 / (2 * seen.measured_std ** 2), axis=0)
-           for G in (seen.baseline, seen.updated)]
+    far = [
+        np.mean(np.abs(seen.measured - G) ** 2 / (2 * seen.measured_std**2), axis=0)
+        for G in (seen.baseline, seen.updated)
+    ]
     for i, j in pairs:
         assert far[0][i, j] > 50 * far[1][i, j]
         assert far[1][i, j] < 3  # of complex noise alone 1
@@ -250,6 +279,7 @@ def test_an_effect_without_a_response_is_measured_from_its_simulation(found):
 def test_records_of_one_level_come_first(found):
     def at(record, level):
         return replace(record, header=replace(record.header, level_V=level))
+
     a, b, c, rest = found.measured.records
     campaign = replace(found.measured, records=(at(a, 0.1), at(b, 0.3), at(c, 0.31), rest))
     assert [[r.header.name for r in one.records] for one in selections(campaign)] == [["01", "02"], ["00", "01", "02"]]
@@ -272,7 +302,10 @@ def test_records_stand_by_level_and_time_fitted_ones_open(found):
     assert markers.count("circle-open") == 4
     one = replace(found, gap=stand_in.with_verdict(found.gap, "none"))
     assert {e.label for e in figures(section(one, "dependence"))["gap_records"].legend()} == {
-        "re-identified, fitted", "re-identified, held out", "noise alone"}
+        "re-identified, fitted",
+        "re-identified, held out",
+        "noise alone",
+    }
 
 
 def test_shares_of_power_are_drawn_and_tabled(found):
@@ -287,8 +320,12 @@ def test_shares_of_power_are_drawn_and_tabled(found):
     rows = tables(part)[0].rows
     assert len(rows) == len(stand_in.OUTPUTS) and len(rows[0]) == 6
     assert "lowest level" in prose(part)
-    alone = replace(top, how="one level", shares={k: v for k, v in top.shares.items() if k != "sensors"},
-                    whole={k: v for k, v in top.whole.items() if k != "sensors"})
+    alone = replace(
+        top,
+        how="one level",
+        shares={k: v for k, v in top.shares.items() if k != "sensors"},
+        whole={k: v for k, v in top.whole.items() if k != "sensors"},
+    )
     text = prose(section(replace(found, gap=replace(found.gap, shares=(alone,))), "dependence"))
     assert "cannot be distinguished from nonlinearity" in text and "counts as unmeasured inputs" in text
 
@@ -296,31 +333,45 @@ def test_shares_of_power_are_drawn_and_tabled(found):
 def test_none_says_from_which_size_on_an_effect_would_show(found):
     gap = stand_in.with_verdict(found.gap, "none")
     assert not tables(section(replace(found, gap=gap), "remaining"))
-    seen = (Detectable("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),
-            Detectable("sensor_gain", "Sz1", "gain", float("inf"), "1"),
-            Detectable("actuator_gain", "Ax2", "gain", 3e-4, "1"),
-            Detectable("actuator_gain", "Az1", "gain", 1e-4, "1"))
+    seen = (
+        Detectable("actuator_lag", "actuators", "time_constant_s", 3.1e-5, "s"),
+        Detectable("sensor_gain", "Sz1", "gain", float("inf"), "1"),
+        Detectable("actuator_gain", "Ax2", "gain", 3e-4, "1"),
+        Detectable("actuator_gain", "Az1", "gain", 1e-4, "1"),
+    )
     one = replace(found, gap=replace(gap, detectable=seen))
     assert tables(section(one, "remaining"))[0].rows == (
-        ("actuator lag", "actuators", "time constant", "3.1e−5 s"), ("sensor gain", "Sz1", "gain", "not detectable"),
-        ("actuator gain", "Az1 (best) to Ax2", "gain", "1.0e−4 to 3.0e−4"))
+        ("actuator lag", "actuators", "time constant", "3.1e−5 s"),
+        ("sensor gain", "Sz1", "gain", "not detectable"),
+        ("actuator gain", "Az1 (best) to Ax2", "gain", "1.0e−4 to 3.0e−4"),
+    )
     assert "detection limits" in prose(section(one, "result"))
 
 
 def test_terms_that_every_model_holds_are_no_effect(found):
     base = found.gap.baseline
     large = active(LargeMotion(), base, "payload", (1.0, 0.0, 1.0))
-    gap = replace(found.gap, baseline=base.with_effect(large), updated=found.gap.updated.with_effect(large),
-                  covariance=None)
+    gap = replace(
+        found.gap, baseline=base.with_effect(large), updated=found.gap.updated.with_effect(large), covariance=None
+    )
     part = section(replace(found, gap=gap), "parameters")
     assert not [row for t in tables(part) for row in t.rows if "large" in row[0]]
     assert "which exist in every table" in prose(part) and "motors turn" in prose(part)
 
 
-@pytest.mark.parametrize(("name", "unit", "read"), [
-    ("stiffness_N_per_m", "N/m", "stiffness"), ("integral_gain_N_per_ms", "N/(m s)", "integral gain"),
-    ("time_constant_s", "s", "time constant"), ("k3_N_per_m3", "N/m^3", "k3"), ("mass_kg", "kg", "mass"),
-    ("damping", "1", "damping"), ("uneven_1", "1", "uneven 1"), ("slope_per_h", "1/h", "slope")])
+@pytest.mark.parametrize(
+    ("name", "unit", "read"),
+    [
+        ("stiffness_N_per_m", "N/m", "stiffness"),
+        ("integral_gain_N_per_ms", "N/(m s)", "integral gain"),
+        ("time_constant_s", "s", "time constant"),
+        ("k3_N_per_m3", "N/m^3", "k3"),
+        ("mass_kg", "kg", "mass"),
+        ("damping", "1", "damping"),
+        ("uneven_1", "1", "uneven 1"),
+        ("slope_per_h", "1/h", "slope"),
+    ],
+)
 def test_parameters_are_read_without_their_units(name, unit, read):
     assert spoken(name, unit) == read
 
@@ -338,11 +389,15 @@ def test_controller_only_where_there_is_one(found):
     rows = tables(part)[0].rows
     assert [row[4] for row in rows] == [Mark("0.950", True), Mark("1.32", False), Mark("0.970", True)]
     assert [row[7] for row in rows] == ["+5.2 dB", "unstable", "+5.4 dB"]
-    lost = replace(found.design.before, stable=False, **dict.fromkeys(
-        ("mu_upper", "mu_lower", "peak_dB", "band_dB", "worst_peak_dB", "worst_band_dB"), float("inf")))
+    lost = replace(
+        found.design.before,
+        stable=False,
+        **dict.fromkeys(("mu_upper", "mu_lower", "peak_dB", "band_dB", "worst_peak_dB", "worst_band_dB"), float("inf")),
+    )
     part = section(replace(found, design=replace(found.design, before=lost, after=None, new=None)), "controller")
-    assert tables(part)[0].rows == (("previous", "re-identified", Mark("no", False), Mark("yes", True),
-                                     Mark("unstable", False), *["unstable"] * 4),)
+    assert tables(part)[0].rows == (
+        ("previous", "re-identified", Mark("no", False), Mark("yes", True), Mark("unstable", False), *["unstable"] * 4),
+    )
     drawn = figures(part)["gap_mu"]
     assert "not stable" in drawn.caption and svg(drawn).startswith("<?xml")
 
@@ -364,13 +419,24 @@ def test_numbers_that_are_not_finite(found):
     """A stage without noise, a place without statistics, an effect without deviation: said in words."""
     nan, inf = float("nan"), float("inf")
     effect = replace(found.gap.effects[0], parameters={"offset_x_m": Reported(0.02, nan, "m")}, probability=nan)
-    gap = replace(found.gap, effects=(effect,), stages=(Stage("nominal", inf, nan), Stage("re-identified", 0.0, nan)),
-                  where=(Where(1.0, 2.0, "", "Sz1", nan),), noise_nrmse=nan, sentences=())
+    gap = replace(
+        found.gap,
+        effects=(effect,),
+        stages=(Stage("nominal", inf, nan), Stage("re-identified", 0.0, nan)),
+        where=(Where(1.0, 2.0, "", "Sz1", nan),),
+        noise_nrmse=nan,
+        sentences=(),
+    )
     one = replace(found, gap=gap)
     gap_html(one)
     gap_pdf(one)
-    cells = [c.text if isinstance(c, Mark) else c for s in document(one).sections for t in tables(s)
-             for row in t.rows for c in row]
+    cells = [
+        c.text if isinstance(c, Mark) else c
+        for s in document(one).sections
+        for t in tables(s)
+        for row in t.rows
+        for c in row
+    ]
     assert len(cells) > 100
     assert not [c for c in cells if re.search(r"\b(inf|nan|None|np\.|array)\b", c)]
 
@@ -386,10 +452,19 @@ def test_every_axis_has_a_unit_or_names(found):
 
 def test_text_from_files_is_never_markup(found, html, tmp_path):
     effect = replace(found.gap.effects[0], confirmation=HOSTILE)
-    gap = replace(found.gap, sentences=(HOSTILE, HOSTILE), effects=(effect,), next_experiment=HOSTILE, heat=replace(
-        found.gap.heat, columns=(HOSTILE, *found.gap.heat.columns[1:])))
-    bad = replace(found, gap=gap, findings=(Finding(HOSTILE, "warning", HOSTILE),),
-                  measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE))
+    gap = replace(
+        found.gap,
+        sentences=(HOSTILE, HOSTILE),
+        effects=(effect,),
+        next_experiment=HOSTILE,
+        heat=replace(found.gap.heat, columns=(HOSTILE, *found.gap.heat.columns[1:])),
+    )
+    bad = replace(
+        found,
+        gap=gap,
+        findings=(Finding(HOSTILE, "warning", HOSTILE),),
+        measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE),
+    )
     page, plain = Reader(gap_html(bad).encode()), Reader(html.encode())
     assert [tag for tag, _ in page.elements].count("script") == [tag for tag, _ in plain.elements].count("script")
     assert page.text.count(HOSTILE) >= 5

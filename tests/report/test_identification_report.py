@@ -32,9 +32,14 @@ from avis_ctrl.study.identification import Identification, IdentifyOptions, iden
 from avis_ctrl.study.plan_file import plan_from_table
 
 FREE = ("mass", "isolator*.k_x", "isolator*.k_z", "isolator1.c_z")
-PLAN = {"title": "small", "duration_s": 8.0, "settle_s": 2.0, "band_Hz": [1.0, 20.0],
-        "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
-        "record": [{"excitation": "noise", "records": 3}, {"excitation": "rest"}]}
+PLAN = {
+    "title": "small",
+    "duration_s": 8.0,
+    "settle_s": 2.0,
+    "band_Hz": [1.0, 20.0],
+    "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+    "record": [{"excitation": "noise", "records": 3}, {"excitation": "rest"}],
+}
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +91,11 @@ def test_verdict_has_the_numbers_of_the_validation(found):
     assert isinstance(first, Paragraph) and found.validation.verdict[1:] in first.text
     information = found.campaign_fit.information
     assert f"{information.rank} combinations of the {len(information.names)} parameters" in first.text
-    assert first.good == (all(h.consistent for h in found.validation.held_out)
-                          and not any(f.severity == "stop" for f in found.findings)
-                          and found.campaign_fit.fit.converged)
+    assert first.good == (
+        all(h.consistent for h in found.validation.held_out)
+        and not any(f.severity == "stop" for f in found.findings)
+        and found.campaign_fit.fit.converged
+    )
 
 
 def test_the_first_page_is_read_alone(found, pdf, tmp_path):
@@ -140,8 +147,13 @@ def test_measured_and_model_reach_the_page(found, html):
 
 
 def test_warnings_come_first_with_their_pictures(found):
-    picture = Picture("Sz1", "time [s]", "Sz1 [V]", (Series("Sz1", np.arange(4.0), np.array([1.0, 2, 2, 2])),),
-                      (Limit("stuck from", 1.0, "x"),))
+    picture = Picture(
+        "Sz1",
+        "time [s]",
+        "Sz1 [V]",
+        (Series("Sz1", np.arange(4.0), np.array([1.0, 2, 2, 2])),),
+        (Limit("stuck from", 1.0, "x"),),
+    )
     extra = Finding("dead channel", "warning", "Sz1 is stuck.", picture=picture)
     part = section(replace(found, findings=(*found.findings, extra)), "gates")
     assert tables(part)[0].rows[0][:2] == ("dead channel", Mark("WARNING", False))
@@ -156,8 +168,14 @@ def test_warnings_come_first_with_their_pictures(found):
 
 def test_pictures_of_every_style_are_drawn():
     x = np.array([0.0, 1.0, 2.0])
-    picture = Picture("A", "channel", "r.m.s. [V]", (Series("b", x, x + 1, "bars"), Series("p", x, x + 2, "points")),
-                      (Limit("most", 5.0),), y_scale="log")
+    picture = Picture(
+        "A",
+        "channel",
+        "r.m.s. [V]",
+        (Series("b", x, x + 1, "bars"), Series("p", x, x + 2, "points")),
+        (Limit("most", 5.0),),
+        y_scale="log",
+    )
     figure = figure_of("f", "c", [picture, picture], 2)
     assert [c.bars > 0 for c in figure.panels[0].curves] == [True, False, False]
     assert figure.panels[0].x.ticks == ((0.0, "0"), (1.0, "1"), (2.0, "2"))
@@ -167,14 +185,16 @@ def test_pictures_of_every_style_are_drawn():
 
 
 def test_panels_of_a_grid_do_not_overlap():
-    panel = Panel(Axis("x"), Axis("y"), (Curve(np.arange(2.0), np.arange(2.0), "a", Style("#000000"),
-                                               error=np.ones(2)),))
+    panel = Panel(
+        Axis("x"), Axis("y"), (Curve(np.arange(2.0), np.arange(2.0), "a", Style("#000000"), error=np.ones(2)),)
+    )
     for columns, shared in ((1, False), (2, False), (3, True)):
         figure = Figure("f", "c", (panel,) * 5, columns, 0.7, shared)
         found = graph(figure)
         layout = found["layout"]
-        boxes = [(layout[f"xaxis{s}"].get("domain", [0, 1]), layout[f"yaxis{s}"]["domain"])
-                 for s in ("", "2", "3", "4", "5")]
+        boxes = [
+            (layout[f"xaxis{s}"].get("domain", [0, 1]), layout[f"yaxis{s}"]["domain"]) for s in ("", "2", "3", "4", "5")
+        ]
         for k, (x, y) in enumerate(boxes):
             assert 0 <= x[0] < x[1] <= 1 + 1e-9 and 0 <= y[0] < y[1] <= 1 + 1e-9
             for other_x, other_y in boxes[:k]:
@@ -191,8 +211,17 @@ def kalman(found: Identification, off: float) -> EkfResult:
     theta = np.tile(values, (m, 1))
     history = EkfHistory(np.arange(m, dtype=float), theta, 0.99 * theta, 1.01 * theta, np.array([0.0, 3.0, 6.0]))
     white = innovation_statistics(np.random.default_rng(3).standard_normal((4000, 6)))
-    return EkfResult(information.names, information.units, information.values, values, 1e-6 * np.eye(n), history,
-                     (white, white), np.zeros(n, int), HONEST_SETTINGS)
+    return EkfResult(
+        information.names,
+        information.units,
+        information.values,
+        values,
+        1e-6 * np.eye(n),
+        history,
+        (white, white),
+        np.zeros(n, int),
+        HONEST_SETTINGS,
+    )
 
 
 def test_ways_are_compared_in_standard_deviations(found):
@@ -218,8 +247,13 @@ def test_a_filter_that_did_not_run_is_said_to_have_not(found):
 
 
 def test_text_from_files_is_never_markup(found, html, tmp_path):
-    bad = replace(found, measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE),
-                  findings=(Finding(HOSTILE, "warning", HOSTILE),), advice=(HOSTILE,), kalman_note=HOSTILE)
+    bad = replace(
+        found,
+        measured=replace(found.measured, notes=(HOSTILE,), source=HOSTILE),
+        findings=(Finding(HOSTILE, "warning", HOSTILE),),
+        advice=(HOSTILE,),
+        kalman_note=HOSTILE,
+    )
     page, plain = Reader(page_of.render(document(bad))), Reader(html)
     assert [tag for tag, _ in page.elements].count("script") == [tag for tag, _ in plain.elements].count("script")
     assert page.text.count(HOSTILE) >= 5
@@ -242,8 +276,13 @@ def test_same_input_same_bytes(found, html, pdf):
 
 
 def test_no_cell_shows_a_programmer_s_nothing(found):
-    cells = [c.text if isinstance(c, Mark) else c for s in document(found).sections for t in tables(s)
-             for row in t.rows for c in row]
+    cells = [
+        c.text if isinstance(c, Mark) else c
+        for s in document(found).sections
+        for t in tables(s)
+        for row in t.rows
+        for c in row
+    ]
     assert len(cells) > 150
     assert not [c for c in cells if re.search(r"\b(inf|nan|None|np\.|array)\b", c)]
 
@@ -263,8 +302,19 @@ def test_frequency_responses_alone(found):
 def test_little_was_found(found):
     """No overlay, no modes, no whiteness: sentences in their place."""
     v = found.validation
-    poor = replace(found, advice=(), validation=replace(v, overlay=None, modes=(), held_out=tuple(
-        replace(h, whiteness=None, nrms_time=None, nrms_time_start=None, nrms_time_whole=None) for h in v.held_out)))
+    poor = replace(
+        found,
+        advice=(),
+        validation=replace(
+            v,
+            overlay=None,
+            modes=(),
+            held_out=tuple(
+                replace(h, whiteness=None, nrms_time=None, nrms_time_start=None, nrms_time_whole=None)
+                for h in v.held_out
+            ),
+        ),
+    )
     text = " ".join(Reader(page_of.render(document(poor))).text.split())
     assert "No measured frequency response can be shown" in text and "not tested" in text
 

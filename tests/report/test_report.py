@@ -55,8 +55,11 @@ class Reader(HTMLParser):
             self.text += data
 
     def graphs(self) -> dict:
-        return next(json.loads(script) for (tag, attrs), script in zip(
-            [e for e in self.elements if e[0] == "script"], self.scripts, strict=True) if attrs.get("id") == "graphs")
+        return next(
+            json.loads(script)
+            for (tag, attrs), script in zip([e for e in self.elements if e[0] == "script"], self.scripts, strict=True)
+            if attrs.get("id") == "graphs"
+        )
 
 
 def pdf_text(pdf: bytes, tmp_path) -> str:
@@ -79,10 +82,14 @@ def pdf(fabricated: DesignResult) -> bytes:
 
 @pytest.fixture(scope="module")
 def hostile(fabricated: DesignResult) -> DesignResult:
-    return replace(fabricated, design=fabricated.design.model_copy(update={"title": HOSTILE}),
-                   rig=replace(fabricated.rig, name=HOSTILE), notes=(HOSTILE,),
-                   requirements=(replace(fabricated.requirements[0], note=HOSTILE),),
-                   controllers=tuple(replace(c, title=f"{c.name} {HOSTILE}") for c in fabricated.controllers))
+    return replace(
+        fabricated,
+        design=fabricated.design.model_copy(update={"title": HOSTILE}),
+        rig=replace(fabricated.rig, name=HOSTILE),
+        notes=(HOSTILE,),
+        requirements=(replace(fabricated.requirements[0], note=HOSTILE),),
+        controllers=tuple(replace(c, title=f"{c.name} {HOSTILE}") for c in fabricated.controllers),
+    )
 
 
 def test_html_fetches_nothing(html: bytes) -> None:
@@ -100,8 +107,18 @@ def test_html_fetches_nothing(html: bytes) -> None:
 def test_requirements_in_both(html: bytes, pdf: bytes, tmp_path) -> None:
     for text in (Reader(html).text, pdf_text(pdf, tmp_path)):
         words = " ".join(text.split())
-        for shown in ("upper bound of mu", "0.930", "at most 1.00", "worst-case peak", "at most +4.0 dB", "NOT MET",
-                      "advantage over the skyhook", "+7.2 dB", "at least +6.0 dB", "unstable"):
+        for shown in (
+            "upper bound of mu",
+            "0.930",
+            "at most 1.00",
+            "worst-case peak",
+            "at most +4.0 dB",
+            "NOT MET",
+            "advantage over the skyhook",
+            "+7.2 dB",
+            "at least +6.0 dB",
+            "unstable",
+        ):
             assert shown in words, shown
 
 
@@ -118,8 +135,15 @@ def test_the_first_page_is_read_alone(fabricated: DesignResult, html: bytes, pdf
     """Task, verdicts, certificate and one figure, and nothing else; the second section begins on the second page."""
     pages = pdf_text(pdf, tmp_path).split("\f")
     first = " ".join(pages[0].split())
-    for shown in ("1 Summary", "Task: one controller for z and phi_x (edge)", "mass ± 10 %", "Table 1", "NOT MET",
-                  "the peak of mu is between", "Figure 1"):
+    for shown in (
+        "1 Summary",
+        "Task: one controller for z and phi_x (edge)",
+        "mass ± 10 %",
+        "Table 1",
+        "NOT MET",
+        "the peak of mu is between",
+        "Figure 1",
+    ):
         assert shown in first, shown
     assert "2 Controllers compared" not in first and "2 Controllers compared" in " ".join(pages[1].split())
     assert [s.alone for s in document(fabricated).sections[:3]] == [True, False, False]
@@ -214,9 +238,25 @@ def test_comparison_says_who_is_unstable(fabricated: DesignResult) -> None:
 def test_a_study_that_found_little_is_still_reported(fabricated: DesignResult) -> None:
     none = np.zeros(0)
     empty = Bound(np.inf, np.nan, np.nan, False, None, (), none, none, none)
-    poor = replace(fabricated, dk_history=(), requirements=(), notes=(), controllers=tuple(
-        replace(c, gamma=np.inf, mu=empty, stability=empty, worst_peak=empty, worst_band=empty, stable=False,
-                peak_transmissibility=np.inf) for c in fabricated.controllers))
+    poor = replace(
+        fabricated,
+        dk_history=(),
+        requirements=(),
+        notes=(),
+        controllers=tuple(
+            replace(
+                c,
+                gamma=np.inf,
+                mu=empty,
+                stability=empty,
+                worst_peak=empty,
+                worst_band=empty,
+                stable=False,
+                peak_transmissibility=np.inf,
+            )
+            for c in fabricated.controllers
+        ),
+    )
     text = " ".join(Reader(render_html(poor)).text.split())
     assert "not proved to be stable for every plant" in text and "No iteration was run." in text
     assert not re.search(r"\b(inf|nan) (dB|Hz|V)\b", text)

@@ -73,13 +73,24 @@ def test_each_axis_is_weighed_against_the_drive_that_reaches_its_limit_first(lim
         gain = abs(plant.full.P.select([f"effort_{axis}"], [f"command_{axis}"])(10j * np.pi)[0, 0])
         assert gain == pytest.approx(level * np.max(np.abs(plant.allocation[:, k]) / limits), rel=5e-3)
         assert plant.effort_weight(axis).meaning.startswith("at most 4 V when")
-    curves = next(p for s in document(limited).sections for p in s.pieces
-                  if isinstance(p, Figure) and p.name == "weight_effort").panels[0].curves
-    assert [c.label for c in curves] == [text for axis in ("z", "phi_x (edge)")
-                                         for text in (f"1/|W_u|, allowed, {axis}", f"mu synthesis, {axis}")]
+    curves = (
+        next(
+            p
+            for s in document(limited).sections
+            for p in s.pieces
+            if isinstance(p, Figure) and p.name == "weight_effort"
+        )
+        .panels[0]
+        .curves
+    )
+    assert [c.label for c in curves] == [
+        text for axis in ("z", "phi_x (edge)") for text in (f"1/|W_u|, allowed, {axis}", f"mu synthesis, {axis}")
+    ]
     site = next(s for s in document(limited).sections if s.anchor == "site")
-    assert any(isinstance(p, Table) and p.caption.endswith("the limit is Az1 10.0 V, Az2 10.0 V, Az3 10.0 V, "
-                                                           "Az4 4.00 V.") for p in site.pieces)
+    assert any(
+        isinstance(p, Table) and p.caption.endswith("the limit is Az1 10.0 V, Az2 10.0 V, Az3 10.0 V, Az4 4.00 V.")
+        for p in site.pieces
+    )
 
 
 def test_result_json_says_which_loops_miss_it(simulated: DesignResult) -> None:

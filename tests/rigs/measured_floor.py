@@ -57,8 +57,9 @@ def read_floor_motion(path: Path) -> MeasuredSpectrum:
 def shared_points(a: MeasuredSpectrum, b: MeasuredSpectrum) -> list[tuple[float, float]]:
     """Bands [Hz] over which two files hold the very same numbers, which two measurements never do."""
     other = dict(zip(b.frequency_Hz.tolist(), b.displacement_asd.tolist(), strict=True))
-    same = np.array([other.get(f) == d for f, d in
-                     zip(a.frequency_Hz.tolist(), a.displacement_asd.tolist(), strict=True)])
+    same = np.array(
+        [other.get(f) == d for f, d in zip(a.frequency_Hz.tolist(), a.displacement_asd.tolist(), strict=True)]
+    )
     return [(float(a.frequency_Hz[i]), float(a.frequency_Hz[j])) for i, j in _runs(same, 3)]
 
 
@@ -66,8 +67,10 @@ def drawn_lines(spectrum: MeasuredSpectrum, points: int = 6) -> list[tuple[float
     """Stretches (low Hz, high Hz, slope) where the ASD is an exact power law: drawn, not measured."""
     slope = np.diff(np.log(spectrum.displacement_asd)) / np.diff(np.log(spectrum.frequency_Hz))
     straight = np.abs(np.diff(slope)) < 1e-6
-    return [(float(spectrum.frequency_Hz[i]), float(spectrum.frequency_Hz[j + 2]), float(slope[i]))
-            for i, j in _runs(straight, points - 2)]
+    return [
+        (float(spectrum.frequency_Hz[i]), float(spectrum.frequency_Hz[j + 2]), float(slope[i]))
+        for i, j in _runs(straight, points - 2)
+    ]
 
 
 def _runs(flags: np.ndarray, shortest: int) -> list[tuple[int, int]]:

@@ -43,8 +43,16 @@ def test_stiffness_damping_and_floor_matrices_are_newtons(rig):
 
 
 def test_actuators_push_where_eq_2_18_says(rig):
-    layout = {"Ay1": (0, 1), "Az1": (0, 2), "Ax2": (1, 0), "Az2": (1, 2), "Ay3": (2, 1), "Az3": (2, 2), "Ax4": (3, 0),
-              "Az4": (3, 2)}
+    layout = {
+        "Ay1": (0, 1),
+        "Az1": (0, 2),
+        "Ax2": (1, 0),
+        "Az2": (1, 2),
+        "Ay3": (2, 1),
+        "Az3": (2, 2),
+        "Ax4": (3, 0),
+        "Az4": (3, 2),
+    }
     eom = rig.equations_of_motion()
     assert eom.actuators == tuple(layout)  # the order of u, eq. 2.24
     for column, (isolator, axis) in zip(eom.T.T, layout.values(), strict=True):
@@ -73,22 +81,27 @@ def test_static_and_high_frequency_limits(skew):
     assert np.allclose(system.dcgain()[:6, 8:], np.eye(6), atol=1e-9)  # the payload follows the floor
     w = 2 * np.pi * 1e4
     high = system.frequency_response(np.array([w]))[0]
-    assert np.allclose(-w**2 * high[:6, :8], np.linalg.solve(eom.M, eom.T), rtol=1e-3, atol=1e-6)
+    assert np.allclose(-(w**2) * high[:6, :8], np.linalg.solve(eom.M, eom.T), rtol=1e-3, atol=1e-6)
 
 
 def test_natural_frequencies_of_the_symmetric_table_by_hand(rig):
     """Equal isolators: z and phi_z alone, (x, phi_y) and (y, phi_x) in pairs; quadratic formula."""
     kx, ky, kz = 21e3, 20e3, 46e3
-    equal = rig.with_parameters({f"isolator{i}.k_{a}": k for i in range(1, 5)
-                                 for a, k in zip("xyz", (kx, ky, kz), strict=True)})
+    equal = rig.with_parameters(
+        {f"isolator{i}.k_{a}": k for i in range(1, 5) for a, k in zip("xyz", (kx, ky, kz), strict=True)}
+    )
 
     def pair(J, k, kr):
         half, product = (k / 500.0 + kr / J) / 2, (k * kr - (k * PZ) ** 2) / (500.0 * J)
         root = np.sqrt(half**2 - product)
         return [np.sqrt(half - root), np.sqrt(half + root)]
 
-    expected = [np.sqrt(4 * kz / 500.0), np.sqrt(4 * (kx * PY**2 + ky * PX**2) / 61.0),
-                *pair(42.7, 4 * kx, 4 * (kz * PX**2 + kx * PZ**2)), *pair(28.5, 4 * ky, 4 * (kz * PY**2 + ky * PZ**2))]
+    expected = [
+        np.sqrt(4 * kz / 500.0),
+        np.sqrt(4 * (kx * PY**2 + ky * PX**2) / 61.0),
+        *pair(42.7, 4 * kx, 4 * (kz * PX**2 + kx * PZ**2)),
+        *pair(28.5, 4 * ky, 4 * (kz * PY**2 + ky * PZ**2)),
+    ]
     found = equal.equations_of_motion().natural_frequencies().frequencies_Hz
     assert np.allclose(found, np.sort(expected) / (2 * np.pi), rtol=1e-12)
 
@@ -143,6 +156,7 @@ def test_slopes_of_all_matrices_are_those_of_differences(skew, apart):
     def matrices(rig):
         eom, (_, R) = rig.equations_of_motion(), rig.sensor_rows()
         return {"M": eom.M, "C": eom.C, "K": eom.K, "C_floor": eom.C_floor, "K_floor": eom.K_floor, "T": eom.T, "R": R}
+
     channels = {"T": rig.equations_of_motion().actuators, "R": rig.sensor_rows()[0]}
     for name, parameter in rig.parameters().items():
         found = {which: np.zeros_like(matrix) for which, matrix in matrices(rig).items()}

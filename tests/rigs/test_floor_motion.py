@@ -15,24 +15,17 @@ from scipy.integrate import quad
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import h2_norm
 from avis_ctrl.lti.rational import Rational
-from avis_ctrl.rigs.floor_motion import (
-    band_rms,
-    third_octave_edges,
-    third_octave_midbands,
-    third_octave_rms,
-)
-from avis_ctrl.rigs.floor_spectrum import (
-    SpectrumModel,
-    realise,
-    shipped_spectra,
-    shipped_spectrum,
-    spectrum_from_table,
-)
+from avis_ctrl.rigs.floor_motion import band_rms, third_octave_edges, third_octave_midbands, third_octave_rms
+from avis_ctrl.rigs.floor_spectrum import SpectrumModel, realise, shipped_spectra, shipped_spectrum, spectrum_from_table
 from benchmarks.floor_spectra import fit_error_dB, fit_spectrum, smoothed, spectrum_to_table
 
-FILES = {"kamioka_quiet": "kamiokaQuiet.txt", "kamioka_stormy": "kamiokaNoisy.txt",
-         "clio_shield_horizontal": "CLIOshieldHoriz.txt", "clio_shield_vertical": "CLIOshieldVert.txt",
-         "ligo_livingston": "seismic_mean.npz"}
+FILES = {
+    "kamioka_quiet": "kamiokaQuiet.txt",
+    "kamioka_stormy": "kamiokaNoisy.txt",
+    "clio_shield_horizontal": "CLIOshieldHoriz.txt",
+    "clio_shield_vertical": "CLIOshieldVert.txt",
+    "ligo_livingston": "seismic_mean.npz",
+}
 
 
 @pytest.fixture
@@ -50,8 +43,12 @@ def model():
 
 def test_what_the_measured_files_hold_and_what_was_drawn_or_copied(measured):
     assert {name: s.frequency_Hz.size for name, s in measured.items()} == {
-        "kamioka_quiet": 261, "kamioka_stormy": 261, "clio_shield_horizontal": 923, "clio_shield_vertical": 923,
-        "ligo_livingston": 1024}
+        "kamioka_quiet": 261,
+        "kamioka_stormy": 261,
+        "clio_shield_horizontal": 923,
+        "clio_shield_vertical": 923,
+        "ligo_livingston": 1024,
+    }
     for name in ("kamioka_quiet", "kamioka_stormy"):
         [(low, high, slope)] = drawn_lines(measured[name])
         assert (low, high, slope) == pytest.approx((21.0, 1000.0, -1.0))
@@ -74,10 +71,13 @@ def test_shipped_models_have_the_error_they_state(measured, name):
     inside = data.between(model.low_Hz * (1 - 1e-5), model.high_Hz * (1 + 1e-5))
     # The errors were stated at 160 points evenly spaced in logarithm.
     grid = np.geomspace(inside.frequency_Hz[0], inside.frequency_Hz[-1], 160)
-    level = np.exp(np.interp(np.log(grid), np.log(inside.frequency_Hz),
-                             np.log(smoothed(inside.frequency_Hz, inside.displacement_asd))))
+    level = np.exp(
+        np.interp(
+            np.log(grid), np.log(inside.frequency_Hz), np.log(smoothed(inside.frequency_Hz, inside.displacement_asd))
+        )
+    )
     error = 20 * np.log10(model.asd(grid) / level)
-    assert np.sqrt(np.mean(error ** 2)) == pytest.approx(model.error_rms_dB, abs=0.01)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(model.error_rms_dB, abs=0.01)
     assert np.max(np.abs(error)) == pytest.approx(model.error_max_dB, abs=0.02)
 
 
@@ -93,7 +93,7 @@ def test_refitting_finds_the_shipped_model(measured):
     again = fit_spectrum(data.frequency_Hz, data.displacement_asd, 8)
     assert again.error_rms_dB <= shipped.error_rms_dB + 0.01
     error = fit_error_dB(shipped, data.frequency_Hz, data.displacement_asd)
-    assert np.sqrt(np.mean(error ** 2)) < 1.5 * shipped.error_rms_dB
+    assert np.sqrt(np.mean(error**2)) < 1.5 * shipped.error_rms_dB
 
 
 def test_a_fit_recovers_a_rational_spectrum(model):
@@ -115,14 +115,16 @@ def test_shipped_models_are_stable_minimum_phase_and_well_scaled():
         system = model.system(quantity="velocity")
         assert system.is_stable() and np.all(model.shape.zeros().real < 0)
         f = np.geomspace(model.low_Hz, model.high_Hz, 60)
-        np.testing.assert_allclose(np.sqrt(2) * np.abs(system.frequency_response(2 * np.pi * f)[:, 0, 0]),
-                                   model.asd(f, "velocity"), rtol=1e-9)
+        np.testing.assert_allclose(
+            np.sqrt(2) * np.abs(system.frequency_response(2 * np.pi * f)[:, 0, 0]), model.asd(f, "velocity"), rtol=1e-9
+        )
         assert np.linalg.cond(system.A) < 1e7
 
 
 def test_h2_norm_of_the_shaping_filter_is_the_rms(model):
-    total, _ = quad(lambda x: np.exp(x) * model.asd(np.array([np.exp(x)]))[0] ** 2, np.log(1e-5), np.log(1e5),
-                    limit=400, epsabs=0)
+    total, _ = quad(
+        lambda x: np.exp(x) * model.asd(np.array([np.exp(x)]))[0] ** 2, np.log(1e-5), np.log(1e5), limit=400, epsabs=0
+    )
     assert float(h2_norm(model.system())) == pytest.approx(np.sqrt(total), rel=1e-4)
 
 
@@ -137,12 +139,12 @@ def test_scaling_to_the_floor_velocity_of_the_rig():
 def test_band_rms_of_a_power_law_is_its_integral(slope, level, low, ratio):
     frequency = np.geomspace(0.005, 2000, 30)
     exact, _ = quad(lambda x: np.exp(x) * (level * np.exp(slope * x)) ** 2, np.log(low), np.log(low * ratio), epsabs=0)
-    assert band_rms(frequency, level * frequency ** slope, low, low * ratio) == pytest.approx(np.sqrt(exact), rel=1e-8)
+    assert band_rms(frequency, level * frequency**slope, low, low * ratio) == pytest.approx(np.sqrt(exact), rel=1e-8)
 
 
 def test_band_rms_of_one_over_root_f_is_logarithmic():
     frequency = np.geomspace(1, 100, 7)
-    assert band_rms(frequency, frequency ** -0.5, 2.0, 50.0) == pytest.approx(np.sqrt(np.log(25.0)), rel=1e-12)
+    assert band_rms(frequency, frequency**-0.5, 2.0, 50.0) == pytest.approx(np.sqrt(np.log(25.0)), rel=1e-12)
 
 
 def test_third_octaves_are_base_ten_and_add_up(model):
@@ -154,16 +156,18 @@ def test_third_octaves_are_base_ten_and_add_up(model):
     np.testing.assert_allclose(lower[1:], upper[:-1], rtol=1e-12)
     frequency = np.geomspace(0.5, 200, 2000)
     _, rms = third_octave_rms(frequency, model.asd(frequency, "velocity"), bands)
-    exact = [np.sqrt(quad(lambda f: model.asd(np.array([f]), "velocity")[0] ** 2, lo, hi, epsabs=0)[0])
-             for lo, hi in zip(lower, upper, strict=True)]
+    exact = [
+        np.sqrt(quad(lambda f: model.asd(np.array([f]), "velocity")[0] ** 2, lo, hi, epsabs=0)[0])
+        for lo, hi in zip(lower, upper, strict=True)
+    ]
     np.testing.assert_allclose(rms, exact, rtol=1e-4)
-    assert np.sum(rms ** 2) == pytest.approx(model.rms(lower[0], upper[-1]) ** 2, rel=1e-4)
+    assert np.sum(rms**2) == pytest.approx(model.rms(lower[0], upper[-1]) ** 2, rel=1e-4)
 
 
 def test_third_octaves_by_default_lie_wholly_inside_the_data():
     frequency = np.geomspace(1.0, 100.0, 50)
     bands, _ = third_octave_rms(frequency, np.ones(50))
-    assert bands[0] == pytest.approx(10 ** 0.1) and bands[-1] == pytest.approx(10 ** 1.9)
+    assert bands[0] == pytest.approx(10**0.1) and bands[-1] == pytest.approx(10**1.9)
 
 
 def test_realisation_has_the_spectrum_of_the_model(model):
@@ -171,8 +175,9 @@ def test_realisation_has_the_spectrum_of_the_model(model):
     rng, records, T, dt = np.random.default_rng(5), 20, 50.0, 0.002
     n = round(T / dt)
     frequency = np.fft.rfftfreq(n, dt)
-    power = np.mean([2 * dt / n * np.abs(np.fft.rfft(realise(model, T, dt, rng).displacement)) ** 2
-                     for _ in range(records)], axis=0)
+    power = np.mean(
+        [2 * dt / n * np.abs(np.fft.rfft(realise(model, T, dt, rng).displacement)) ** 2 for _ in range(records)], axis=0
+    )
     for lower, upper in zip(*third_octave_edges(third_octave_midbands(0.5, 80.0)), strict=True):
         lines = (frequency >= lower) & (frequency < upper)
         count = np.sum(lines)
@@ -204,24 +209,29 @@ def test_parseval_of_one_record(model):
     record = realise(model, 20.0, 0.005, np.random.default_rng(2))
     lines = np.fft.rfft(record.displacement)
     energy = (np.abs(lines[0]) ** 2 + 2 * np.sum(np.abs(lines[1:-1]) ** 2) + np.abs(lines[-1]) ** 2) / 4000
-    assert np.sum(record.displacement ** 2) == pytest.approx(energy, rel=1e-12)
+    assert np.sum(record.displacement**2) == pytest.approx(energy, rel=1e-12)
     assert np.all(np.abs(lines[np.fft.rfftfreq(4000, 0.005) < 0.0999]) < 1e-12 * np.max(np.abs(lines)))
 
 
-@pytest.mark.parametrize(("call", "field"), [
-    (lambda m: m.asd(np.ones(2), "speed"), "quantity"), (lambda m: m.scaled_to_rms(-1.0, 1, 2), "rms"),
-    (lambda m: realise(m, -1.0, 0.01, np.random.default_rng(0)), "duration_s"),
-    (lambda m: realise(m, 0.001, 0.0005, np.random.default_rng(0)), "duration_s"),
-    (lambda m: realise(m, 10.0, np.nan, np.random.default_rng(0)), "dt"),
-    (lambda m: shipped_spectrum("mars"), "spectrum"),
-    (lambda m: fit_spectrum(np.arange(1, 9.0), np.ones(8), 1), "order"),
-    (lambda m: spectrum_from_table("x", {"band_Hz": [1, 2]}), "x"),
-    (lambda m: SpectrumModel("x", "", Rational(1.0, real_poles=(1.0,)), 1.0, 2.0), "shape"),
-    (lambda m: SpectrumModel("x", "", m.shape, 2.0, 1.0), "band_Hz"),
-    (lambda m: band_rms(np.arange(1, 9.0), np.ones(8), 0.5, 2.0), "band_Hz"),
-    (lambda m: third_octave_midbands(5.0, 1.0), "band_Hz"),
-    (lambda m: third_octave_rms(np.array([1.0, 1.01]), np.ones(2)), "frequency_Hz"),
-    (lambda m: MeasuredSpectrum("x", np.arange(3.0), np.ones(3)), "frequency_Hz")])
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda m: m.asd(np.ones(2), "speed"), "quantity"),
+        (lambda m: m.scaled_to_rms(-1.0, 1, 2), "rms"),
+        (lambda m: realise(m, -1.0, 0.01, np.random.default_rng(0)), "duration_s"),
+        (lambda m: realise(m, 0.001, 0.0005, np.random.default_rng(0)), "duration_s"),
+        (lambda m: realise(m, 10.0, np.nan, np.random.default_rng(0)), "dt"),
+        (lambda m: shipped_spectrum("mars"), "spectrum"),
+        (lambda m: fit_spectrum(np.arange(1, 9.0), np.ones(8), 1), "order"),
+        (lambda m: spectrum_from_table("x", {"band_Hz": [1, 2]}), "x"),
+        (lambda m: SpectrumModel("x", "", Rational(1.0, real_poles=(1.0,)), 1.0, 2.0), "shape"),
+        (lambda m: SpectrumModel("x", "", m.shape, 2.0, 1.0), "band_Hz"),
+        (lambda m: band_rms(np.arange(1, 9.0), np.ones(8), 0.5, 2.0), "band_Hz"),
+        (lambda m: third_octave_midbands(5.0, 1.0), "band_Hz"),
+        (lambda m: third_octave_rms(np.array([1.0, 1.01]), np.ones(2)), "frequency_Hz"),
+        (lambda m: MeasuredSpectrum("x", np.arange(3.0), np.ones(3)), "frequency_Hz"),
+    ],
+)
 def test_wrong_input_is_refused_by_name(model, call, field):
     with pytest.raises(InputError, match=field):
         call(model)

@@ -39,15 +39,21 @@ def write(tmp_path):
         path = tmp_path / name
         path.write_text(text)
         return path
+
     return make
 
 
 def open_gain(entry, others):
     """Median gain of the same model and coil without its shunt R, which loads it by R / (R + coil); with this shunt."""
+
     def divider(one):
         return 1.0 if one.shunt_ohm is None else one.shunt_ohm / (one.shunt_ohm + one.coil_ohm)
-    opened = [one.gain_Vs_per_m / divider(one) for one in others
-              if one is not entry and (one.model, one.coil_ohm) == (entry.model, entry.coil_ohm)]
+
+    opened = [
+        one.gain_Vs_per_m / divider(one)
+        for one in others
+        if one is not entry and (one.model, one.coil_ohm) == (entry.model, entry.coil_ohm)
+    ]
     return np.median(opened) * divider(entry) if opened else None
 
 
@@ -91,29 +97,38 @@ def test_a_wrong_corner_and_a_wrong_normalisation_are_found(write):
     assert "normalisation" in check_against_name(read_response(write(scaled)))[0]
 
 
-@pytest.mark.parametrize(("change", "field"), [
-    (lambda t: t[:t.index("B053F15-18    1")], "poles"),
-    (lambda t: t[:t.index("B058F03")], "B058F04"),
-    (lambda t: t[:40], "B053"),
-    (lambda t: "", "B053F03"),
-    (lambda t: t.replace("-19.792  20.192", "nan  20.192"), "B053F15-18"),
-    (lambda t: t.replace("-19.792", "19.792"), "poles"),
-    (lambda t: t.replace("M/S - Velocity in Meters Per Second", "M/S**2 - Acceleration"), "B053F05"),
-    (lambda t: t.replace("V - Volts", "MV - Millivolts"), "B053F06"),
-    (lambda t: t.replace("A [Laplace Transform (Rad/sec)]", "B [Analog (Hz)]"), "B053F03"),
-    (lambda t: t.replace("B053F10-13    1  0.0", "B053F10-13    1  3.0"), "zeros"),
-    (lambda t: t.replace("2.62e+01", "-26.2"), "B058F04"),
-    (lambda t: t.replace("2.62e+01", "inf"), "B058F04"),
-    (lambda t: t.replace("Number of poles:                       2", "Number of poles:                       two"),
-     "B053F14")])
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda t: t[: t.index("B053F15-18    1")], "poles"),
+        (lambda t: t[: t.index("B058F03")], "B058F04"),
+        (lambda t: t[:40], "B053"),
+        (lambda t: "", "B053F03"),
+        (lambda t: t.replace("-19.792  20.192", "nan  20.192"), "B053F15-18"),
+        (lambda t: t.replace("-19.792", "19.792"), "poles"),
+        (lambda t: t.replace("M/S - Velocity in Meters Per Second", "M/S**2 - Acceleration"), "B053F05"),
+        (lambda t: t.replace("V - Volts", "MV - Millivolts"), "B053F06"),
+        (lambda t: t.replace("A [Laplace Transform (Rad/sec)]", "B [Analog (Hz)]"), "B053F03"),
+        (lambda t: t.replace("B053F10-13    1  0.0", "B053F10-13    1  3.0"), "zeros"),
+        (lambda t: t.replace("2.62e+01", "-26.2"), "B058F04"),
+        (lambda t: t.replace("2.62e+01", "inf"), "B058F04"),
+        (
+            lambda t: t.replace(
+                "Number of poles:                       2", "Number of poles:                       two"
+            ),
+            "B053F14",
+        ),
+    ],
+)
 def test_a_broken_file_is_refused_naming_file_and_field(write, change, field):
     with pytest.raises(InputError, match=field) as caught:
         read_response(write(change(GOOD)))
     assert GOOD_NAME in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["RESP.XX.short", "RESP.XX.N..SHZ.GS11D.4_5.380.NONE.abc",
-                                  "RESP.XX.N..SHZ.S13.NONE.629"])
+@pytest.mark.parametrize(
+    "name", ["RESP.XX.short", "RESP.XX.N..SHZ.GS11D.4_5.380.NONE.abc", "RESP.XX.N..SHZ.S13.NONE.629"]
+)
 def test_a_name_that_cannot_be_read_is_refused(write, name):
     with pytest.raises(InputError, match="name"):
         read_response(write(GOOD, name))

@@ -19,10 +19,15 @@ E_N_PER_V = np.array([6.59, 7.85, 7.07, 8.10, 7.50, 7.89, 6.65, 5.97])
 R = np.sqrt(0.5)
 ARM = L3 - L1 / 2
 ACTUATORS = [  # place and direction of the force, from the figures' description and eq. 19
-    ((ARM, -L2 / 2, 0), (0, 0, 1)), ((-ARM, -L2 / 2, 0), (0, 0, 1)),
-    ((-ARM, L2 / 2, 0), (0, 0, 1)), ((ARM, L2 / 2, 0), (0, 0, 1)),
-    ((-L45 / 2, -L45 / 2, -L6), (-R, R, 0)), ((L45 / 2, -L45 / 2, -L6), (R, R, 0)),
-    ((L45 / 2, L45 / 2, -L6), (R, -R, 0)), ((-L45 / 2, L45 / 2, -L6), (-R, -R, 0))]
+    ((ARM, -L2 / 2, 0), (0, 0, 1)),
+    ((-ARM, -L2 / 2, 0), (0, 0, 1)),
+    ((-ARM, L2 / 2, 0), (0, 0, 1)),
+    ((ARM, L2 / 2, 0), (0, 0, 1)),
+    ((-L45 / 2, -L45 / 2, -L6), (-R, R, 0)),
+    ((L45 / 2, -L45 / 2, -L6), (R, R, 0)),
+    ((L45 / 2, L45 / 2, -L6), (R, -R, 0)),
+    ((-L45 / 2, L45 / 2, -L6), (-R, -R, 0)),
+]
 SPRINGS = [(sx * L1 / 2, sy * L2 / 2, 0) for sx, sy in ((1, -1), (-1, -1), (-1, 1), (1, 1))]
 
 
@@ -98,19 +103,20 @@ def test_matrices_are_symmetric_and_passive(name):
 
 # One test for each row of the table of misprints.
 
+
 def test_eq_4_needs_second_derivatives_of_the_angles(rig, loaded):
     # phi(t) = a sin(wt), x = 0: acceleration of the load's centre of mass by differences of its position.
     r_e, a, w, t, h = np.array([-0.075, 0.075, 0.080]), np.array([1e-5, -2e-5, 3e-5]), 7.0, 0.4, 1e-3
     place = [rotation_matrix(a * np.sin(w * tau)) @ r_e for tau in (t - h, t, t + h)]
     acceleration = (place[0] - 2 * place[1] + place[2]) / h**2
-    corrected = np.cross(-w**2 * a * np.sin(w * t), r_e)
+    corrected = np.cross(-(w**2) * a * np.sin(w * t), r_e)
     printed = np.cross(w * a * np.cos(w * t), r_e)
     size = np.linalg.norm(acceleration)
     assert np.linalg.norm(acceleration - corrected) < 2e-4 * size
     assert np.linalg.norm(acceleration - printed) > 0.5 * size
     # The force that moves the load is what the load adds to the first three rows of M.
     added = (loaded.mass_matrix() - rig.mass_matrix())[:3, 3:]
-    assert np.allclose(added @ (-w**2 * a * np.sin(w * t)), 10.0 * acceleration, atol=2e-3 * size)
+    assert np.allclose(added @ (-(w**2) * a * np.sin(w * t)), 10.0 * acceleration, atol=2e-3 * size)
 
 
 def test_eq_18_rolling_stiffness_has_the_arm_of_the_vertical_springs(rig):
@@ -129,8 +135,13 @@ def test_eq_19_vertical_actuators_push_with_their_whole_force(rig):
     assert np.allclose(roll / printed, 2 * places[:, 1])  # the printed force would act at twice its arm
 
 
-DIMENSIONS = {"N": np.array([1, 1, -2]), "m": np.array([0, 1, 0]), "s": np.array([0, 0, 1]),
-              "kg": np.array([1, 0, 0]), "rad": np.zeros(3, int)}
+DIMENSIONS = {
+    "N": np.array([1, 1, -2]),
+    "m": np.array([0, 1, 0]),
+    "s": np.array([0, 0, 1]),
+    "kg": np.array([1, 0, 0]),
+    "rad": np.zeros(3, int),
+}
 
 
 def dimension(unit):
@@ -161,8 +172,11 @@ def test_table_1_test_10_is_the_horizontal_damping(rig):
 
 def test_table_2_totals_leave_out_the_parallel_axis_terms(loaded):
     """Of the two readings of I_xx + I^e_xx only one leaves the load an inertia that a body can have."""
-    totals, plate, arms = np.array([0.455, 0.374, 0.730]), np.array([0.340, 0.259, 0.500]), np.array(
-        [0.075**2 + 0.080**2, 0.075**2 + 0.080**2, 2 * 0.075**2])
+    totals, plate, arms = (
+        np.array([0.455, 0.374, 0.730]),
+        np.array([0.340, 0.259, 0.500]),
+        np.array([0.075**2 + 0.080**2, 0.075**2 + 0.080**2, 2 * 0.075**2]),
+    )
     own = totals - plate
     assert np.allclose(np.diag(loaded.load.inertia()), own, atol=1e-15)
     principal = np.linalg.eigvalsh(loaded.load.inertia())
@@ -174,6 +188,7 @@ def test_table_2_totals_leave_out_the_parallel_axis_terms(loaded):
 
 # Limits, modes, transfer functions.
 
+
 def test_static_limit_the_plate_follows_the_floor(loaded):
     static = loaded.equations_of_motion().state_space().dcgain()[:6, 8:]
     assert np.allclose(static, np.eye(6), atol=1e-9)
@@ -183,27 +198,32 @@ def test_high_frequency_limit_is_free_motion(loaded):
     w = 2 * np.pi * 1e5
     eom = loaded.equations_of_motion()
     response = eom.state_space().frequency_response(np.array([w]))[0]
-    assert np.allclose(-w**2 * response[:6, :8], np.linalg.solve(eom.M, eom.T), rtol=1e-3, atol=1e-4)
+    assert np.allclose(-(w**2) * response[:6, :8], np.linalg.solve(eom.M, eom.T), rtol=1e-3, atol=1e-4)
     assert np.allclose(1j * w * response[:6, 8:], np.linalg.solve(eom.M, eom.C), rtol=2e-3, atol=0.1)
 
 
 def test_natural_frequencies_by_hand(rig):
     """Bare plate: z and phi_z alone, (x, phi_y) and (y, phi_x) in pairs; quadratic formula."""
+
     def pair(m, J, k, c, kr):
         half, product = (k / m + kr / J) / 2, (k * kr - c**2) / (m * J)
         root = np.sqrt(half**2 - product)
         return [np.sqrt(half - root), np.sqrt(half + root)]
 
     horizontal, tilt = 2 * K_A + K_T, 2 * K_A * L6
-    expected = [np.sqrt(4 * (K_A + K_S) / 19.3), np.sqrt((2 * K_A * L45**2 + K_R) / 0.5),
-                *pair(19.3, 0.340, horizontal, tilt, (K_A + K_S) * L2**2 + 2 * K_A * L6**2),
-                *pair(19.3, 0.259, horizontal, tilt, 4 * K_A * ARM**2 + K_S * L1**2 + 2 * K_A * L6**2)]
+    expected = [
+        np.sqrt(4 * (K_A + K_S) / 19.3),
+        np.sqrt((2 * K_A * L45**2 + K_R) / 0.5),
+        *pair(19.3, 0.340, horizontal, tilt, (K_A + K_S) * L2**2 + 2 * K_A * L6**2),
+        *pair(19.3, 0.259, horizontal, tilt, 4 * K_A * ARM**2 + K_S * L1**2 + 2 * K_A * L6**2),
+    ]
     found = rig.equations_of_motion().natural_frequencies().frequencies_Hz
     assert np.allclose(found, np.sort(expected) / (2 * np.pi), rtol=1e-12)
 
 
 def test_drive_patterns_of_tables_1_and_2_excite_what_the_source_says(rig):
     """With equal forces: test 5 turns about x, test 12 about z, test 8 of Table 2 pushes along x and tilts about y."""
+
     def wrench(pattern):
         volts = np.array([pattern.get(f"A{i}", 0.0) for i in range(1, 9)]) / E_N_PER_V
         return rig.actuator_matrix() @ volts

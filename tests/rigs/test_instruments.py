@@ -26,26 +26,26 @@ def response(system, frequency_Hz):
 def test_rounding_noise_of_a_random_signal_is_lsb_squared_over_12(rng):
     signal = rng.normal(0.0, 1.0, 200_000)
     error = AVIS_CONVERTER.convert(signal) - signal
-    variance = AVIS_CONVERTER.lsb_V ** 2 / 12
+    variance = AVIS_CONVERTER.lsb_V**2 / 12
     # Variance of the estimate for a uniform error: (1/80 - 1/144) lsb^4 / n; five standard deviations.
-    spread = AVIS_CONVERTER.lsb_V ** 2 * np.sqrt((1 / 80 - 1 / 144) / signal.size)
-    assert abs(np.mean(error ** 2) - variance) < 5 * spread
-    assert AVIS_CONVERTER.noise_rms_V ** 2 == pytest.approx(variance)
+    spread = AVIS_CONVERTER.lsb_V**2 * np.sqrt((1 / 80 - 1 / 144) / signal.size)
+    assert abs(np.mean(error**2) - variance) < 5 * spread
+    assert AVIS_CONVERTER.noise_rms_V**2 == pytest.approx(variance)
 
 
 def test_rounding_noise_is_white_with_the_density_stated(rng):
-    signal = rng.normal(0.0, 1.0, 2 ** 17)
+    signal = rng.normal(0.0, 1.0, 2**17)
     error = AVIS_CONVERTER.convert(signal) - signal
     lines = np.abs(np.fft.rfft(error)[1:-1]) ** 2 * 2 / (error.size * 1000.0)
-    bands = lines[:lines.size // 16 * 16].reshape(16, -1).mean(axis=1)
+    bands = lines[: lines.size // 16 * 16].reshape(16, -1).mean(axis=1)
     # Each band averages about 4096 exponential lines: 1/64 relative standard deviation, five of them.
-    np.testing.assert_allclose(bands, AVIS_CONVERTER.noise_density_V_rtHz ** 2, rtol=5 / 64)
+    np.testing.assert_allclose(bands, AVIS_CONVERTER.noise_density_V_rtHz**2, rtol=5 / 64)
 
 
 def test_converter_clips_at_its_end_codes_and_has_one_code_less_above():
     volts = AVIS_CONVERTER.convert(np.array([-50.0, 50.0, 0.0, 3.2]))
     assert volts[0] == -10.0
-    assert volts[1] == 10.0 - 20.0 / 2 ** 14
+    assert volts[1] == 10.0 - 20.0 / 2**14
     assert volts[2] == 0.0
     assert AVIS_CONVERTER.clipped(np.array([-10.5, 10.5, 9.0])).tolist() == [True, True, False]
 
@@ -95,12 +95,18 @@ def test_zero_order_hold_model_follows_the_sinc():
     assert zero_order_hold(T, 2).dcgain()[0, 0] == pytest.approx(1.0, rel=1e-13)
 
 
-@pytest.mark.parametrize(("make", "field"), [
-    (lambda: Converter(0, 10.0, 1000.0), "bits"), (lambda: Converter(14.5, 10.0, 1000.0), "bits"),
-    (lambda: Converter(33, 10.0, 1000.0), "bits = 33: expected a whole number of bits from 1 to 32"),
-    (lambda: Converter(14, np.inf, 1000.0), "range_V"),
-    (lambda: pade_delay(1e-3, 0), "order"), (lambda: pade_delay(1e-3, 40), "order"),
-    (lambda: zero_order_hold(0.0), "sample_time")])
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Converter(0, 10.0, 1000.0), "bits"),
+        (lambda: Converter(14.5, 10.0, 1000.0), "bits"),
+        (lambda: Converter(33, 10.0, 1000.0), "bits = 33: expected a whole number of bits from 1 to 32"),
+        (lambda: Converter(14, np.inf, 1000.0), "range_V"),
+        (lambda: pade_delay(1e-3, 0), "order"),
+        (lambda: pade_delay(1e-3, 40), "order"),
+        (lambda: zero_order_hold(0.0), "sample_time"),
+    ],
+)
 def test_wrong_numbers_are_refused_by_name(make, field):
     with pytest.raises(InputError, match=field):
         make()

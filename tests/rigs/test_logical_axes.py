@@ -98,16 +98,22 @@ def test_five_drives_push_what_is_asked_and_as_little_else_as_they_can():
     problem = cp.Problem(cp.Minimize(cp.sum_squares(T[[1, 3, 4, 5]] @ volts)), [T[[0, 2]] @ volts == np.eye(2)])
     problem.solve("CLARABEL")
     assert np.allclose(T[[0, 2]] @ found.allocation, np.eye(2), atol=1e-12)
-    assert np.sum(found.leftover ** 2) == pytest.approx(problem.value, rel=1e-6) and problem.value > 0.01
+    assert np.sum(found.leftover**2) == pytest.approx(problem.value, rel=1e-6) and problem.value > 0.01
 
 
 def test_noisy_sensors_count_less():
     """Decoding of twelve sensors against generalised least squares with each sensor's noise as velocity, 1 to 30 Hz."""
     rig = load_rig(TABLES / "twelve_sensors.toml")
     omega = 2 * np.pi * np.geomspace(1.0, 30.0, 20)
-    lsb = 20.0 / 2 ** 16
-    sigma = np.array([np.hypot(one.noise_rms_V, lsb / np.sqrt(12)) / one.gain
-                      * np.exp(-np.mean(np.log(np.abs(one.as_velocity(omega))))) for one in rig.sensors()])
+    lsb = 20.0 / 2**16
+    sigma = np.array(
+        [
+            np.hypot(one.noise_rms_V, lsb / np.sqrt(12))
+            / one.gain
+            * np.exp(-np.mean(np.log(np.abs(one.as_velocity(omega)))))
+            for one in rig.sensors()
+        ]
+    )
     found = sensor_axes(rig)
     H = found.matrix / sigma[:, None]
     assert np.allclose(found.decoding, np.linalg.solve(H.T @ H, H.T) / sigma, atol=1e-9)
@@ -120,8 +126,10 @@ def test_position_sensors_alone_measure_all_axes_relative_to_the_chassis():
     where = [([1.0, 0.0, 0.0], [0.0, 0.0, 0.3])]
     where += [([0.0, 1.0, 0.0], [x, 0.0, 0.0]) for x in (-0.3, 0.3)]
     where += [([0.0, 0.0, 1.0], place) for place in ([0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.3, 0.0])]
-    content["position_sensor"] = [{**content["position_sensor"][0], "name": f"P{k}", "direction": direction,
-                                   "position_m": place} for k, (direction, place) in enumerate(where)]
+    content["position_sensor"] = [
+        {**content["position_sensor"][0], "name": f"P{k}", "direction": direction, "position_m": place}
+        for k, (direction, place) in enumerate(where)
+    ]
     found = sensor_axes(rig_from(content))
     assert found.relative == COORDINATES and not np.any(found.inertial)
     assert np.allclose(found.decoding @ found.matrix, np.eye(6), atol=1e-12)

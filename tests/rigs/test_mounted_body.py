@@ -11,8 +11,9 @@ NONE, Z = np.zeros((3, 3)), np.diag([0.0, 0.0, 1.0])
 
 def beam(centre=(0.0, 0.0, 0.0), inertia=None):
     """Two vertical springs at x = -1 and x = 1 m under a body of 4 kg."""
-    mounts = tuple(Mount(f"spring{i}", [x, 0, 0], [x, 0, 0], k * Z, NONE)
-                   for i, (x, k) in enumerate(((-1.0, 300.0), (1.0, 500.0))))
+    mounts = tuple(
+        Mount(f"spring{i}", [x, 0, 0], [x, 0, 0], k * Z, NONE) for i, (x, k) in enumerate(((-1.0, 300.0), (1.0, 500.0)))
+    )
     push = PointActuator("push", [2.0, 0, 0], [0, 0, 1.0], 0.5)
     return MountedBody(4.0, np.eye(3) if inertia is None else inertia, centre, mounts, (push,))
 

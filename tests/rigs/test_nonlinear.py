@@ -46,8 +46,11 @@ def run(rig, state, dt, steps, keep_every, u=None, q_ch=None):
 def bodies():
     avis = load_rig("avis")
     feet = tuple(replace(one, chassis_offset=(0.02, 0.01 * k, -0.3)) for k, one in enumerate(avis.isolators))
-    return {"avis": avis, "avis skew": replace(avis.with_parameters(SKEW), isolators=feet),
-            "halcyonics_loaded": load_rig("halcyonics_loaded")}
+    return {
+        "avis": avis,
+        "avis skew": replace(avis.with_parameters(SKEW), isolators=feet),
+        "halcyonics_loaded": load_rig("halcyonics_loaded"),
+    }
 
 
 @pytest.mark.parametrize("name", ["avis", "avis skew", "halcyonics_loaded"])
@@ -63,8 +66,9 @@ def test_the_linear_model_is_the_jacobian(name):
         state, u, q_ch, q_ch_dot = np.split(point, [12, 12 + n_u, 18 + n_u])
         columns.append(nonlinear.derivative(state, u, q_ch, q_ch_dot).imag / h)
     jacobian = np.column_stack(columns)
-    expected = np.vstack([np.eye(6, 24 + n_u, k=6),
-                          np.linalg.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.T, eom.K_floor, eom.C_floor]))])
+    expected = np.vstack(
+        [np.eye(6, 24 + n_u, k=6), np.linalg.solve(eom.M, np.hstack([-eom.K, -eom.C, eom.T, eom.K_floor, eom.C_floor]))]
+    )
     error = np.abs(jacobian - expected)
     for block in np.split(np.arange(24 + n_u), [6, 12, 12 + n_u, 18 + n_u]):
         scale = np.abs(expected[:, block]).max(axis=1, keepdims=True)
@@ -136,12 +140,15 @@ def test_power_balance_at_any_state(name, rng):
         state, u = rng.uniform(-0.5, 0.5, 12), rng.uniform(-10, 10, 8)
         q_ch, q_ch_dot = rng.uniform(-0.2, 0.2, (2, 6))
         slope = rig.derivative(state, u, q_ch, q_ch_dot)
-        change = (rig.energy(state + h * slope, q_ch + h * q_ch_dot)
-                  - rig.energy(state - h * slope, q_ch - h * q_ch_dot)) / (2 * h)
+        change = (
+            rig.energy(state + h * slope, q_ch + h * q_ch_dot) - rig.energy(state - h * slope, q_ch - h * q_ch_dot)
+        ) / (2 * h)
 
         q, q_dot = state[:6], state[6:]
-        power = sum(a.constant_N_per_V * u_k * a.direction @ motion(q, q_dot, a.position)[1]
-                    for a, u_k in zip(body.actuators, u, strict=True))
+        power = sum(
+            a.constant_N_per_V * u_k * a.direction @ motion(q, q_dot, a.position)[1]
+            for a, u_k in zip(body.actuators, u, strict=True)
+        )
         for mount in body.mounts:
             place, speed = motion(q, q_dot, mount.position)
             place_ch, speed_ch = motion(q_ch, q_ch_dot, mount.chassis_point)

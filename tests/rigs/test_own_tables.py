@@ -56,10 +56,11 @@ def test_each_sensor_has_its_own_dynamics():
     granite = {one.name: one for one in load_rig(RIGS / "granite.toml").sensors()}
     w, b = 2 * np.pi * 0.4, 2 * np.pi * 500.0
     expected = {
-        ("velocity", twelve["Gv1"]): 60.0 * 200.0 * s ** 2 / (s ** 2 + 2 * 0.7 * w * s + w ** 2),
+        ("velocity", twelve["Gv1"]): 60.0 * 200.0 * s**2 / (s**2 + 2 * 0.7 * w * s + w**2),
         ("acceleration", twelve["Az1"]): 100.0 * s / (s + 2 * np.pi * 0.3),
-        ("velocity", granite["Gz1"]): 100.0 * 200.0 * s ** 2 / (s ** 2 + 1.4 * 2 * np.pi * s + (2 * np.pi) ** 2),
-        ("displacement", granite["Pz1"]): 2e4 * b / (s + b)}
+        ("velocity", granite["Gz1"]): 100.0 * 200.0 * s**2 / (s**2 + 1.4 * 2 * np.pi * s + (2 * np.pi) ** 2),
+        ("displacement", granite["Pz1"]): 2e4 * b / (s + b),
+    }
     for (quantity, sensor), response in expected.items():
         assert sensor.quantity == quantity
         assert np.allclose(sensor.chain().frequency_response(omega)[:, 0, 0], response, rtol=1e-9)
@@ -79,8 +80,15 @@ def test_attached_and_placed_channels_are_one_table():
         isolator = content["isolator"][last.pop("isolator") - 1]
         name, axis = last.pop("names"), "xyz".index(last.pop("axis"))
         shared = {key: value for key, value in lists.items() if not isinstance(value, list) and key != "limit_V"}
-        content[kind] = [{"name": name, "position_m": isolator["position_m"],
-                          "direction": np.eye(3)[axis].tolist(), **last, **shared}]
+        content[kind] = [
+            {
+                "name": name,
+                "position_m": isolator["position_m"],
+                "direction": np.eye(3)[axis].tolist(),
+                **last,
+                **shared,
+            }
+        ]
     other = rig_from(content)
     assert np.array_equal(other.equations_of_motion().T, avis.equations_of_motion().T)
     assert other.sensors() == avis.sensors()
@@ -116,19 +124,25 @@ def changed(change):
     return content
 
 
-@pytest.mark.parametrize("change, message", [
-    (lambda c: c["drive"][0].update(direction=[0.0, 0.0, 0.0]), r"drive\[1\].direction.*a vector that is not zero"),
-    (lambda c: c["drive"][0].update(direction=[0.0, 1.0]), r"drive\[1\].direction.*at least 3 items"),
-    (lambda c: c["drive"][3].update(name="X1"), r"drive = 'X1': expected different names"),
-    (lambda c: c["geophone"][0].update(name="Pz1"), r"'Pz1': expected different names"),
-    (lambda c: c["geophone"][1].update(compensated_Hz=0.5), r"geophone\[2\].compensated_damping.*both or neither"),
-    (lambda c: c["position_sensor"][0].update(noise_m_rtHz=1e-9), r"position_sensor\[1\].noise_rms_V.*not both"),
-    (lambda c: c.update(drive=[]), "drive: expected at least one drive"),
-    (lambda c: [c.pop(kind) for kind in ("geophone", "position_sensor")], "expected at least one geophone"),
-    (lambda c: c.pop("actuators"), r"drive\[1\].limit_V: this key is missing"),
-    (lambda c: c["drive"][0].update(name="a drive"), r"drive\[1\].name"),
-    (lambda c: c["drive"][0].update(position_mm=1.0), "position_mm.*unit in this key is wrong; expected position_m"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda c: c["drive"][0].update(direction=[0.0, 0.0, 0.0]), r"drive\[1\].direction.*a vector that is not zero"),
+        (lambda c: c["drive"][0].update(direction=[0.0, 1.0]), r"drive\[1\].direction.*at least 3 items"),
+        (lambda c: c["drive"][3].update(name="X1"), r"drive = 'X1': expected different names"),
+        (lambda c: c["geophone"][0].update(name="Pz1"), r"'Pz1': expected different names"),
+        (lambda c: c["geophone"][1].update(compensated_Hz=0.5), r"geophone\[2\].compensated_damping.*both or neither"),
+        (lambda c: c["position_sensor"][0].update(noise_m_rtHz=1e-9), r"position_sensor\[1\].noise_rms_V.*not both"),
+        (lambda c: c.update(drive=[]), "drive: expected at least one drive"),
+        (lambda c: [c.pop(kind) for kind in ("geophone", "position_sensor")], "expected at least one geophone"),
+        (lambda c: c.pop("actuators"), r"drive\[1\].limit_V: this key is missing"),
+        (lambda c: c["drive"][0].update(name="a drive"), r"drive\[1\].name"),
+        (
+            lambda c: c["drive"][0].update(position_mm=1.0),
+            "position_mm.*unit in this key is wrong; expected position_m",
+        ),
+    ],
+)
 def test_what_is_wrong_is_named(change, message):
     with pytest.raises(InputError, match=message):
         rig_from(changed(change))
@@ -138,21 +152,29 @@ def test_what_is_wrong_is_named(change, message):
 def test_a_drive_that_stands_askew_drives_no_coordinate_by_itself(tilt_rad, driven):
     """One drive at the centre of mass: drawings give directions to 0.005 rad, beyond 0.02 rad it is meant."""
     content = content_of("four_vertical")
-    content["drive"] = [{**content["drive"][0], "position_m": [0.0, 0.0, 0.0],
-                         "direction": [float(np.sin(tilt_rad)), 0.0, float(np.cos(tilt_rad))]}]
+    content["drive"] = [
+        {
+            **content["drive"][0],
+            "position_m": [0.0, 0.0, 0.0],
+            "direction": [float(np.sin(tilt_rad)), 0.0, float(np.cos(tilt_rad))],
+        }
+    ]
     assert drivable(rig_from(content)) == driven
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_conditioned_channel_shows_velocity_alike(name):
-    """Motion in space above one common corner of second order, motion against the chassis below the differentiator's.
-    """
+    """Motion in space above one common corner of second order, motion against the chassis below the
+    differentiator's."""
     rig, f = load_rig(RIGS / f"{name}.toml"), np.array([1e-3, 1e-2, 0.05, 1.0, 10.0, 50.0])
     shown = {True: [], False: []}
     for sensor, own in zip(rig.sensors(), conditioning(rig, 0.1), strict=True):
         s = 2j * np.pi * f
-        digital = own.leading * np.prod([s - zero for zero in own.zeros], axis=0) / np.prod(
-            [s - pole for pole in own.poles], axis=0)
+        digital = (
+            own.leading
+            * np.prod([s - zero for zero in own.zeros], axis=0)
+            / np.prod([s - pole for pole in own.poles], axis=0)
+        )
         shown[sensor.inertial].append(sensor.as_velocity(2 * np.pi * f) * digital)
     for inertial, alike in shown.items():
         if alike:

@@ -36,10 +36,12 @@ def test_any_parameters_come_back_with_all_digits(name, data):
     known = [one for one in rig.parameters() if one != "k_s"]
     chosen = data.draw(st.lists(st.sampled_from(known), unique=True, max_size=8))
     # Inertia only so far that there is a body that has it.
-    factors = {one: data.draw(st.floats(0.995, 1.005) if "I" in one or "J" in one else st.floats(0.5, 2.0))
-               for one in chosen}
-    changed = rig.with_parameters({one: rig.parameters()[one].value * factor for one, factor in factors.items()
-                                   if not one.startswith("load.I")})
+    factors = {
+        one: data.draw(st.floats(0.995, 1.005) if "I" in one or "J" in one else st.floats(0.5, 2.0)) for one in chosen
+    }
+    changed = rig.with_parameters(
+        {one: rig.parameters()[one].value * factor for one, factor in factors.items() if not one.startswith("load.I")}
+    )
     again = read_back(changed)
     values, found = changed.parameters(), again.parameters()
     for one in values:
@@ -53,20 +55,35 @@ def test_any_parameters_come_back_with_all_digits(name, data):
 def test_what_only_some_rigs_have(tmp_path):
     avis = load_rig("avis")
     offset = replace(avis.isolators[1], chassis_offset=(0.01, -0.003, -0.1))
-    moved = replace(avis, isolators=(avis.isolators[0], offset, *avis.isolators[2:]), ambient=None,
-                    name='a "quoted" \\ name\x7f of \u00b5m')
+    moved = replace(
+        avis,
+        isolators=(avis.isolators[0], offset, *avis.isolators[2:]),
+        ambient=None,
+        name='a "quoted" \\ name\x7f of \u00b5m',
+    )
     assert np.allclose(read_back(moved).isolators[1].chassis_offset, offset.chassis_offset, rtol=0, atol=1e-16)
     assert read_back(moved).ambient is None and read_back(moved).name == moved.name
     loaded = load_rig("halcyonics_loaded")
-    other = replace(loaded, load=replace(loaded.load, Izz=0.1875, Ixy=0.01, Ixz=-0.02, Iyz=0.003),
-                    k_s=(1e4, 1.1e4, 1.2e4, 1.3e4),
-                    M2_arm=0.21, ambient=avis.ambient)
+    other = replace(
+        loaded,
+        load=replace(loaded.load, Izz=0.1875, Ixy=0.01, Ixz=-0.02, Iyz=0.003),
+        k_s=(1e4, 1.1e4, 1.2e4, 1.3e4),
+        M2_arm=0.21,
+        ambient=avis.ambient,
+    )
     assert read_back(other) == other
 
 
 def test_comments_stand_behind_their_lines():
-    text = rig_toml(load_rig("avis"), {"mass": "500 +- 3 kg", "isolator2.k_x": "fixed", "isolator2.k_z": "free",
-                                       "isolator[3].damping_Ns_per_m": "guess # not measured"})
+    text = rig_toml(
+        load_rig("avis"),
+        {
+            "mass": "500 +- 3 kg",
+            "isolator2.k_x": "fixed",
+            "isolator2.k_z": "free",
+            "isolator[3].damping_Ns_per_m": "guess # not measured",
+        },
+    )
     lines = text.splitlines()
     assert "mass_kg = 500.0  # 500 +- 3 kg" in lines
     assert "stiffness_N_per_m = [21500.0, 20000.0, 47000.0]  # fixed; free" in lines

@@ -54,7 +54,7 @@ def test_momentum_form_needs_no_floor_velocity_and_is_the_same_system(name):
     omega = 2 * np.pi * np.array([0.3, 2.0, 5.1, 40.0])
     response = system.frequency_response(omega)
     for w, G in zip(omega, response, strict=True):
-        dynamic = -w**2 * eom.M + 1j * w * eom.C + eom.K
+        dynamic = -(w**2) * eom.M + 1j * w * eom.C + eom.K
         pushed = np.hstack([eom.T, 1j * w * eom.C_floor + eom.K_floor, np.eye(6)])
         q = np.linalg.solve(dynamic, pushed)
         expected = np.vstack([q, 1j * w * q])

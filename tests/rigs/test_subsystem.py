@@ -16,7 +16,7 @@ def six_dof(rig):
     eom = rig.equations_of_motion()
     responses = []
     for w in OMEGA:
-        dynamic = -w**2 * eom.M + 1j * w * eom.C + eom.K
+        dynamic = -(w**2) * eom.M + 1j * w * eom.C + eom.K
         pushed = np.hstack([eom.T, 1j * w * eom.C_floor + eom.K_floor])
         responses.append(np.linalg.solve(dynamic, pushed)[KEEP])
     return np.array(responses)
@@ -40,7 +40,7 @@ def test_locked_is_two_equations():
     assert reduced.system.nstates == 4 and reduced.system.inputs[8:] == ("floor_z", "floor_phi_x")
     square = np.ix_(KEEP, KEEP)
     for w, G in zip(OMEGA, reduced.system.frequency_response(OMEGA), strict=True):
-        dynamic = -w**2 * eom.M[square] + 1j * w * eom.C[square] + eom.K[square]
+        dynamic = -(w**2) * eom.M[square] + 1j * w * eom.C[square] + eom.K[square]
         pushed = np.hstack([eom.T[KEEP], 1j * w * eom.C_floor[square] + eom.K_floor[square]])
         assert np.allclose(G[:2], np.linalg.solve(dynamic, pushed), rtol=1e-9, atol=1e-15)
 
@@ -91,8 +91,9 @@ def test_the_floor_motion_that_the_reduction_drops_is_shown():
     assert 20 * np.log10(roll_from_y.max()) > 10.0
 
 
-@pytest.mark.parametrize(("arguments", "expected"), [
-    ({"others": "glued"}, "locked or free"), ({"keep": ("z", "phi")}, "out of")])
+@pytest.mark.parametrize(
+    ("arguments", "expected"), [({"others": "glued"}, "locked or free"), ({"keep": ("z", "phi")}, "out of")]
+)
 def test_choices_that_make_no_sense_are_refused(arguments, expected):
     with pytest.raises(InputError, match=expected):
         reduce_rig(load_rig("avis"), **arguments)

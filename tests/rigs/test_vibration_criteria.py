@@ -60,9 +60,16 @@ def test_low_frequency_motion_counts_only_where_the_curve_reaches():
     assert rating(BANDS, v).criterion == "VC-B"
 
 
-@pytest.mark.parametrize(("bands", "rms", "field"), [
-    ([8.0], [np.nan], "rms"), ([8.0], [-1.0], "rms"), ([8.0, 10.0], [1e-6], "rms"), ([0.0], [1e-6], "midband_Hz"),
-    ([1.0], [1e-6], "midband_Hz")])
+@pytest.mark.parametrize(
+    ("bands", "rms", "field"),
+    [
+        ([8.0], [np.nan], "rms"),
+        ([8.0], [-1.0], "rms"),
+        ([8.0, 10.0], [1e-6], "rms"),
+        ([0.0], [1e-6], "midband_Hz"),
+        ([1.0], [1e-6], "midband_Hz"),
+    ],
+)
 def test_wrong_input_is_refused_by_name(bands, rms, field):
     with pytest.raises(InputError, match=field):
         rating(np.array(bands), np.array(rms))

@@ -70,10 +70,14 @@ def test_the_factor_returned_puts_a_pole_on_the_imaginary_axis():
         assert abs(1 + f * L(1j * found.omega)) < 1e-6 and abs(found.delta[0, 0]) == pytest.approx(found.upper)
 
 
-@pytest.mark.parametrize("plant, controller, pole, words", [
-    (control.tf([1.0], [1.0, -1.0]), tf([-3.0], [1.0]), "4", "give -K"),
-    (control.tf([-3.0], [1.0, 1.0]), None, "2", "give -L"),
-    (real("k", 1.0, percent=1) * tf([-3.0], [1.0, 1.0]), None, "2", "give -L")])
+@pytest.mark.parametrize(
+    "plant, controller, pole, words",
+    [
+        (control.tf([1.0], [1.0, -1.0]), tf([-3.0], [1.0]), "4", "give -K"),
+        (control.tf([-3.0], [1.0, 1.0]), None, "2", "give -L"),
+        (real("k", 1.0, percent=1) * tf([-3.0], [1.0, 1.0]), None, "2", "give -L"),
+    ],
+)
 def test_a_nominal_loop_that_is_not_stable_is_named_as_such(plant, controller, pole, words):
     with pytest.raises(ComputationError, match="nominal loop is not stable") as error:
         disk_margin(plant, controller)
@@ -102,16 +106,22 @@ def test_the_worst_case_over_an_uncertain_gain_is_that_of_the_worst_gain():
     assert found.delta is not None and abs(found.delta[0, 0]) <= found.upper * 1.01
 
 
-@pytest.mark.parametrize("call, error, words", [
-    (lambda: disk_margin(control.tf([1], [1, -1])), ComputationError, "stable"),
-    (lambda: disk_margin(np.ones((2, 1)) @ real("k", 1.0, percent=1)), InputError, "square loop"),
-    (lambda: disk_margin(L, at="somewhere"), InputError, "outputs, inputs or both"),
-    (lambda: disk_margin(L, skew=np.nan), InputError, "finite skew"),
-    (lambda: disk_margin(SATELLITE, np.ones((1, 2))), InputError, "feedback of shape"),
-    (lambda: disk_margin(control.frd(L, [1.0, 2.0])), InputError, "no(ne| states)"),
-    (lambda: disk_margin(real("k", 1.0, percent=300) * tf([25.0], [1.0, 10.0, 10.0, 10.0])), ComputationError,
-     "no margin"),
-])
+@pytest.mark.parametrize(
+    "call, error, words",
+    [
+        (lambda: disk_margin(control.tf([1], [1, -1])), ComputationError, "stable"),
+        (lambda: disk_margin(np.ones((2, 1)) @ real("k", 1.0, percent=1)), InputError, "square loop"),
+        (lambda: disk_margin(L, at="somewhere"), InputError, "outputs, inputs or both"),
+        (lambda: disk_margin(L, skew=np.nan), InputError, "finite skew"),
+        (lambda: disk_margin(SATELLITE, np.ones((1, 2))), InputError, "feedback of shape"),
+        (lambda: disk_margin(control.frd(L, [1.0, 2.0])), InputError, "no(ne| states)"),
+        (
+            lambda: disk_margin(real("k", 1.0, percent=300) * tf([25.0], [1.0, 10.0, 10.0, 10.0])),
+            ComputationError,
+            "no margin",
+        ),
+    ],
+)
 def test_what_has_no_margin_is_refused_in_one_line(call, error, words):
     with pytest.raises(error, match=words) as caught:
         call()

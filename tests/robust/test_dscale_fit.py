@@ -95,12 +95,14 @@ def test_constant_fit_is_the_weighted_chebyshev_centre():
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-2.5, 2.5), st.floats(0.3, 2)), min_size=1, max_size=4),
-       st.integers(1, 4))
+@given(
+    st.lists(st.tuples(st.floats(-3, 3), st.floats(-2.5, 2.5), st.floats(0.3, 2)), min_size=1, max_size=4),
+    st.integers(1, 4),
+)
 def test_every_fit_is_stable_and_minimum_phase(bumps, order):
     """Random smooth magnitudes: roots in the open left half plane, realised response equal to the roots'."""
     x = np.log10(EIGHT_DECADES)
-    target = np.exp(sum(height * np.exp(-((x - centre) / width) ** 2) for centre, height, width in bumps))
+    target = np.exp(sum(height * np.exp(-(((x - centre) / width) ** 2)) for centre, height, width in bumps))
     fit = fit_magnitude(EIGHT_DECADES, target, order)
     system = fit.scaling.realise()
     assert np.all(system.poles().real < 0)
@@ -113,7 +115,7 @@ def test_every_fit_is_stable_and_minimum_phase(bumps, order):
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.integers(1, 5), st.integers(0, 2 ** 32 - 1))
+@given(st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_spectral_factor_of_a_sum_of_squares(half_order, seed):
     """p(y) = s0(y)^2 + y s1(y)^2 is |f(j omega)|^2 of the factor, at frequencies of no grid."""
     rng = np.random.default_rng(seed)
@@ -123,7 +125,7 @@ def test_spectral_factor_of_a_sum_of_squares(half_order, seed):
     assert np.all(roots.real < 0)
     omega = rng.uniform(0, 5, 50)
     square = p[-1] * np.prod(np.abs(1j * omega[:, None] - roots) ** 2, axis=1)
-    assert np.allclose(square, np.polynomial.polynomial.polyval(omega ** 2, p), rtol=1e-5, atol=1e-6 * p[0])
+    assert np.allclose(square, np.polynomial.polynomial.polyval(omega**2, p), rtol=1e-5, atol=1e-6 * p[0])
 
 
 @pytest.mark.parametrize(("n", "degree"), [(2, 1), (2, 2), (3, 1)])
@@ -154,18 +156,20 @@ def test_one_by_one_matrix_fit_agrees_with_the_scalar_fit():
     omega = np.logspace(-2, 2, 40)
     target = np.exp(np.tanh(np.log(omega)) + 0.2 * np.sin(np.log(omega)))
     scalar = fit_magnitude(omega, target, 2, tolerance=1e-4)
-    matrix = fit_hermitian(omega, (target ** 2)[:, None, None].astype(complex), 2, tolerance=1e-4)
+    matrix = fit_hermitian(omega, (target**2)[:, None, None].astype(complex), 2, tolerance=1e-4)
     assert matrix.error == pytest.approx(scalar.error, abs=3e-4)
 
 
 def test_scaled_plant_is_the_product_of_its_parts(rng):
     """scale(P) against the frequency responses of D, P and D^-1, for scalar, full and repeated blocks."""
     structure = BlockStructure.of([ComplexScalar(2), ComplexFull(1, 2)]).with_performance(2, 1)
-    D = MatrixScaling(StateSpace(-np.eye(2), np.eye(2), 0.3 * np.eye(2), np.array([[1.0, 0.4], [0.0, 0.7]])),
-                      rational(rng, 2))
+    D = MatrixScaling(
+        StateSpace(-np.eye(2), np.eye(2), 0.3 * np.eye(2), np.array([[1.0, 0.4], [0.0, 0.7]])), rational(rng, 2)
+    )
     scalings = Scalings(structure, (D, rational(rng, 3), ScalarScaling.constant(1.0)))
-    P = StateSpace(-np.diag(rng.uniform(1, 5, 4)), rng.normal(size=(4, 7)), rng.normal(size=(6, 4)),
-                   rng.normal(size=(6, 7)))
+    P = StateSpace(
+        -np.diag(rng.uniform(1, 5, 4)), rng.normal(size=(4, 7)), rng.normal(size=(6, 4)), rng.normal(size=(6, 7))
+    )
     omega = np.logspace(-2, 2, 9)
     left, right = scalings.left().frequency_response(omega), scalings.right_inverse().frequency_response(omega)
     zeros, poles = (np.polyval(np.poly(roots), 1j * omega) for roots in (D.factor.zeros, D.factor.poles))
@@ -185,8 +189,8 @@ def test_scaled_plant_is_the_product_of_its_parts(rng):
 
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_roots_beyond_the_band_move_to_its_edge_and_leave_the_magnitude(order):
-    """Zeros fast and poles slow, and the other way round: d is known far inside, where each is a constant or a slope.
-    """
+    """Zeros fast and poles slow, and the other way round: d is known far inside, where each is a constant or a
+    slope."""
     fast, slow = -(10.0 ** np.arange(5.0, 5.0 + order)), -(10.0 ** -np.arange(5.0, 5.0 + order))
     inside = np.geomspace(0.1, 10.0, 7)
     for zeros, poles in ((fast, slow), (slow, fast), (fast, -np.ones(order)), (-np.ones(order), fast)):
@@ -200,26 +204,51 @@ def test_roots_beyond_the_band_move_to_its_edge_and_leave_the_magnitude(order):
 def test_slopes_of_the_magnitude_are_its_derivatives(rng):
     d = rational(rng, 5)
     h = 1e-6
-    numeric = np.stack([(ScalarScaling(d.theta + h * e).log_magnitude(EIGHT_DECADES)
-                         - ScalarScaling(d.theta - h * e).log_magnitude(EIGHT_DECADES)) / (2 * h)
-                        for e in np.eye(d.theta.size)], axis=1)
+    numeric = np.stack(
+        [
+            (
+                ScalarScaling(d.theta + h * e).log_magnitude(EIGHT_DECADES)
+                - ScalarScaling(d.theta - h * e).log_magnitude(EIGHT_DECADES)
+            )
+            / (2 * h)
+            for e in np.eye(d.theta.size)
+        ],
+        axis=1,
+    )
     assert np.max(np.abs(d.jacobian(EIGHT_DECADES) - numeric)) < 1e-6
 
 
-@pytest.mark.parametrize(("change", "field"), [
-    ({"omega": [1.0, -2.0]}, "omega"), ({"magnitude": [1.0, 0.0]}, "magnitude"), ({"magnitude": [1.0, np.nan]}, "magn"),
-    ({"order": -1}, "order"), ({"order": 1.5}, "order"), ({"weight": [2.0, 1.0]}, "weight"),
-    ({"magnitude": [1.0, 2.0, 3.0]}, "magnitude"), ({"weight": [0.0, 0.0]}, "weight")])
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"omega": [1.0, -2.0]}, "omega"),
+        ({"magnitude": [1.0, 0.0]}, "magnitude"),
+        ({"magnitude": [1.0, np.nan]}, "magn"),
+        ({"order": -1}, "order"),
+        ({"order": 1.5}, "order"),
+        ({"weight": [2.0, 1.0]}, "weight"),
+        ({"magnitude": [1.0, 2.0, 3.0]}, "magnitude"),
+        ({"weight": [0.0, 0.0]}, "weight"),
+    ],
+)
 def test_bad_input_is_named(change, field):
     good = {"omega": [1.0, 2.0], "magnitude": [1.0, 2.0], "order": 1, "weight": None}
     with pytest.raises(InputError, match=field):
         fit_magnitude(**(good | change))
 
 
-@pytest.mark.parametrize(("X", "degree", "message"), [
-    ([[1.0, 0.0], [0.0, -1.0]], 0, "positive definite"), ([[1.0, 0.2], [0.1, 1.0]], 0, "finite Hermitian"),
-    ([[1.0, 0.1j], [0.1j, 1.0]], 0, "finite Hermitian"), ([[1.0, 0.0], [0.0, np.inf]], 0, "finite Hermitian"),
-    ([[1.0, 0.0]], 0, "do not fit"), ([[1.0]], -1, "whole number"), ([[1.0]], 0.5, "whole number")])
+@pytest.mark.parametrize(
+    ("X", "degree", "message"),
+    [
+        ([[1.0, 0.0], [0.0, -1.0]], 0, "positive definite"),
+        ([[1.0, 0.2], [0.1, 1.0]], 0, "finite Hermitian"),
+        ([[1.0, 0.1j], [0.1j, 1.0]], 0, "finite Hermitian"),
+        ([[1.0, 0.0], [0.0, np.inf]], 0, "finite Hermitian"),
+        ([[1.0, 0.0]], 0, "do not fit"),
+        ([[1.0]], -1, "whole number"),
+        ([[1.0]], 0.5, "whole number"),
+    ],
+)
 def test_matrix_that_cannot_be_fitted_is_refused(X, degree, message):
     with pytest.raises(InputError, match=message):
         fit_hermitian(np.array([1.0]), np.array([X], complex), degree)
@@ -233,6 +262,7 @@ def added(monkeypatch) -> list[np.ndarray]:
     def watched(points, omega, M):
         rounds.append(np.sort(omega))
         return extended(points, omega, M)
+
     monkeypatch.setattr(PointwiseScalings, "extended", watched)
     return rounds
 
@@ -246,8 +276,9 @@ def test_the_four_highest_peaks_between_the_points_become_points(added):
     N = StateSpace(A, B, C, np.full((2, 2), 0.1))
     structure = BlockStructure.of([ComplexFull(1, 1)]).with_performance(1, 1)
     coarse, dense = np.geomspace(0.01, 1000, 16), np.geomspace(0.01, 1000, CHECKED_POINTS)
-    step = next(d_steps(PointwiseScalings.of(coarse, N.frequency_response(coarse), structure), N,
-                        Scalings.identity(structure)))
+    step = next(
+        d_steps(PointwiseScalings.of(coarse, N.frequency_response(coarse), structure), N, Scalings.identity(structure))
+    )
     sigma = np.linalg.norm(N.frequency_response(dense), ord=2, axis=(1, 2))
     peaks = find_peaks(sigma)[0]
     highest = peaks[np.argsort(sigma[peaks])[-4:]]
@@ -271,17 +302,27 @@ def test_a_repeated_block_is_fitted_where_its_misfit_costs_most():
 
     At constant scalings the output and input directions of the first lie wholly within its block.
     """
+
     def loop(ratio):
         """[0 t; 1/t 0] with |t| from `ratio` at low frequency to 1/ratio at high."""
         direct, step = np.array([[0.0, 1 / ratio], [ratio, 0.0]]), ratio - 1 / ratio
-        return StateSpace(-np.diag([1 / ratio, ratio]), np.array([[0.0, 1.0], [1.0, 0.0]]),
-                          np.diag([step / ratio, -step * ratio]), direct)
+        return StateSpace(
+            -np.diag([1 / ratio, ratio]),
+            np.array([[0.0, 1.0], [1.0, 0.0]]),
+            np.diag([step / ratio, -step * ratio]),
+            direct,
+        )
+
     pair = append(loop(10.0).renamed(["a", "b"], ["c", "d"]), loop(3.0).renamed(["e", "f"], ["g", "h"]))
     N = StateSpace(pair.A, pair.B, pair.C, pair.D + 0.05)
     structure = BlockStructure.of([ComplexScalar(2), ComplexFull(1, 1)]).with_performance(1, 1)
     omega = np.geomspace(1e-3, 1e3, 40)
-    *_, step = d_steps(PointwiseScalings.of(omega, N.frequency_response(omega), structure), N,
-                       Scalings.identity(structure), allowed_cost=0.05)
+    *_, step = d_steps(
+        PointwiseScalings.of(omega, N.frequency_response(omega), structure),
+        N,
+        Scalings.identity(structure),
+        allowed_cost=0.05,
+    )
     assert step.cost < 0.05 and min(step.scalings.orders[:2]) > 0
 
 
@@ -290,8 +331,12 @@ def constants(seed, block, away):
     rng = np.random.default_rng(seed)
     structure = BlockStructure.of([block, ComplexFull(1, 1)]).with_performance(1, 1)
     n = structure.n_w
-    N = StateSpace(-np.diag(10.0 ** rng.uniform(-1, 1, 4)), rng.normal(size=(4, n)), rng.normal(size=(n, 4)),
-                   0.1 * rng.normal(size=(n, n)))
+    N = StateSpace(
+        -np.diag(10.0 ** rng.uniform(-1, 1, 4)),
+        rng.normal(size=(4, n)),
+        rng.normal(size=(n, 4)),
+        0.1 * rng.normal(size=(n, n)),
+    )
     omega = np.geomspace(1e-2, 1e2, 30)
     M = N.frequency_response(omega)
 
@@ -327,8 +372,12 @@ def test_scalings_of_a_group_share_the_states_of_signals_that_depend_on_each_oth
     rng = np.random.default_rng(3)
     structure = BlockStructure.of([ComplexFull(1, 1)] * 3).with_performance(1, 1)
     B, C = rng.normal(size=(4, 2)) @ rng.normal(size=(2, 3)), rng.normal(size=(3, 2)) @ rng.normal(size=(2, 4))
-    P = StateSpace(-np.diag([1.0, 2.0, 5.0, 9.0]), np.hstack([B, rng.normal(size=(4, 2))]),
-                   np.vstack([C, rng.normal(size=(2, 4))]), np.zeros((5, 5)))
+    P = StateSpace(
+        -np.diag([1.0, 2.0, 5.0, 9.0]),
+        np.hstack([B, rng.normal(size=(4, 2))]),
+        np.vstack([C, rng.normal(size=(2, 4))]),
+        np.zeros((5, 5)),
+    )
     d = ScalarScaling.from_roots(1.0, [-3.0], [-0.7])
     parts = tuple(ScalarScaling(np.r_[gain_, d.theta[1:]]) for gain_ in (0.3, -1.0, 2.0))
     apart = Scalings(structure, (*parts, ScalarScaling.constant(1.0)))

@@ -27,8 +27,11 @@ def peak_by_slicot(loop: StateSpace, structure: BlockStructure = ONE_DRIVE) -> f
     poles = loop.poles()
     if np.max(np.abs(poles) - 1 if loop.dt else poles.real) >= 0:
         return np.inf
-    omega = (np.concatenate([np.geomspace(1e-2, np.pi / loop.dt, 400), np.abs(np.angle(poles)) / loop.dt]) if loop.dt
-             else np.concatenate([np.geomspace(1e-2, 1e5, 400), np.abs(poles)]))
+    omega = (
+        np.concatenate([np.geomspace(1e-2, np.pi / loop.dt, 400), np.abs(np.angle(poles)) / loop.dt])
+        if loop.dt
+        else np.concatenate([np.geomspace(1e-2, 1e5, 400), np.abs(poles)])
+    )
     return max(mu_upper_slicot(M, structure) for M in loop.frequency_response(omega))
 
 
@@ -93,6 +96,7 @@ def test_no_frequency_is_bounded_twice_in_a_step(full, monkeypatch):
     def counted(M, *arguments):
         seen.append(M)
         return upper_bound(M, *arguments)
+
     monkeypatch.setattr("avis_ctrl.robust.mu_descent.upper_bound", counted)
     value, _ = Objective(Task(P, ONE_DRIVE), form, frequency_grid(lft_lower(P, made.K)), 20.0).value(form.start)
     every = np.concatenate(seen)
@@ -121,8 +125,10 @@ def test_an_added_mode_lowers_the_smoothed_peak(full, most):
     omega = frequency_grid(lft_lower(P, one.K))
 
     def smoothed(K):
-        return sum(mu_upper_slicot(M, ONE_DRIVE) ** SETTINGS.sharpness[0]
-                   for M in lft_lower(P, K).frequency_response(omega))
+        return sum(
+            mu_upper_slicot(M, ONE_DRIVE) ** SETTINGS.sharpness[0] for M in lft_lower(P, K).frequency_response(omega)
+        )
+
     assert smoothed(longer) < smoothed(one.K)
 
 
@@ -171,8 +177,12 @@ def test_a_sampled_plant_gets_a_short_sampled_controller():
 
 def test_an_order_that_cannot_stabilise_is_refused():
     """1/(s^2 - 1) measured by position alone: no gain stabilises it, and one state less than one is none."""
-    P = StateSpace([[0.0, 1.0], [1.0, 0.0]], [[0, 0, 0], [0.1, 1.0, 1.0]], [[0.1, 0.0], [1.0, 0.0], [1.0, 0.0]],
-                   [[0, 0, 0.01], [0, 0, 0.1], [0, 0.1, 0]])
+    P = StateSpace(
+        [[0.0, 1.0], [1.0, 0.0]],
+        [[0, 0, 0], [0.1, 1.0, 1.0]],
+        [[0.1, 0.0], [1.0, 0.0], [1.0, 0.0]],
+        [[0, 0, 0.01], [0, 0, 0.1], [0, 0.1, 0]],
+    )
     with pytest.raises(ComputationError, match="every mode is needed for stability"):
         musyn(P, [ComplexScalar()], 1, 1, order=0, max_iterations=2)
 
@@ -187,10 +197,13 @@ def test_wrong_order(order):
 def test_decentralised_loops_see_their_own_signal_alone():
     """Two tables whose sensors hear each other by a tenth; off the diagonal K is exactly zero."""
     one, two = barely_known_table(0.5), barely_known_table(0.4)
-    both = append(one.renamed(["d1", "w1", "n1", "u1"], ["e1", "z1", "f1", "y1"]),
-                  two.renamed(["d2", "w2", "n2", "u2"], ["e2", "z2", "f2", "y2"]))
-    mixed = both.select(["e1", "e2", "z1", "f1", "z2", "f2", "y1", "y2"],
-                        ["d1", "d2", "w1", "n1", "w2", "n2", "u1", "u2"])
+    both = append(
+        one.renamed(["d1", "w1", "n1", "u1"], ["e1", "z1", "f1", "y1"]),
+        two.renamed(["d2", "w2", "n2", "u2"], ["e2", "z2", "f2", "y2"]),
+    )
+    mixed = both.select(
+        ["e1", "e2", "z1", "f1", "z2", "f2", "y1", "y2"], ["d1", "d2", "w1", "n1", "w2", "n2", "u1", "u2"]
+    )
     left = np.eye(8)
     left[6, 7] = left[7, 6] = 0.1
     P = mixed.scaled(left=left)

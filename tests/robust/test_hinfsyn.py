@@ -9,17 +9,7 @@ import pytest
 import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import (
-    StateSpace,
-    append,
-    connect,
-    discretise,
-    gain,
-    hinf_norm,
-    lft_lower,
-    summing_junction,
-    tf,
-)
+from avis_ctrl.lti import StateSpace, append, connect, discretise, gain, hinf_norm, lft_lower, summing_junction, tf
 from avis_ctrl.lti.realisation import hankel_singular_values
 from avis_ctrl.robust.hinf_bounds import hinf_lower_bound
 from avis_ctrl.robust.hinf_lmi import UNCERTIFIED, certified, lmi_gamma
@@ -31,10 +21,15 @@ DISTURBANCE_PROCESS = ([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1
 
 
 def random_plant(rng, n, n_w, n_z, ncon, nmeas, direct=1.0):
-    D = np.block([[direct * rng.standard_normal((n_z, n_w)), rng.standard_normal((n_z, ncon))],
-                  [rng.standard_normal((nmeas, n_w)), direct * rng.standard_normal((nmeas, ncon))]])
-    return StateSpace(rng.standard_normal((n, n)), rng.standard_normal((n, n_w + ncon)),
-                      rng.standard_normal((n_z + nmeas, n)), D)
+    D = np.block(
+        [
+            [direct * rng.standard_normal((n_z, n_w)), rng.standard_normal((n_z, ncon))],
+            [rng.standard_normal((nmeas, n_w)), direct * rng.standard_normal((nmeas, ncon))],
+        ]
+    )
+    return StateSpace(
+        rng.standard_normal((n, n)), rng.standard_normal((n, n_w + ncon)), rng.standard_normal((n_z + nmeas, n)), D
+    )
 
 
 def check(P, nmeas, ncon, result, backoff=0.01):
@@ -49,8 +44,17 @@ def check(P, nmeas, ncon, result, backoff=0.01):
 
 
 def mixed_sensitivity(weight, plant=DISTURBANCE_PROCESS):
-    return connect([tf(*plant, ["u"], ["g"]), summing_junction("e", ["r", "-g"]), tf(*weight, ["e"], ["wp_e"]),
-                    gain([[1.0]], ["u"], ["wu_u"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["wp_e", "wu_u", "y"])
+    return connect(
+        [
+            tf(*plant, ["u"], ["g"]),
+            summing_junction("e", ["r", "-g"]),
+            tf(*weight, ["e"], ["wp_e"]),
+            gain([[1.0]], ["u"], ["wu_u"]),
+            gain([[1.0]], ["e"], ["y"]),
+        ],
+        ["r", "u"],
+        ["wp_e", "wu_u", "y"],
+    )
 
 
 class TestKnownOptimum:
@@ -67,8 +71,16 @@ class TestKnownOptimum:
     @pytest.mark.parametrize("z", [0.5, 2.0])
     def test_weighted_sensitivity_with_a_right_half_plane_zero(self, z):
         """min ||W S|| = |W(z)|: Zames and Francis (IEEE TAC 28, 1983); Skogestad and Postlethwaite eq. 5.30."""
-        P = connect([tf([-1, z], [1, 4, 3], ["u"], ["g"]), summing_junction("e", ["r", "-g"]),
-                     tf([1, 1], [1, 0.01], ["e"], ["z"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["z", "y"])
+        P = connect(
+            [
+                tf([-1, z], [1, 4, 3], ["u"], ["g"]),
+                summing_junction("e", ["r", "-g"]),
+                tf([1, 1], [1, 0.01], ["e"], ["z"]),
+                gain([[1.0]], ["e"], ["y"]),
+            ],
+            ["r", "u"],
+            ["z", "y"],
+        )
         exact = (z + 1) / (z + 0.01)
         result = hinfsyn(P, 1, 1)
         assert result.status is Status.REGULARISED and "D12" in result.notes[0]
@@ -79,8 +91,15 @@ class TestKnownOptimum:
     def test_sensitivity_peak_of_an_unstable_plant_with_a_zero(self):
         """min ||S|| = |z + p| / |z - p|: Skogestad and Postlethwaite, section 5.3, combined pole and zero."""
         z, p = 8.0, 1.0
-        P = connect([tf([1, -z], np.polymul([1, -p], [0.1, 1]), ["u"], ["g"]), summing_junction("y", ["r", "-g"]),
-                     gain([[1.0]], ["y"], ["e"])], ["r", "u"], ["e", "y"])
+        P = connect(
+            [
+                tf([1, -z], np.polymul([1, -p], [0.1, 1]), ["u"], ["g"]),
+                summing_junction("y", ["r", "-g"]),
+                gain([[1.0]], ["y"], ["e"]),
+            ],
+            ["r", "u"],
+            ["e", "y"],
+        )
         result = hinfsyn(P, 1, 1)
         assert (z + p) / (z - p) <= result.gamma <= 1.03 * (z + p) / (z - p)
 
@@ -121,8 +140,16 @@ class TestKnownOptimum:
         Francis, A Course in H-infinity Control Theory, 1987). Posed as T1 = R T2 with T2 inner, its zeros R's poles."""
         p = np.array([1.0, 2.0])
         R_num = [3.0, 5.0]
-        P = connect([tf(R_num, np.poly(-p), ["w"], ["t1"]), tf(np.poly(p), np.poly(-p), ["u"], ["t2"]),
-                     summing_junction("z", ["t1", "-t2"]), gain([[1.0]], ["w"], ["y"])], ["w", "u"], ["z", "y"])
+        P = connect(
+            [
+                tf(R_num, np.poly(-p), ["w"], ["t1"]),
+                tf(np.poly(p), np.poly(-p), ["u"], ["t2"]),
+                summing_junction("z", ["t1", "-t2"]),
+                gain([[1.0]], ["w"], ["y"]),
+            ],
+            ["w", "u"],
+            ["z", "y"],
+        )
         mirror = tf([-R_num[0], R_num[1]], np.poly(-p))
         result = hinfsyn(P, 1, 1, tolerance=1e-5)
         assert result.gamma_optimal_bounds[1] == pytest.approx(hankel_singular_values(mirror)[0], rel=2e-5)
@@ -144,8 +171,18 @@ class TestKnownOptimum:
 
 
 class TestAgainstMatrixInequalities:
-    @pytest.mark.parametrize("size", [(0, 3, 3, 1, 2), (1, 2, 2, 1, 1), (2, 2, 1, 1, 1), (3, 3, 2, 1, 2),
-                                      (4, 4, 5, 2, 2), (3, 2, 4, 2, 2), (6, 3, 3, 2, 1)])
+    @pytest.mark.parametrize(
+        "size",
+        [
+            (0, 3, 3, 1, 2),
+            (1, 2, 2, 1, 1),
+            (2, 2, 1, 1, 1),
+            (3, 3, 2, 1, 2),
+            (4, 4, 5, 2, 2),
+            (3, 2, 4, 2, 2),
+            (6, 3, 3, 2, 1),
+        ],
+    )
     def test_same_optimum_for_any_direct_terms(self, rng, size):
         n, n_w, n_z, ncon, nmeas = size
         P = random_plant(rng, n, n_w, n_z, ncon, nmeas)
@@ -172,8 +209,9 @@ class TestAgainstMatrixInequalities:
         D = np.zeros((5, 5))
         D[1:3, 3:] = D[3:, 1:3] = np.eye(2)
         for _ in range(4):
-            P = StateSpace(rng.standard_normal((4, 4)) - 3 * np.eye(4), rng.standard_normal((4, 5)),
-                           rng.standard_normal((5, 4)), D)
+            P = StateSpace(
+                rng.standard_normal((4, 4)) - 3 * np.eye(4), rng.standard_normal((4, 5)), rng.standard_normal((5, 4)), D
+            )
             other = P.scaled(left=[1, 1, 1, 1, 1e-10], right=[1, 1, 1, 1, 1e-10])
             assert hinf_lower_bound(other, 2, 2).gamma == pytest.approx(hinf_lower_bound(P, 2, 2).gamma, rel=1e-6)
 
@@ -186,8 +224,9 @@ class TestAgainstMatrixInequalities:
         g, h, a = tf([1], np.poly(-np.ones(order))), tf([corner], [1, corner]), 1e6
         B, C = np.zeros((order + 1, 4)), np.zeros((4, order + 1))
         B[:order, 3], C[1, :order], B[order, 0], C[1, order] = g.B[:, 0], g.C[0], h.B[0, 0], h.C[0, 0]
-        P = StateSpace(la.block_diag(g.A, h.A), B, C, np.array([[0, 0.1, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0],
-                                                                [0, 1, 0, 0]]))
+        P = StateSpace(
+            la.block_diag(g.A, h.A), B, C, np.array([[0, 0.1, 1, 0], [0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
+        )
         s = 1j * np.geomspace(1e-2, 1e9, 5000)
         reached = np.max(np.abs(corner / (s + corner) * (1 - (s / a + 1) ** -order)))
         assert reached < 0.1
@@ -208,8 +247,9 @@ class TestSingularProblems:
     def test_zero_on_the_imaginary_axis(self):
         """An undamped mode that the cost does not see but the input moves."""
         A = la.block_diag([[0.0, 1.0], [-4.0, 0.0]], [[-1.0]])
-        P = StateSpace(A, [[0, 0, 0], [1, 0, 1], [1, 0, 1]], [[0, 0, 1], [0, 0, 0], [1, 0, 1]],
-                       [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+        P = StateSpace(
+            A, [[0, 0, 0], [1, 0, 1], [1, 0, 1]], [[0, 0, 1], [0, 0, 0], [1, 0, 1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+        )
         result = hinfsyn(P, 1, 1)
         assert result.status is Status.REGULARISED and "imaginary axis" in result.notes[0]
         assert result.abscissa < 0
@@ -225,26 +265,48 @@ class TestSingularProblems:
 class TestRefusals:
     def test_mode_that_no_input_moves_is_named(self):
         stuck = tf([1.0], [1, 0, (2 * np.pi * 2.07) ** 2], ["floor"], ["z1"])
-        P = connect([stuck, tf([1.0], [1, 1], ["force"], ["x"]), summing_junction("y", ["x", "z1"]),
-                     gain([[1.0]], ["force"], ["z2"])], ["floor", "force"], ["z1", "z2", "y"])
+        P = connect(
+            [
+                stuck,
+                tf([1.0], [1, 1], ["force"], ["x"]),
+                summing_junction("y", ["x", "z1"]),
+                gain([[1.0]], ["force"], ["z2"]),
+            ],
+            ["floor", "force"],
+            ["z1", "z2", "y"],
+        )
         with pytest.raises(ComputationError, match=r"mode at 2\.07 Hz is not moved by any of the inputs \['force'\]"):
             hinfsyn(P, 1, 1)
 
     def test_mode_that_no_measurement_sees_is_named(self):
         unseen = tf([1.0], [1, -0.5], ["force"], ["z1"])
-        P = connect([unseen, tf([1.0], [1, 1], ["force"], ["x"]), summing_junction("y", ["x", "n"])],
-                    ["n", "force"], ["z1", "y"])
+        P = connect(
+            [unseen, tf([1.0], [1, 1], ["force"], ["x"]), summing_junction("y", ["x", "n"])],
+            ["n", "force"],
+            ["z1", "y"],
+        )
         with pytest.raises(ComputationError, match=r"not seen by any of the measurements \['y'\]"):
             hinfsyn(P, 1, 1)
 
-    @pytest.mark.parametrize(("nmeas", "ncon", "field"), [(0, 1, "nmeas"), (1, 0, "ncon"), (3, 1, "nmeas"),
-                                                         (1, 7, "ncon"), (1.5, 1, "nmeas"), (True, 1, "nmeas")])
+    @pytest.mark.parametrize(
+        ("nmeas", "ncon", "field"),
+        [(0, 1, "nmeas"), (1, 0, "ncon"), (3, 1, "nmeas"), (1, 7, "ncon"), (1.5, 1, "nmeas"), (True, 1, "nmeas")],
+    )
     def test_wrong_partition(self, rng, nmeas, ncon, field):
         with pytest.raises(InputError, match=field):
             hinfsyn(random_plant(rng, 2, 2, 2, 1, 1), nmeas, ncon)
 
-    @pytest.mark.parametrize("options", [{"backoff": -1}, {"tolerance": 0}, {"method": "magic"},
-                                         {"gamma_hint": np.nan}, {"far_poles": "slow"}, {"sample_rate_Hz": -5.0}])
+    @pytest.mark.parametrize(
+        "options",
+        [
+            {"backoff": -1},
+            {"tolerance": 0},
+            {"method": "magic"},
+            {"gamma_hint": np.nan},
+            {"far_poles": "slow"},
+            {"sample_rate_Hz": -5.0},
+        ],
+    )
     def test_wrong_options(self, rng, options):
         with pytest.raises(InputError, match=next(iter(options))):
             hinfsyn(random_plant(rng, 2, 2, 2, 1, 1), 1, 1, **options)
@@ -281,7 +343,8 @@ class TestUse:
         P = random_plant(rng, 5, 2, 2, 1, 1)
         scaled = P.similar(np.diag(10.0 ** rng.uniform(-5, 5, 5))).scaled([1, 1, 1e6], [1, 1, 1e-4])
         assert hinfsyn(scaled, 1, 1).gamma_optimal_bounds[1] == pytest.approx(
-            hinfsyn(P, 1, 1).gamma_optimal_bounds[1], rel=2e-3)
+            hinfsyn(P, 1, 1).gamma_optimal_bounds[1], rel=2e-3
+        )
 
     @pytest.mark.parametrize("w_u", [1.0, 1e-3, 1e-6])
     def test_fourteen_decades_between_the_poles(self, w_u):
@@ -289,9 +352,18 @@ class TestUse:
         singular: the same problem with poles from 1e-3 to 1e5 rad/s and from 1e-7 to 1e7 rad/s."""
         optima = []
         for slow, fast in ((1e-3, 1e5), (1e-7, 1e7)):
-            P = connect([tf(*DISTURBANCE_PROCESS, ["force"], ["g"]), tf([fast], [1, fast], ["u"], ["force"]),
-                         summing_junction("e", ["r", "-g"]), tf([1 / 1.5, 10], [1, slow], ["e"], ["z1"]),
-                         gain([[w_u]], ["u"], ["z2"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["z1", "z2", "y"])
+            P = connect(
+                [
+                    tf(*DISTURBANCE_PROCESS, ["force"], ["g"]),
+                    tf([fast], [1, fast], ["u"], ["force"]),
+                    summing_junction("e", ["r", "-g"]),
+                    tf([1 / 1.5, 10], [1, slow], ["e"], ["z1"]),
+                    gain([[w_u]], ["u"], ["z2"]),
+                    gain([[1.0]], ["e"], ["y"]),
+                ],
+                ["r", "u"],
+                ["z1", "z2", "y"],
+            )
             result = hinfsyn(P, 1, 1)
             assert result.status is Status.OPTIMAL
             check(P, 1, 1, result)
@@ -375,8 +447,9 @@ class TestUse:
 
     def test_two_plants_side_by_side_have_the_larger_optimum(self, rng):
         a, b = (random_plant(rng, 2, 2, 2, 1, 1) for _ in range(2))
-        both = append(a.renamed(["w1", "w2", "u1"], ["z1", "z2", "y1"]), b.renamed(["w3", "w4", "u2"],
-                                                                                 ["z3", "z4", "y2"]))
+        both = append(
+            a.renamed(["w1", "w2", "u1"], ["z1", "z2", "y1"]), b.renamed(["w3", "w4", "u2"], ["z3", "z4", "y2"])
+        )
         both = both.select(["z1", "z2", "z3", "z4", "y1", "y2"], ["w1", "w2", "w3", "w4", "u1", "u2"])
         larger = max(hinfsyn(one, 1, 1).gamma_optimal_bounds[1] for one in (a, b))
         assert hinfsyn(both, 2, 2).gamma_optimal_bounds[1] == pytest.approx(larger, rel=2e-3)

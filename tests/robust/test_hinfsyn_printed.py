@@ -43,8 +43,15 @@ def normalised_coprime_factors(G):
     (McFarlane and Glover 1990; Skogestad and Postlethwaite eq. 9.66)."""
     X = la.solve_continuous_are(G.A, G.B, G.C.T @ G.C, np.eye(1))
     Z = la.solve_continuous_are(G.A.T, G.C.T, G.B @ G.B.T, np.eye(1))
-    P = StateSpace(G.A, np.hstack([Z @ G.C.T, G.B]), np.vstack([0 * G.C, G.C, G.C]),
-                   [[0, 1], [1, 0], [1, 0]], 0.0, ["w", "u"], ["z_u", "z_y", "y"])
+    P = StateSpace(
+        G.A,
+        np.hstack([Z @ G.C.T, G.B]),
+        np.vstack([0 * G.C, G.C, G.C]),
+        [[0, 1], [1, 0], [1, 0]],
+        0.0,
+        ["w", "u"],
+        ["z_u", "z_y", "y"],
+    )
     return P, np.sqrt(1 + np.max(la.eigvals(X @ Z).real))
 
 
@@ -63,9 +70,13 @@ def agrees(P: StateSpace, nmeas: int, ncon: int, printed: str) -> Synthesis:
     return result
 
 
-@pytest.mark.parametrize(("weight", "printed"), [
-    (bound(10.0), "1.37"),
-    (tuple(np.polymul(p, p) for p in ([1 / np.sqrt(1.5), 10.0], [1, 10.0 * np.sqrt(1e-4)])), "2.19")])
+@pytest.mark.parametrize(
+    ("weight", "printed"),
+    [
+        (bound(10.0), "1.37"),
+        (tuple(np.polymul(p, p) for p in ([1 / np.sqrt(1.5), 10.0], [1, 10.0 * np.sqrt(1e-4)])), "2.19"),
+    ],
+)
 def test_disturbance_process_of_skogestad_and_postlethwaite(weight, printed):
     """Example 2.17 (2.11 in the 1st edition), S/KS with a weight of first and of second order, data as in Expl2_17.m.
 
@@ -74,8 +85,9 @@ def test_disturbance_process_of_skogestad_and_postlethwaite(weight, printed):
     agrees(mixed_sensitivity(DISTURBANCE_PROCESS, [weight], [UNIT]), 1, 1, printed)
 
 
-@pytest.mark.parametrize(("w_B1", "w_B2", "printed"), [
-    (0.25, 0.25, "2.80"), (0.25, 25.0, "2.92"), (25.0, 0.25, "6.73")])
+@pytest.mark.parametrize(
+    ("w_B1", "w_B2", "printed"), [(0.25, 0.25, "2.80"), (0.25, 25.0, "2.92"), (25.0, 0.25, "6.73")]
+)
 def test_two_by_two_plant_with_a_right_half_plane_zero(w_B1, w_B2, printed):
     """Skogestad and Postlethwaite, example 3.17 (3.8 in the 1st edition), data as in Expl3_17.m.
 
@@ -94,9 +106,13 @@ def test_unstable_plant_with_a_right_half_plane_zero():
     agrees(mixed_sensitivity(G, [([0.5, 1.0], [1, 1e-8])], [UNIT]), 1, 1, "1.89")
 
 
-@pytest.mark.parametrize(("shaped", "printed"), [
-    (DISTURBANCE_PROCESS @ tf([1, 2], [1, 0]), "2.34"),
-    (tf([16], [1, 0.16, 16]) @ tf([1, 0.8], [1, 0]) @ tf([1], [1 / 20, 1]), "1.9885")])
+@pytest.mark.parametrize(
+    ("shaped", "printed"),
+    [
+        (DISTURBANCE_PROCESS @ tf([1, 2], [1, 0]), "2.34"),
+        (tf([16], [1, 0.16, 16]) @ tf([1, 0.8], [1, 0]) @ tf([1], [1 / 20, 1]), "1.9885"),
+    ],
+)
 def test_loop_shaping(shaped, printed):
     """Normalised coprime factors of a shaped plant.
 
@@ -130,8 +146,13 @@ def test_smaller_weight_on_the_effort_with_states_twice(tolerance):
     """The same problem as [W_P, -W_P G; 0, 0.1; 1, -G], every entry realised on its own: four states are superfluous,
     Y is zero and X singular. Round-off then decides the sign of X's eigenvalues, which must not set a bound."""
     weight, den = bound(10.0), np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1]))
-    P = in_parallel([[weight, (np.multiply(-200, weight[0]), np.polymul(weight[1], den))],
-                     [([0.0], [1.0]), ([0.1], [1.0])], [([1.0], [1.0]), ([-200.0], den)]])
+    P = in_parallel(
+        [
+            [weight, (np.multiply(-200, weight[0]), np.polymul(weight[1], den))],
+            [([0.0], [1.0]), ([0.1], [1.0])],
+            [([1.0], [1.0]), ([-200.0], den)],
+        ]
+    )
     assert P.nstates == 8
     result = hinfsyn(P, 1, 1, tolerance=tolerance)
     lower, upper = result.gamma_optimal_bounds

@@ -35,8 +35,8 @@ def assert_bounds_proved(M, blocks, found):
     structure = BlockStructure.of(blocks)
     X_z, X_w = found.D @ found.D, found.D_w @ found.D_w
     GM = found.G @ M
-    F_ = found.upper ** 2 * X_w - M.conj().T @ X_z @ M - 1j * (GM - GM.conj().T)
-    assert np.linalg.eigvalsh(F_)[0] > -1e-7 * np.linalg.norm(found.upper ** 2 * X_w + M.conj().T @ X_z @ M, 2)
+    F_ = found.upper**2 * X_w - M.conj().T @ X_z @ M - 1j * (GM - GM.conj().T)
+    assert np.linalg.eigvalsh(F_)[0] > -1e-7 * np.linalg.norm(found.upper**2 * X_w + M.conj().T @ X_z @ M, 2)
     # The scalings commute with every Delta of the structure.
     delta = structure.random(np.random.default_rng(0))
     assert np.allclose(X_w @ delta, delta @ X_z, atol=1e-9 * np.linalg.norm(X_w))
@@ -49,6 +49,7 @@ def assert_bounds_proved(M, blocks, found):
 
 
 # -- printed values -----------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("blocks, printed", [([F(2)], 3.162), ([C(), C()], 3.000)])
 def test_skogestad_postlethwaite_example_8_5(blocks, printed):
@@ -63,9 +64,13 @@ def test_skogestad_postlethwaite_example_8_5(blocks, printed):
 
 def test_slicot_ab13md_printed_example():
     """SLICOT library, AB13MD program results: bound 0.4174753408D+02 (two real scalars, a full block, two complex)."""
-    half = np.array([[-1 + 6j, 2 - 3j, 3 + 8j, 3 + 8j, -5 - 9j, -6 + 2j],
-                     [4 + 2j, -2 + 5j, -6 - 7j, -4 + 11j, 8 - 7j, 12 - 1j],
-                     [5 - 4j, -4 - 8j, 1 - 3j, -6 + 14j, 2 - 5j, 4 + 16j]])
+    half = np.array(
+        [
+            [-1 + 6j, 2 - 3j, 3 + 8j, 3 + 8j, -5 - 9j, -6 + 2j],
+            [4 + 2j, -2 + 5j, -6 - 7j, -4 + 11j, 8 - 7j, 12 - 1j],
+            [5 - 4j, -4 - 8j, 1 - 3j, -6 + 14j, 2 - 5j, 4 + 16j],
+        ]
+    )
     M, blocks = np.vstack([half, half]), [R(), R(), F(2), C(), C()]
     found = mu(M, blocks)
     assert found.upper == pytest.approx(41.74753408, rel=2e-6)
@@ -104,6 +109,7 @@ def test_one_scalar_skogestad_postlethwaite_8_74_8_75():
 
 
 # -- provable by hand ---------------------------------------------------------------------------------------
+
 
 def test_rank_one_is_the_sum_of_magnitudes(rng):
     """M = a b^H with scalars: mu = sum |a_i b_i| (the phases of Delta align every term of b^H Delta a)."""
@@ -144,15 +150,18 @@ def test_full_block_is_the_largest_singular_value(rng):
     assert mu(M, [F(4, 3)]).lower == pytest.approx(np.linalg.norm(M, 2), rel=1e-9)
 
 
-@pytest.mark.parametrize("M, blocks, expected", [
-    (np.zeros((3, 3)), [C(), R(), C()], 0.0),
-    ([[0, 1], [0, 0]], [C(), C()], 0.0),
-    ([[1, 1e3], [0, 0.5]], [C(), C()], 1.0),
-    ([[1, 1e8], [1e-8, 1]], [C(), C()], 2.0),
-    (1e-120 * np.ones((2, 2)), [C(), C()], 2e-120),
-    (1e120 * np.ones((2, 2)), [C(), C()], 2e120),
-    ([[0, 2, 0], [3, 0, 0], [0, 0, 0]], [C(), C(), C()], np.sqrt(6)),
-])
+@pytest.mark.parametrize(
+    "M, blocks, expected",
+    [
+        (np.zeros((3, 3)), [C(), R(), C()], 0.0),
+        ([[0, 1], [0, 0]], [C(), C()], 0.0),
+        ([[1, 1e3], [0, 0.5]], [C(), C()], 1.0),
+        ([[1, 1e8], [1e-8, 1]], [C(), C()], 2.0),
+        (1e-120 * np.ones((2, 2)), [C(), C()], 2e-120),
+        (1e120 * np.ones((2, 2)), [C(), C()], 2e120),
+        ([[0, 2, 0], [3, 0, 0], [0, 0, 0]], [C(), C(), C()], np.sqrt(6)),
+    ],
+)
 def test_degenerate_matrices(M, blocks, expected):
     found = mu(M, blocks)
     assert found.upper == pytest.approx(expected, rel=2e-5, abs=1e-8 * np.linalg.norm(M))
@@ -161,6 +170,7 @@ def test_degenerate_matrices(M, blocks, expected):
 
 
 # -- other algorithms ---------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("name", MIXED)
 def test_upper_bound_agrees_with_lmi_bisection(name, rng):
@@ -213,6 +223,7 @@ def test_batch_equals_one_by_one(rng):
 
 # -- laws ---------------------------------------------------------------------------------------------------
 
+
 def cases():
     return st.tuples(st.sampled_from(sorted(MIXED)), st.integers(0, 10_000))
 
@@ -241,7 +252,8 @@ def test_homogeneous(case, factor, negative):
     blocks, M, _ = drawn(case)
     factor = -factor if negative else factor
     assert mu_upper(factor * M, blocks).upper == pytest.approx(
-        abs(factor) * mu_upper(M, blocks).upper, rel=1e-4, abs=1e-6)
+        abs(factor) * mu_upper(M, blocks).upper, rel=1e-4, abs=1e-6
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -273,7 +285,7 @@ def test_stages_in_series_have_the_product_of_their_gains_as_worst_case():
     M = np.array([[0, 0, 0, 1.0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]) * np.array([[0.3], [0.3], [0.3], [1.0]])
     M[0, 2] = 1e-17
     bound = skewed_upper_bound(M[None, None] + 0j, BlockStructure.of([ComplexScalar()] * 3 + [ComplexFull(1, 1)]))
-    assert bound.beta[0] == pytest.approx(0.3 ** 3, rel=1e-2)
+    assert bound.beta[0] == pytest.approx(0.3**3, rel=1e-2)
 
 
 @settings(max_examples=10, deadline=None)
@@ -297,7 +309,8 @@ def test_order_of_blocks_does_not_matter(seed):
     M = random_matrix(rng, [R(), C(), F(2)])
     order = [2, 3, 0, 1]
     assert mu_upper(M[np.ix_(order, order)], [F(2), R(), C()]).upper == pytest.approx(
-        mu_upper(M, [R(), C(), F(2)]).upper, rel=1e-4)
+        mu_upper(M, [R(), C(), F(2)]).upper, rel=1e-4
+    )
 
 
 @settings(max_examples=10, deadline=None)
@@ -333,8 +346,11 @@ def test_no_perturbation_makes_a_nilpotent_matrix_singular(n, block):
 
 # -- input --------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("M, blocks", [
-    (np.eye(3), [C(), C()]), (np.eye(2)[0], [C(), C()]), ([[np.nan, 1], [1, 1]], [C(), C()]), (np.eye(2), ["full"])])
+
+@pytest.mark.parametrize(
+    "M, blocks",
+    [(np.eye(3), [C(), C()]), (np.eye(2)[0], [C(), C()]), ([[np.nan, 1], [1, 1]], [C(), C()]), (np.eye(2), ["full"])],
+)
 def test_wrong_input_is_named(M, blocks):
     with pytest.raises(InputError):
         mu(M, blocks)
@@ -372,6 +388,7 @@ def test_shared_scalings_of_full_blocks_hold_for_every_matrix():
     def peak(d):
         d_z, d_w = np.repeat(d, [3, 1, 1]), np.repeat(d, [2, 1, 3])
         return np.max(np.linalg.norm(M[0] * d_z[:, None] / d_w, 2, axis=(1, 2)))
+
     d = np.sqrt(np.diag(found.scalings.X_w[0]).real[[0, 2, 3]])
     assert peak(d) == pytest.approx(found.beta[0], rel=1e-9)
     for size in (1e-3, 1e-2, 0.1, 1.0):

@@ -42,30 +42,46 @@ def distillation():
     """
     G0 = np.array([[87.8, -86.4], [108.2, -109.6]])
     T_wI = np.polymul([1, 0.2], [0.7]), np.polymul([0.5, 1], [1, 0.7])
-    entries = [((-T_wI[0], T_wI[1]), np.eye(2)), ((-np.polymul(T_wI[0], [75, 1]), T_wI[1]), np.linalg.inv(G0)),
-               (([0.5, 0.05], np.polymul([1, 0.7], [75, 1])), G0), (([0.5, 0.05], [1, 0.7]), np.eye(2))]
+    entries = [
+        ((-T_wI[0], T_wI[1]), np.eye(2)),
+        ((-np.polymul(T_wI[0], [75, 1]), T_wI[1]), np.linalg.inv(G0)),
+        (([0.5, 0.05], np.polymul([1, 0.7], [75, 1])), G0),
+        (([0.5, 0.05], [1, 0.7]), np.eye(2)),
+    ]
     parts = []
     for k, ((num, den), matrix) in enumerate(entries):
         one = tf(num, den)
         both = append(one.renamed([f"u{k}a"], [f"y{k}a"]), one.renamed([f"u{k}b"], [f"y{k}b"]))
         parts.append(both @ gain(matrix, [f"v{k}a", f"v{k}b"], [f"u{k}a", f"u{k}b"]))
     I, O = np.eye(2), np.zeros((2, 2))
-    return append(*parts).scaled(left=np.block([[I, I, O, O], [O, O, I, I]]),
-                                 right=np.block([[I, O], [O, I], [I, O], [O, I]]))
+    return append(*parts).scaled(
+        left=np.block([[I, I, O, O], [O, O, I, I]]), right=np.block([[I, O], [O, I], [I, O], [O, I]])
+    )
 
 
 def distillation_plant():
     """The same without its controller: inputs w_delta, w, u; outputs z_delta, z, y = -(G (u + w_delta) + w)."""
-    G = StateSpace(-np.eye(2) / 75, np.eye(2), np.array([[87.8, -86.4], [108.2, -109.6]]) / 75, np.zeros((2, 2)), 0.0,
-                   ["a1", "a2"], ["g1", "g2"])
+    G = StateSpace(
+        -np.eye(2) / 75,
+        np.eye(2),
+        np.array([[87.8, -86.4], [108.2, -109.6]]) / 75,
+        np.zeros((2, 2)),
+        0.0,
+        ["a1", "a2"],
+        ["g1", "g2"],
+    )
     parts = [G]
     for k in "12":
-        parts += [tf([1.0, 0.2], [0.5, 1.0], [f"u{k}"], [f"z_delta{k}"]), tf([0.5, 0.05], [1.0, 1e-6], [f"e{k}"],
-                     [f"z{k}"]),
-                  summing_junction(f"a{k}", [f"u{k}", f"w_delta{k}"]), summing_junction(f"e{k}", [f"g{k}", f"w{k}"]),
-                  summing_junction(f"y{k}", [f"-e{k}"])]
-    return connect(parts, ["w_delta1", "w_delta2", "w1", "w2", "u1", "u2"],
-                   ["z_delta1", "z_delta2", "z1", "z2", "y1", "y2"])
+        parts += [
+            tf([1.0, 0.2], [0.5, 1.0], [f"u{k}"], [f"z_delta{k}"]),
+            tf([0.5, 0.05], [1.0, 1e-6], [f"e{k}"], [f"z{k}"]),
+            summing_junction(f"a{k}", [f"u{k}", f"w_delta{k}"]),
+            summing_junction(f"e{k}", [f"g{k}", f"w{k}"]),
+            summing_junction(f"y{k}", [f"-e{k}"]),
+        ]
+    return connect(
+        parts, ["w_delta1", "w_delta2", "w1", "w2", "u1", "u2"], ["z_delta1", "z_delta2", "z1", "z2", "y1", "y2"]
+    )
 
 
 def flexible(rng, n_w, n_z, modes=6, damping=1e-3):
@@ -74,7 +90,7 @@ def flexible(rng, n_w, n_z, modes=6, damping=1e-3):
     A = np.zeros((2 * modes, 2 * modes))
     B, C_ = np.zeros((2 * modes, n_w)), np.zeros((n_z, 2 * modes))
     for k, w in enumerate(omega):
-        A[2 * k:2 * k + 2, 2 * k:2 * k + 2] = [[0, w], [-w, -2 * damping * w]]
+        A[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = [[0, w], [-w, -2 * damping * w]]
         B[2 * k + 1] = rng.standard_normal(n_w) * np.sqrt(w * damping)
         C_[:, 2 * k] = rng.standard_normal(n_z) * np.sqrt(w * damping)
     return StateSpace(A, B, C_, 0.1 * rng.standard_normal((n_z, n_w)))
@@ -86,6 +102,7 @@ def singular_at(N, found):
 
 
 # -- printed values -----------------------------------------------------------------------------------------
+
 
 def test_spinning_satellite_real_repeated_is_one_at_one_frequency():
     """Skogestad and Postlethwaite (1996), example 8.10: mu is 1 at one frequency, 0 at all others.
@@ -141,17 +158,22 @@ def test_distillation_worst_case_gain():
     assert skewed.upper == pytest.approx(1.0, rel=2e-3)
 
 
-@pytest.mark.parametrize("num, den, printed", [
-    ([1.0], [1.0], 1.1798),
-    (2 * np.poly([-1000, -0.25, -0.054]) / 1000, np.polymul([1, 1.34, 0.67 ** 2 + 0.56 ** 2], [1, 0.013]), 0.9740)])
+@pytest.mark.parametrize(
+    "num, den, printed",
+    [
+        ([1.0], [1.0], 1.1798),
+        (2 * np.poly([-1000, -0.25, -0.054]) / 1000, np.polymul([1, 1.34, 0.67**2 + 0.56**2], [1, 0.013]), 0.9740),
+    ],
+)
 def test_distillation_under_the_controllers_of_the_book(num, den, printed):
     """H-infinity optimal for D = I (first D-K step) and for Lundstroem's D: peak mu 1.1798 and 0.9740 in Skogestad and
     Postlethwaite's own Sec8_124.m (section 8.12.4; off a grid of 61 points, searches to 0.1 %)."""
     P, d, inverse, one = distillation_plant(), tf(num, den), tf(den, num), tf([1.0], [1.0])
     left = append(*(x.renamed([f"i{k}"], [f"o{k}"]) for k, x in enumerate([d, d, one, one, one, one])))
     right = append(*(x.renamed([f"i{k}"], [f"o{k}"]) for k, x in enumerate([inverse, inverse, one, one, one, one])))
-    K = hinfsyn(left.renamed(P.outputs, P.outputs) @ P @ right.renamed(P.inputs, P.inputs), 2, 2,
-                backoff=1e-4, tolerance=1e-4).K
+    K = hinfsyn(
+        left.renamed(P.outputs, P.outputs) @ P @ right.renamed(P.inputs, P.inputs), 2, 2, backoff=1e-4, tolerance=1e-4
+    ).K
     found = mu_peak(lft_lower(P, K), [C(), C(), F(2)])
     assert found.guaranteed and found.lower == pytest.approx(printed, rel=1e-3)
     assert found.upper == pytest.approx(printed, rel=2e-3)
@@ -163,11 +185,15 @@ def test_two_carts_with_uncertain_masses_and_spring():
     2.8803 to 2.8834 in different releases), at 575.0339 rad/s, with k = 1.5773 and m1 = m2 = 0.4227."""
     s = 0.2
     # m1 x1'' = u - f - w1, m2 x2'' = f - w2, f = x1 - x2 + w_k; z = s (x1'', x2'', x1 - x2).
-    carts = StateSpace([[0, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0, 1], [1, 0, -1, 0]],
-                       [[0, 0, 0, 0], [-1, 0, -1, 1], [0, 0, 0, 0], [0, -1, 1, 0]],
-                       [[-s, 0, s, 0], [s, 0, -s, 0], [s, 0, -s, 0], [0, 0, 1, 0]],
-                       [[-s, 0, -s, s], [0, -s, s, 0], [0, 0, 0, 0], [0, 0, 0, 0]], 0.0,
-                       ["w1", "w2", "w_k", "u"], ["z1", "z2", "z_k", "x2"])
+    carts = StateSpace(
+        [[0, 1, 0, 0], [-1, 0, 1, 0], [0, 0, 0, 1], [1, 0, -1, 0]],
+        [[0, 0, 0, 0], [-1, 0, -1, 1], [0, 0, 0, 0], [0, -1, 1, 0]],
+        [[-s, 0, s, 0], [s, 0, -s, 0], [s, 0, -s, 0], [0, 0, 1, 0]],
+        [[-s, 0, -s, s], [0, -s, s, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+        0.0,
+        ["w1", "w2", "w_k", "u"],
+        ["z1", "z2", "z_k", "x2"],
+    )
     controller = tf(-100 * np.poly([-1, -1, -1]), np.poly([-1000, -1000, -1000]) / 1e9, ["x2"], ["u"])
     found = mu_peak(connect([carts, controller], ["w1", "w2", "w_k"], ["z1", "z2", "z_k"]), [R(), R(), R()])
     assert 1 / found.lower == pytest.approx(2.8864, abs=5e-5) and found.omega == pytest.approx(575.0339, abs=5e-5)
@@ -185,6 +211,7 @@ def test_mass_spring_damper_with_uncertain_damping():
 
 # -- exact values -------------------------------------------------------------------------------------------
 
+
 def test_full_block_is_the_hinf_norm(rng):
     N = flexible(rng, 2, 3)
     found = mu_peak(N, [F(2, 3)])
@@ -195,7 +222,7 @@ def test_full_block_is_the_hinf_norm(rng):
 
 def test_narrow_resonance_between_grid_points():
     """A mode of damping 1e-7 (half-width 1e-7 of its frequency) beside a broad one."""
-    narrow, broad = tf([1e-6, 0], [1, 2e-7 * 3.7, 3.7 ** 2]), tf([1], [1, 1])
+    narrow, broad = tf([1e-6, 0], [1, 2e-7 * 3.7, 3.7**2]), tf([1], [1, 1])
     N = append(narrow.renamed(["a"], ["b"]), broad.renamed(["c"], ["d"]))
     found = mu_peak(N, [C(), C()])
     assert found.guaranteed
@@ -237,8 +264,7 @@ def test_blocks_without_a_loop_change_nothing(rng, dead):
         left[4, 4], left[4, 0] = 0.0, 1.0
     whole = inside.scaled(left=left, right=right).select([0, 4, 1, 2, 3], [0, 4, 1, 2, 3])
     assert whole.nstates == N.nstates + 1
-    for function, blocks, small in ((mu_peak, [R(), C(), F(3)], [R(), F(3)]),
-                                    (worst_case_gain, [R(), C()], [R()])):
+    for function, blocks, small in ((mu_peak, [R(), C(), F(3)], [R(), F(3)]), (worst_case_gain, [R(), C()], [R()])):
         found, expected = function(whole, blocks), function(N, small)
         assert found.guaranteed and found.upper == pytest.approx(expected.upper, rel=1e-3)
         assert found.lower == pytest.approx(expected.lower, rel=1e-3)
@@ -258,8 +284,9 @@ def test_flat_peak_of_a_passive_oscillator():
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-M_inv @ L.T @ np.diag(k) @ L, -M_inv @ L.T @ np.diag(c) @ L]])
     # m x'' + L^T w_c + L^T w_k + w_m + .. = 0 with w = delta z, z_m = 0.3 m x'', z_c = 0.3 c L x', z_k = 0.3 k L x.
     B = np.vstack([np.zeros((2, 6)), -M_inv @ np.hstack([np.eye(2), L.T, L.T])])
-    C_ = share * np.vstack([mass @ A[2:], np.hstack([np.zeros((2, 2)), np.diag(c) @ L]),
-                            np.hstack([np.diag(k) @ L, np.zeros((2, 2))])])
+    C_ = share * np.vstack(
+        [mass @ A[2:], np.hstack([np.zeros((2, 2)), np.diag(c) @ L]), np.hstack([np.diag(k) @ L, np.zeros((2, 2))])]
+    )
     D = share * np.vstack([mass @ B[2:], np.zeros((4, 6))])
     found = mu_peak(StateSpace(A, B, C_, D), [R()] * 6, slack=5e-3)
     assert found.guaranteed and found.lower == pytest.approx(share, rel=1e-5)
@@ -271,9 +298,17 @@ def test_a_proof_that_takes_too_long_is_given_up_and_says_so(rng):
     N = flexible(rng, 3, 3, modes=10)
     structure = BlockStructure.of([R(), R(), R()])
     bound = mu_upper(N.frequency_response(np.abs(N.poles())), structure).upper
-    done = cover(N, structure, lambda system, level: system.scaled(left=1 / level),
-                 lambda M: upper_bound(M, structure, 1e-4).beta, 0.5 * float(np.max(bound)), (0.0, np.inf),
-                 np.abs(N.poles()), slack=5e-4, rounds=2)
+    done = cover(
+        N,
+        structure,
+        lambda system, level: system.scaled(left=1 / level),
+        lambda M: upper_bound(M, structure, 1e-4).beta,
+        0.5 * float(np.max(bound)),
+        (0.0, np.inf),
+        np.abs(N.poles()),
+        slack=5e-4,
+        rounds=2,
+    )
     assert done.gaps and all(low < high for low, high in done.gaps)
     found = mu_peak(N, structure)
     assert found.guaranteed and found.lower <= found.upper
@@ -289,6 +324,7 @@ def test_larger_slack_stays_above(rng):
 
 
 # -- the guarantee, bands, clocks ---------------------------------------------------------------------------
+
 
 def test_upper_bound_holds_between_the_points(rng):
     blocks = [R(), C(), C(2), F(2)]
@@ -326,6 +362,7 @@ def test_static_and_zero_systems():
 
 
 # -- worst-case gain and simulation -------------------------------------------------------------------------
+
 
 def test_worst_case_gain_is_what_the_perturbed_system_has(rng):
     blocks = [R(2), C(2), C(), F(2, 1)]
@@ -386,6 +423,7 @@ def test_realised_scalar_is_all_pass(value):
 
 # -- input --------------------------------------------------------------------------------------------------
 
+
 def test_unstable_system_names_its_pole():
     with pytest.raises(ComputationError, match=r"pole 0\.25"):
         mu_peak(tf([1], [1, -0.25]), [C()])
@@ -410,8 +448,10 @@ def test_wrong_input_is_named():
 @pytest.mark.parametrize("band_Hz", [(0.2, 2.0), (2.0, 4.9), (0.9, 1.1)])
 def test_a_band_of_a_sampled_system_is_in_its_own_frequencies(band_Hz):
     """Two resonances, 1 and 3 Hz at 10 Hz: the frequency axis is bent by 30 % at 3 Hz. Against a dense grid."""
-    modes = [tf([0.1 * w], [1.0, 0.02 * w, w * w], [f"u{k}"], [f"y{k}"])
-             for k, w in enumerate(2 * np.pi * np.array([1.0, 3.0]))]
+    modes = [
+        tf([0.1 * w], [1.0, 0.02 * w, w * w], [f"u{k}"], [f"y{k}"])
+        for k, w in enumerate(2 * np.pi * np.array([1.0, 3.0]))
+    ]
     N = discretise(append(*modes), 0.1, "tustin").scaled(left=np.array([[1.0, 0.5], [0.3, 2.0]]))
     low, high = (2 * np.pi * f for f in band_Hz)
     found = mu_peak(N, [F(2)], band=(low, high))
@@ -424,8 +464,12 @@ def test_a_band_of_a_sampled_system_is_in_its_own_frequencies(band_Hz):
 
 def test_a_known_robust_stability_changes_no_bound(rng):
     """With and without it, in a band and at all frequencies; a perturbation that destabilises is returned."""
-    N = StateSpace(-np.eye(6) + 0.3 * rng.standard_normal((6, 6)), 0.4 * rng.standard_normal((6, 4)),
-                   0.4 * rng.standard_normal((4, 6)), np.zeros((4, 4)))
+    N = StateSpace(
+        -np.eye(6) + 0.3 * rng.standard_normal((6, 6)),
+        0.4 * rng.standard_normal((6, 4)),
+        0.4 * rng.standard_normal((4, 6)),
+        np.zeros((4, 4)),
+    )
     blocks, inner = [R(), C()], N.select(range(2), range(2))
     robust = mu_peak(inner, blocks)
     assert robust.upper < 1
@@ -491,8 +535,14 @@ def test_a_hidden_mode_at_the_limit_of_stability_is_an_error():
     """Two masses and a spring, angles as states, the speed fed back: the common angle has a pole at zero, which
     eigenvalue computation moves to about -1e-13."""
     k, c, J = 800.0, 0.05, (0.02, 0.05)
-    A = np.array([[0, 1, 0, 0], [-k / J[0], -c / J[0], k / J[0], c / J[0]],
-                  [0, 0, 0, 1], [k / J[1], c / J[1], -k / J[1], -c / J[1]]])
+    A = np.array(
+        [
+            [0, 1, 0, 0],
+            [-k / J[0], -c / J[0], k / J[0], c / J[0]],
+            [0, 0, 0, 1],
+            [k / J[1], c / J[1], -k / J[1], -c / J[1]],
+        ]
+    )
     A[1, 1] -= 0.8 / J[0]
     for shift in (0.0, 1e-15):
         loop = StateSpace(A - shift * np.eye(4), [[0], [1 / J[0]], [0], [0]], [[0, 1, 0, 0]], [[0.0]])

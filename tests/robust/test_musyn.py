@@ -36,17 +36,27 @@ def distillation() -> StateSpace:
     G = 1/(75 s + 1) [87.8 -86.4; 108.2 -109.6], input uncertainty w_I = 0.2 (5 s + 1)/(0.5 s + 1) in each channel,
     performance w_P = (s/2 + 0.05)/s on the sensitivity, its integrator at 1e-6 rad/s.
     """
-    G = StateSpace(-np.eye(2) / 75, np.eye(2), np.array([[87.8, -86.4], [108.2, -109.6]]) / 75, np.zeros((2, 2)), 0.0,
-                   ("a1", "a2"), ("g1", "g2"))
+    G = StateSpace(
+        -np.eye(2) / 75,
+        np.eye(2),
+        np.array([[87.8, -86.4], [108.2, -109.6]]) / 75,
+        np.zeros((2, 2)),
+        0.0,
+        ("a1", "a2"),
+        ("g1", "g2"),
+    )
     parts = {"G": G}
     for k in ("1", "2"):
-        parts |= {f"W_I{k}": tf([1.0, 0.2], [0.5, 1.0], [f"u{k}"], [f"z_delta{k}"]),
-                  f"W_P{k}": tf([0.5, 0.05], [1.0, 1e-6], [f"e{k}"], [f"z{k}"]),
-                  f"input{k}": summing_junction(f"a{k}", [f"u{k}", f"w_delta{k}"]),
-                  f"error{k}": summing_junction(f"e{k}", [f"g{k}", f"w{k}"]),
-                  f"sensor{k}": summing_junction(f"y{k}", [f"-e{k}"])}
-    return connect(parts, ["w_delta1", "w_delta2", "w1", "w2", "u1", "u2"],
-                   ["z_delta1", "z_delta2", "z1", "z2", "y1", "y2"])
+        parts |= {
+            f"W_I{k}": tf([1.0, 0.2], [0.5, 1.0], [f"u{k}"], [f"z_delta{k}"]),
+            f"W_P{k}": tf([0.5, 0.05], [1.0, 1e-6], [f"e{k}"], [f"z{k}"]),
+            f"input{k}": summing_junction(f"a{k}", [f"u{k}", f"w_delta{k}"]),
+            f"error{k}": summing_junction(f"e{k}", [f"g{k}", f"w{k}"]),
+            f"sensor{k}": summing_junction(f"y{k}", [f"-e{k}"]),
+        }
+    return connect(
+        parts, ["w_delta1", "w_delta2", "w1", "w2", "u1", "u2"], ["z_delta1", "z_delta2", "z1", "z2", "y1", "y2"]
+    )
 
 
 DISTILLATION_BLOCKS = [ComplexFull(1, 1), ComplexFull(1, 1)]
@@ -62,12 +72,18 @@ def table(kind=RealScalar) -> tuple[StateSpace, list]:
     # states: payload velocity v, spring deflection d = f - x; v' = (k d + w_k + c (f' - v) + force) / m
     A = np.array([[-c / m, k / m], [-1.0, 0.0]])
     B = np.array([[1 / m, c / m, 1 / m], [0.0, 1.0, 0.0]])
-    rig = StateSpace(A, B, np.array([[0.0, 0.3 * k], [1.0, 0.0]]), np.zeros((2, 3)), 0.0,
-                     ("w_k", "floor", "force"), ("z_k", "v"))
-    parts = {"rig": rig, "chain": tf([1 / 200, 0.1], [1 / 2000, 1.0], ["u"], ["z_a"]),
-             "force": summing_junction("force", ["u", "w_a"]), "bound": tf([2.0, 3.0], [1.0, 6.0], ["v"], ["z1"]),
-             "effort": tf([0.02, 0.1], [1 / 500, 1.0], ["u"], ["z2"]), "noise": tf([0.01], [1.0], ["w2"], ["n"]),
-             "sensor": summing_junction("y", ["v", "n"])}
+    rig = StateSpace(
+        A, B, np.array([[0.0, 0.3 * k], [1.0, 0.0]]), np.zeros((2, 3)), 0.0, ("w_k", "floor", "force"), ("z_k", "v")
+    )
+    parts = {
+        "rig": rig,
+        "chain": tf([1 / 200, 0.1], [1 / 2000, 1.0], ["u"], ["z_a"]),
+        "force": summing_junction("force", ["u", "w_a"]),
+        "bound": tf([2.0, 3.0], [1.0, 6.0], ["v"], ["z1"]),
+        "effort": tf([0.02, 0.1], [1 / 500, 1.0], ["u"], ["z2"]),
+        "noise": tf([0.01], [1.0], ["w2"], ["n"]),
+        "sensor": summing_junction("y", ["v", "n"]),
+    }
     P = connect(parts, ["w_k", "w_a", "floor", "w2", "u"], ["z_k", "z_a", "z1", "z2", "y"])
     return P, [kind(1), ComplexFull(1, 1)]
 
@@ -278,6 +294,7 @@ def test_nominal_controller_is_where_large_uncertainty_forbids_the_first_one(lon
 
     def judged(K):
         return max(mu_upper_slicot(M, structure) for M in lft_lower(P, K).frequency_response(omega))
+
     assert long_run.history[1].mu_upper == pytest.approx(judged(nominal), rel=0.01)
     assert long_run.history[0].mu_upper == pytest.approx(judged(hinfsyn(P, 1, 1).K), rel=0.02)
     assert judged(nominal) < 0.3 * judged(hinfsyn(P, 1, 1).K)
@@ -354,18 +371,18 @@ def test_the_grid_of_a_loop_sees_its_resonance_and_halves_around_peaks():
     """1/(s^2 + 2 zeta s + 1) peaks at sqrt(1 - 2 zeta^2); half a bandwidth to either side it is 3 dB lower."""
     zeta = 0.01
     omega = frequency_grid(StateSpace([[0.0, 1.0], [-1.0, -2 * zeta]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]]))
-    size = 1 / np.abs(1 - omega ** 2 + 2j * zeta * omega)
-    assert np.max(size) == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta ** 2)), rel=1e-6)
+    size = 1 / np.abs(1 - omega**2 + 2j * zeta * omega)
+    assert np.max(size) == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta**2)), rel=1e-6)
     assert np.sum((size > 0.69 * np.max(size)) & (size < 0.73 * np.max(size))) == 2
     assert size[0] == pytest.approx(1.0, rel=0.01) and size[-1] < 1e-2 * np.max(size)
     coarse, mu = np.geomspace(2.0, 200.0, 9), np.array([9.0, 2.0, 3.0, 3.0, 1.0, 4.0, 1.0, 2.0, 0.5])
     finer = refined_grid(coarse, mu, peaks=3)
     # The end is none, of a plateau both ends are, and the lowest of the four stays.
-    between = coarse[[1, 2, 3, 4, 5]] * 10 ** 0.125
+    between = coarse[[1, 2, 3, 4, 5]] * 10**0.125
     assert np.allclose(np.setdiff1d(finer, coarse), between)
     for points, room in ((MAX_POINTS - 2, True), (MAX_POINTS - 1, False)):
         many = np.geomspace(1.0, 1e4, points)
-        assert refined_grid(many, np.exp(-np.log(many / many[40]) ** 2)).size == points + 2 * room
+        assert refined_grid(many, np.exp(-(np.log(many / many[40]) ** 2))).size == points + 2 * room
 
 
 def test_gamma_reported_is_measured(distilled):
@@ -374,11 +391,22 @@ def test_gamma_reported_is_measured(distilled):
     assert hinf_norm(scaled).gain == pytest.approx(result.gamma, rel=1e-5)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"blocks": [ComplexFull(3, 3), ComplexFull(1, 1)]}, "performance"), ({"blocks": ["delta"]}, "blocks"),
-    ({"nmeas": 0}, "nmeas"), ({"ncon": 9}, "ncon"), ({"target": -1.0}, "target"),
-    ({"starts": ["K"]}, "starts"), ({"starts": [np.ones((2, 1))]}, "starts"), ({"max_iterations": 0}, "max_iterations"),
-    ({"backoff": -0.1}, "backoff"), ({"state": {"format": "x"}}, "state"), ({"P": "plant"}, "P")])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"blocks": [ComplexFull(3, 3), ComplexFull(1, 1)]}, "performance"),
+        ({"blocks": ["delta"]}, "blocks"),
+        ({"nmeas": 0}, "nmeas"),
+        ({"ncon": 9}, "ncon"),
+        ({"target": -1.0}, "target"),
+        ({"starts": ["K"]}, "starts"),
+        ({"starts": [np.ones((2, 1))]}, "starts"),
+        ({"max_iterations": 0}, "max_iterations"),
+        ({"backoff": -0.1}, "backoff"),
+        ({"state": {"format": "x"}}, "state"),
+        ({"P": "plant"}, "P"),
+    ],
+)
 def test_bad_input_is_named(change, message):
     P, blocks = table()
     good = {"P": P, "blocks": blocks, "nmeas": 1, "ncon": 1}
@@ -423,12 +451,24 @@ def test_mode_out_of_reach_is_named():
 def barely_known_table(spread: float) -> StateSpace:
     """One axis of a table whose drive is uncertain by far more than 100 %: floor w1 -> velocity z1, effort z2."""
     m, k, c = 1.0, (2 * np.pi * 3) ** 2, 1.0
-    rig = StateSpace(np.array([[-c / m, k / m], [-1.0, 0.0]]), np.array([[c / m, 1 / m], [1.0, 0.0]]),
-                     np.array([[1.0, 0.0]]), np.zeros((1, 2)), 0.0, ("w1", "force"), ("v",))
-    parts = {"rig": rig, "chain": gain([[spread]], ["u"], ["z_delta"]),
-             "force": summing_junction("force", ["u", "w_delta"]), "bound": gain([[1.0]], ["v"], ["z1"]),
-             "effort": gain([[0.001]], ["u"], ["z2"]), "noise": gain([[0.01]], ["w2"], ["n"]),
-             "sensor": summing_junction("y", ["v", "n"])}
+    rig = StateSpace(
+        np.array([[-c / m, k / m], [-1.0, 0.0]]),
+        np.array([[c / m, 1 / m], [1.0, 0.0]]),
+        np.array([[1.0, 0.0]]),
+        np.zeros((1, 2)),
+        0.0,
+        ("w1", "force"),
+        ("v",),
+    )
+    parts = {
+        "rig": rig,
+        "chain": gain([[spread]], ["u"], ["z_delta"]),
+        "force": summing_junction("force", ["u", "w_delta"]),
+        "bound": gain([[1.0]], ["v"], ["z1"]),
+        "effort": gain([[0.001]], ["u"], ["z2"]),
+        "noise": gain([[0.01]], ["w2"], ["n"]),
+        "sensor": summing_junction("y", ["v", "n"]),
+    }
     return connect(parts, ["w_delta", "w1", "w2", "u"], ["z_delta", "z1", "z2", "y"])
 
 

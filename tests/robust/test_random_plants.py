@@ -53,14 +53,17 @@ def test_zero_is_said():
     found = hinfsyn(P, 1, 1)
     assert found.status is Status.OPTIMAL and found.gamma < 1e-6
     assert any("zero to working precision" in note for note in found.notes)
-    assert not any("zero to working" in note for note in hinfsyn(
-        StateSpace([[1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]), 1, 1).notes)
+    assert not any(
+        "zero to working" in note
+        for note in hinfsyn(StateSpace([[1.0]], [[1.0, 1.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]), 1, 1).notes
+    )
 
 
 def test_a_small_optimum_that_is_proved_is_not_called_zero():
     """A measured disturbance that u cancels, beside a direct term of 1e-7 that nothing changes."""
-    P = StateSpace([[-1.0]], [[1.0, 0.0, 0.0]], [[1.0], [0.0], [0.0]],
-                   [[0.0, 0.0, 1.0], [0.0, 1e-7, 0.0], [1.0, 0.0, 0.0]])
+    P = StateSpace(
+        [[-1.0]], [[1.0, 0.0, 0.0]], [[1.0], [0.0], [0.0]], [[0.0, 0.0, 1.0], [0.0, 1e-7, 0.0], [1.0, 0.0, 0.0]]
+    )
     found = hinfsyn(P, 1, 1)
     assert found.status is Status.OPTIMAL and found.gamma_optimal_bounds == pytest.approx((1e-7, 1e-7))
     assert not any("zero to working" in note for note in found.notes)

@@ -23,14 +23,30 @@ from avis_ctrl.robust.reduction import (
 def process():
     """S/KS problem of Skogestad and Postlethwaite's disturbance process (example 2.17)."""
     G = tf([200], np.polymul([10, 1], np.polymul([0.05, 1], [0.05, 1])), ["u"], ["g"])
-    return connect([G, summing_junction("e", ["r", "-g"]), tf([1 / 1.5, 10], [1, 1e-3], ["e"], ["wp"]),
-                    gain([[1.0]], ["u"], ["wu"]), gain([[1.0]], ["e"], ["y"])], ["r", "u"], ["wp", "wu", "y"])
+    return connect(
+        [
+            G,
+            summing_junction("e", ["r", "-g"]),
+            tf([1 / 1.5, 10], [1, 1e-3], ["e"], ["wp"]),
+            gain([[1.0]], ["u"], ["wu"]),
+            gain([[1.0]], ["e"], ["y"]),
+        ],
+        ["r", "u"],
+        ["wp", "wu", "y"],
+    )
 
 
 def padded(K, rng):
     """K with fast, nearly invisible modes added: what a D-K iteration leaves behind."""
-    extra = StateSpace(-np.diag(10.0 ** rng.uniform(1, 3, 4)), rng.standard_normal((4, 1)),
-                       1e-5 * rng.standard_normal((1, 4)), [[0.0]], 0.0, K.inputs, K.outputs)
+    extra = StateSpace(
+        -np.diag(10.0 ** rng.uniform(1, 3, 4)),
+        rng.standard_normal((4, 1)),
+        1e-5 * rng.standard_normal((1, 4)),
+        [[0.0]],
+        0.0,
+        K.inputs,
+        K.outputs,
+    )
     return K + extra
 
 
@@ -45,18 +61,22 @@ def test_invisible_states_go_and_the_figure_stays(process, rng):
 
 def test_own_measure_decides(process):
     K = hinfsyn(process, 1, 1).K
-    full = reduce_controller(process, K, measure=lambda candidate: 10.0 ** -candidate.nstates)
+    full = reduce_controller(process, K, measure=lambda candidate: 10.0**-candidate.nstates)
     assert full.order == K.nstates and full.K is K and full.growth == 0
     least = reduce_controller(process, K, measure=lambda candidate: 1.0)
     assert least.order < K.nstates and lft_lower(process, least.K).is_stable()
 
 
-@given(st.integers(0, 2 ** 31), st.integers(0, 7))
+@given(st.integers(0, 2**31), st.integers(0, 7))
 @settings(max_examples=30, deadline=None)
 def test_split_adds_up(seed, n):
     rng = np.random.default_rng(seed)
-    K = StateSpace(rng.standard_normal((n, n)), rng.standard_normal((n, 2)), rng.standard_normal((1, n)),
-                   rng.standard_normal((1, 2)))
+    K = StateSpace(
+        rng.standard_normal((n, n)),
+        rng.standard_normal((n, 2)),
+        rng.standard_normal((1, n)),
+        rng.standard_normal((1, 2)),
+    )
     stable, unstable = split_stable(K)
     assert stable.is_stable() and np.all(unstable.poles().real >= 0)
     np.testing.assert_allclose((stable + unstable)(1.3j), K(1.3j), rtol=1e-6, atol=1e-8)
@@ -65,8 +85,16 @@ def test_split_adds_up(seed, n):
 def test_unstable_part_of_the_controller_is_kept():
     """A plant that only an unstable controller stabilises: a zero between two unstable poles breaks the parity
     interlacing condition (Youla, Bongiorno and Lu 1974)."""
-    P = connect([tf([1, -2], np.polymul([1, -4], [1, 1]), ["u"], ["g"]), summing_junction("y", ["r", "-g"]),
-                 gain([[1.0]], ["y"], ["z1"]), gain([[1.0]], ["u"], ["z2"])], ["r", "u"], ["z1", "z2", "y"])
+    P = connect(
+        [
+            tf([1, -2], np.polymul([1, -4], [1, 1]), ["u"], ["g"]),
+            summing_junction("y", ["r", "-g"]),
+            gain([[1.0]], ["y"], ["z1"]),
+            gain([[1.0]], ["u"], ["z2"]),
+        ],
+        ["r", "u"],
+        ["z1", "z2", "y"],
+    )
     K = hinfsyn(P, 1, 1).K
     assert not K.is_stable()
     reduced = reduce_controller(P, K, growth=0.2)
@@ -113,8 +141,9 @@ def test_lags_keep_the_phase_lead_of_fast_poles():
 def test_lags_of_several_channels_and_a_controller_without_fast_poles(rng):
     slow = StateSpace(np.diag([-1.0, -3.0]), rng.standard_normal((2, 2)), rng.standard_normal((3, 2)), np.zeros((3, 2)))
     assert replace_fast_by_lags(slow, 100.0) is slow
-    fast = StateSpace(np.diag([-300.0, -900.0]), rng.standard_normal((2, 2)), rng.standard_normal((3, 2)),
-                      np.zeros((3, 2)))
+    fast = StateSpace(
+        np.diag([-300.0, -900.0]), rng.standard_normal((2, 2)), rng.standard_normal((3, 2)), np.zeros((3, 2))
+    )
     made = replace_fast_by_lags(slow + fast, 100.0)
     assert made.nstates == 2 + 3 * 2
     assert made.dcgain() == pytest.approx((slow + fast).dcgain(), rel=1e-12)

@@ -54,19 +54,22 @@ def test_an_lft_with_blocks_is_the_same_as_the_system():
     assert worst_case_gain(P, blocks).upper == worst_case_gain(oscillator()).upper
 
 
-@pytest.mark.parametrize("call, words", [
-    (lambda: robust_stability(tf([1.0], [1.0, 1.0])), "with its blocks"),
-    (lambda: robust_stability(oscillator(), [RealScalar(1)]), "expected no blocks"),
-    (lambda: robust_stability(tf([1.0], [1.0, 1.0]), []), "something uncertain"),
-    (lambda: robust_stability(tf([1.0], [1.0, 1.0]), [RealScalar(3)]), "the blocks need"),
-    (lambda: robust_performance(tf([1.0], [1.0, 1.0]), [RealScalar(1)]), "inputs d and outputs e"),
-    (lambda: mixed_sensitivity(PLANT), "at least one weight"),
-    (lambda: mixed_sensitivity(PLANT, np.ones((1, 2))), "expected 1 or 1 inputs"),
-    (lambda: uncertainty_weight(PLANT, []), "expected responses"),
-    (lambda: uncertainty_weight(PLANT, [PLANT]), "differ from a nominal one"),
-    (lambda: uncertainty_weight(PLANT, [np.ones((2, 2))]), "responses of shape"),
-    (lambda: uncertainty_weight(ROW, [2 * TWO_INPUTS], kind="output"), "additive or input"),
-])
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda: robust_stability(tf([1.0], [1.0, 1.0])), "with its blocks"),
+        (lambda: robust_stability(oscillator(), [RealScalar(1)]), "expected no blocks"),
+        (lambda: robust_stability(tf([1.0], [1.0, 1.0]), []), "something uncertain"),
+        (lambda: robust_stability(tf([1.0], [1.0, 1.0]), [RealScalar(3)]), "the blocks need"),
+        (lambda: robust_performance(tf([1.0], [1.0, 1.0]), [RealScalar(1)]), "inputs d and outputs e"),
+        (lambda: mixed_sensitivity(PLANT), "at least one weight"),
+        (lambda: mixed_sensitivity(PLANT, np.ones((1, 2))), "expected 1 or 1 inputs"),
+        (lambda: uncertainty_weight(PLANT, []), "expected responses"),
+        (lambda: uncertainty_weight(PLANT, [PLANT]), "differ from a nominal one"),
+        (lambda: uncertainty_weight(PLANT, [np.ones((2, 2))]), "responses of shape"),
+        (lambda: uncertainty_weight(ROW, [2 * TWO_INPUTS], kind="output"), "additive or input"),
+    ],
+)
 def test_wrong_input_is_one_line(call, words):
     with pytest.raises(InputError, match=words) as caught:
         call()
@@ -127,8 +130,10 @@ def test_a_weight_from_measured_responses_goes_into_dynamics():
     loop = (nominal * (1 + dynamics("model", W))).feedback(2.0)
     assert robust_stability(loop).robust is True
     # Every member is G (1 + W Delta) with |Delta| <= 1.
-    Delta = [(np.squeeze(one(1j * omega)) / nominal.frequency_response(omega)[:, 0, 0] - 1) / W.shape(1j * omega)
-             for one in family()]
+    Delta = [
+        (np.squeeze(one(1j * omega)) / nominal.frequency_response(omega)[:, 0, 0] - 1) / W.shape(1j * omega)
+        for one in family()
+    ]
     assert np.max(np.abs(Delta)) <= 1 + 1e-9
 
 

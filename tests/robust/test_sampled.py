@@ -25,8 +25,9 @@ DT = 1e-3
 
 
 def delayed(samples: int) -> StateSpace:
-    return StateSpace(np.eye(samples, k=1), np.eye(samples)[:, -1:], np.eye(samples)[:1], np.zeros((1, 1)), DT,
-                      ["u"], ["drive"])
+    return StateSpace(
+        np.eye(samples, k=1), np.eye(samples)[:, -1:], np.eye(samples)[:1], np.zeros((1, 1)), DT, ["u"], ["drive"]
+    )
 
 
 def sampled_table(samples: int = 2) -> tuple[StateSpace, list]:
@@ -40,8 +41,14 @@ def sampled_table(samples: int = 2) -> tuple[StateSpace, list]:
 
 def random_plant(rng, n=6):
     """Poles up to radius 1.1, a negative real one and one at zero; D12 and D21 of full rank, D11 and D22 not zero."""
-    A = la.block_diag(-0.7, 0.0, *[radius * np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
-                                   for radius, a in ((1.1, 0.3), (0.95, 2.8))])
+    A = la.block_diag(
+        -0.7,
+        0.0,
+        *[
+            radius * np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
+            for radius, a in ((1.1, 0.3), (0.95, 2.8))
+        ],
+    )
     T = la.qr(rng.standard_normal((n, n)))[0]
     D = 0.2 * rng.standard_normal((5, 5))
     D[1:3, 3:] += np.eye(2)
@@ -60,6 +67,7 @@ def test_optimum_is_that_of_sb10dd(seed):
     def sb10dd(gamma):
         A, B, C, D = slycot.sb10dd(6, 5, 5, 2, 2, gamma, P.A, P.B, P.C, P.D)[1:5]
         return StateSpace(A, B, C, D, P.dt)
+
     assert hinf_norm_slicot(closed(P, sb10dd(1.02 * upper))) < 1.02 * upper
     with pytest.raises(slycot.exceptions.SlycotError):
         sb10dd(0.98 * lower)
@@ -74,8 +82,9 @@ def test_all_states_driven_and_measured():
     z = x is then reached exactly from what was measured one sample ago: the optimum is the gain of the disturbance.
     """
     B1 = np.array([[1.0, 0.4], [0.0, 2.0]])
-    P = StateSpace([[0.0, 1.0], [0.0, 0.0]], np.hstack([B1, np.eye(2)]), np.vstack([np.eye(2)] * 2), np.zeros((4, 4)),
-                   0.1)
+    P = StateSpace(
+        [[0.0, 1.0], [0.0, 0.0]], np.hstack([B1, np.eye(2)]), np.vstack([np.eye(2)] * 2), np.zeros((4, 4)), 0.1
+    )
     found = hinfsyn(P, 2, 2)
     assert found.gamma_optimal_bounds[0] <= np.linalg.norm(B1, 2) * (1 + 1e-6)
     assert found.gamma_optimal_bounds[1] == pytest.approx(np.linalg.norm(B1, 2), rel=2e-3)

@@ -17,7 +17,7 @@ CONTROLLED = ("z", "phi_x")
 def velocity_feedback(rig, axis: str, factor: float) -> StateSpace:
     """-g v with a high-pass of 0.2 Hz and a low-pass of 150 Hz, g a multiple of critical; in edge units."""
     arm = rig.edge_m if axis.startswith("phi") else 1.0
-    g, low, high = factor * critical_gains(rig)[axis] / arm ** 2, 2 * np.pi * 0.2, 2 * np.pi * 150.0
+    g, low, high = factor * critical_gains(rig)[axis] / arm**2, 2 * np.pi * 0.2, 2 * np.pi * 150.0
     return tf([-g * high, 0.0], [1.0, low + high, low * high])
 
 
@@ -31,12 +31,15 @@ def make_loop():
         sensors = rig_bank(rig, 0.1)
         given = {"sensors": sensors, "floor": dict.fromkeys(("x", "y", "z"), floor), "amplifier_corner_Hz": 300.0}
         return SampledLoop(rig, K, CONTROLLED, loops, **(given | changes))
+
     return make
 
 
 @pytest.fixture(scope="session")
 def passive(make_loop):
     """The same rig with a controller that asks for nothing."""
+
     def make(name: str = "avis", **changes) -> SampledLoop:
         return make_loop(name, 0.0, **changes)
+
     return make

@@ -23,9 +23,16 @@ SILENT = {"ambient": {"velocity_rms_m_per_s": 0.0}, "sensors": {"noise": False, 
 
 
 def plan(*records, **changes) -> CampaignPlan:
-    return CampaignPlan.model_validate({"record": list(records), "duration_s": 20.0, "band_Hz": [1.0, 50.0],
-                                        "ambient": {"velocity_rms_m_per_s": 2e-6},
-                                        "multisine": {"low_crest": False}} | changes)
+    return CampaignPlan.model_validate(
+        {
+            "record": list(records),
+            "duration_s": 20.0,
+            "band_Hz": [1.0, 50.0],
+            "ambient": {"velocity_rms_m_per_s": 2e-6},
+            "multisine": {"low_crest": False},
+        }
+        | changes
+    )
 
 
 def continuous(rig, amplifier_Hz):
@@ -59,9 +66,12 @@ def continuous(rig, amplifier_Hz):
 def test_a_noise_free_record_is_the_exact_response_to_held_delayed_voltages(name, amplifier, kind):
     rig = load_rig(name)
     one = {"excitation": kind, "level_percent": 2.0}
-    records = {nonlinear: simulate_campaign(rig, plan(one, **SILENT, amplifier_corner_Hz=amplifier,
-                                                      truth={"nonlinear": nonlinear})).records[0]
-               for nonlinear in (False, True)}
+    records = {
+        nonlinear: simulate_campaign(
+            rig, plan(one, **SILENT, amplifier_corner_Hz=amplifier, truth={"nonlinear": nonlinear})
+        ).records[0]
+        for nonlinear in (False, True)
+    }
     *system, _ = signal.cont2discrete(continuous(rig, amplifier), 1e-3, "zoh")
     u = records[False].u
     delayed = np.vstack([np.zeros((1, u.shape[1])), u[:-1]])  # one sample: loop_delay_s of both rigs
@@ -77,9 +87,16 @@ def test_a_noise_free_record_is_the_exact_response_to_held_delayed_voltages(name
 @pytest.mark.parametrize("name", ["avis", "halcyonics"])
 def test_after_the_transient_periods_repeat_with_the_sampled_frequency_response(name):
     rig = load_rig(name)
-    campaign = simulate_campaign(rig, plan({"excitation": "multisine"}, **SILENT, duration_s=60.0,
-                                           multisine={"scheme": "orthogonal", "low_crest": False},
-                                           truth={"nonlinear": False}))
+    campaign = simulate_campaign(
+        rig,
+        plan(
+            {"excitation": "multisine"},
+            **SILENT,
+            duration_s=60.0,
+            multisine={"scheme": "orthogonal", "low_crest": False},
+            truth={"nonlinear": False},
+        ),
+    )
     assert len(campaign.records) == 8
     system = continuous(rig, None if name == "avis" else 300.0)
     Ad, Bd, Cd, Dd, _ = signal.cont2discrete(system, 1e-3, "zoh")
@@ -109,7 +126,7 @@ def ambient_density(rig, f):
     chain = 3125.0 * s * s / (s * s + 2 * g.compensated_damping * w * s + w * w)
     floor = shipped_spectrum("kamioka_quiet").scaled_to_rms(2e-6, 0.5, 60.0)
     density = floor.asd(f, "velocity") ** 2 * (f >= floor.low_Hz) * np.sinc(f / 1000.0) ** 4
-    white = 1e-3 ** 2 + (20.0 / 2 ** 14) ** 2 / 12
+    white = 1e-3**2 + (20.0 / 2**14) ** 2 / 12
     return np.sum(np.abs(chain * (H @ velocity)) ** 2, axis=2).T * density + 2e-3 * white
 
 
@@ -127,8 +144,9 @@ def test_the_ambient_level_of_a_rest_record_is_the_predicted_spectrum():
     for channel, psd in enumerate(np.pad(ambient_density(rig, fine), ((0, 0), (1, 0)))):
         mean, covariance = welch_moments(psd, segments)
         for lo, hi in pairwise(edges):
-            variance = sum((1 if d == 0 else 2) * covariance[lo:hi - d, d].sum()
-                           for d in range(min(REACH_LINES, hi - lo)))
+            variance = sum(
+                (1 if d == 0 else 2) * covariance[lo : hi - d, d].sum() for d in range(min(REACH_LINES, hi - lo))
+            )
             dof = 2 * mean[lo:hi].sum() ** 2 / variance
             ratio = estimate[lo:hi, channel].sum() / mean[lo:hi].sum()
             assert stats.chi2.ppf(tail, dof) / dof < ratio < stats.chi2.isf(tail, dof) / dof, (channel, lo)
@@ -137,9 +155,13 @@ def test_the_ambient_level_of_a_rest_record_is_the_predicted_spectrum():
 
 def test_a_seed_gives_one_campaign_and_its_records_differ():
     rig = load_rig("avis")
-    asked = plan({"excitation": "multisine", "records": 2}, {"excitation": "noise"},
-                 {"excitation": "rest", "records": 2}, {"excitation": "floor", "floor_rms_m_per_s": 1e-4},
-                 floor_sensor={"noise_rms_m_per_s": 1e-8})
+    asked = plan(
+        {"excitation": "multisine", "records": 2},
+        {"excitation": "noise"},
+        {"excitation": "rest", "records": 2},
+        {"excitation": "floor", "floor_rms_m_per_s": 1e-4},
+        floor_sensor={"noise_rms_m_per_s": 1e-8},
+    )
     first, again, other = (simulate_campaign(rig, asked, seed) for seed in (1, 1, 2))
     assert digest(first) == digest(again) != digest(other) and first.notes == again.notes
     assert [r.header.excitation for r in first.records] == ["multisine"] * 2 + ["noise"] + ["rest"] * 2 + ["floor"]
@@ -164,14 +186,16 @@ def test_records_start_after_whole_samples():
 
 def test_what_the_converter_reports():
     rig = load_rig("avis")
-    lsb = 20.0 / 2 ** 14
+    lsb = 20.0 / 2**14
     quiet = simulate_campaign(rig, plan({"excitation": "multisine"}, {"excitation": "noise"}), 3)
     for record in quiet.records:
         assert np.array_equal(record.y, np.round(record.y / lsb) * lsb) and np.abs(record.y).max() < 9.9
     assert not any("WARNING" in note for note in quiet.notes)
     largest = quiet.records[0].header.level_V / 0.5
-    loud, bare = (simulate_campaign(rig, plan({"excitation": "multisine", "level_V": 3 * largest},
-                                              sensors={"quantiser": on}), 3) for on in (True, False))
+    loud, bare = (
+        simulate_campaign(rig, plan({"excitation": "multisine", "level_V": 3 * largest}, sensors={"quantiser": on}), 3)
+        for on in (True, False)
+    )
     y, volts = loud.records[0].y, bare.records[0].y
     assert y.max() == 10.0 - lsb and y.min() == -10.0
     assert np.array_equal(y, np.clip(np.floor(volts / lsb + 0.5) * lsb, -10.0, 10.0 - lsb))
@@ -182,14 +206,20 @@ def test_what_the_converter_reports():
 
 def test_levels_are_those_asked_for():
     rig = load_rig("avis")
-    campaign = simulate_campaign(rig, plan({"excitation": "multisine", "level_percent": 10.0},
-                                           {"excitation": "multisine", "level_V": 0.123}, {"excitation": "rest"},
-                                           {"excitation": "floor", "floor_rms_m_per_s": 3e-4}))
+    campaign = simulate_campaign(
+        rig,
+        plan(
+            {"excitation": "multisine", "level_percent": 10.0},
+            {"excitation": "multisine", "level_V": 0.123},
+            {"excitation": "rest"},
+            {"excitation": "floor", "floor_rms_m_per_s": 3e-4},
+        ),
+    )
     a, b, rest, floor = campaign.records
-    assert np.allclose(np.sqrt(np.mean(b.u ** 2, axis=0)), 0.123) and b.header.level_V == pytest.approx(0.123)
-    assert np.allclose(np.sqrt(np.mean(a.u ** 2, axis=0)), a.header.level_V)
+    assert np.allclose(np.sqrt(np.mean(b.u**2, axis=0)), 0.123) and b.header.level_V == pytest.approx(0.123)
+    assert np.allclose(np.sqrt(np.mean(a.u**2, axis=0)), a.header.level_V)
     assert a.header.period_s == 10.0 and rest.header.period_s is None and rest.header.level_V == 0.0
-    shaken = np.sqrt(np.mean(floor.floor ** 2, axis=0))
+    shaken = np.sqrt(np.mean(floor.floor**2, axis=0))
     assert np.allclose(shaken, 3e-4, rtol=0.1)  # 2 x 980 degrees of freedom: 2.3 % standard deviation
     power = np.abs(np.fft.rfft(floor.floor, axis=0)) ** 2
     assert np.sum(power[1001:]) < 1e-3 * np.sum(power)
@@ -200,8 +230,10 @@ def test_levels_are_those_asked_for():
 
 def test_the_floor_sensor():
     rig = load_rig("avis")
-    exact, noisy, absent = (simulate_campaign(rig, plan({"excitation": "rest"}, floor_sensor=how)).records[0] for how in
-                            ({}, {"noise_rms_m_per_s": 1e-6}, {"recorded": False}))
+    exact, noisy, absent = (
+        simulate_campaign(rig, plan({"excitation": "rest"}, floor_sensor=how)).records[0]
+        for how in ({}, {"noise_rms_m_per_s": 1e-6}, {"recorded": False})
+    )
     assert absent.floor is None and absent.header.floor_names == ()
     assert exact.header.floor_names == ("vx", "vy", "vz") and np.array_equal(exact.y, absent.y)
     assert np.array_equal(exact.y, noisy.y)
@@ -210,28 +242,52 @@ def test_the_floor_sensor():
 
 def test_the_shipped_rigs_do_not_clip_by_default():
     for name in ("avis", "halcyonics_loaded"):
-        campaign = simulate_campaign(load_rig(name), plan({"excitation": "multisine"}, {"excitation": "noise"},
-                                                          {"excitation": "floor", "floor_rms_m_per_s": 2e-4},
-                                                          multisine={"low_crest": True}))
+        campaign = simulate_campaign(
+            load_rig(name),
+            plan(
+                {"excitation": "multisine"},
+                {"excitation": "noise"},
+                {"excitation": "floor", "floor_rms_m_per_s": 2e-4},
+                multisine={"low_crest": True},
+            ),
+        )
         assert not any("WARNING" in note for note in campaign.notes)
         for record in campaign.records[:2]:
             assert 2.0 < np.abs(record.y).max() < 10.0 and np.abs(record.u).max() <= 10.0
     assert any("levels chosen for a range of 10 V" in note for note in campaign.notes)
 
 
-@pytest.mark.parametrize(("name", "records", "changes", "expected"), [
-    ("avis", [{"excitation": "multisine", "level_V": 9.0}], {}, r"record\[1\].level_V = 9.0: expected at most"),
-    ("avis", [{"excitation": "rest"}, {"excitation": "noise", "level_V": 4.0}], {}, r"record\[2\].level_V = 4.0"),
-    ("avis", [{"excitation": "multisine", "duration_s": 19.0}], {}, r"record\[1\].duration_s = 19.0.*two periods"),
-    ("avis", [{"excitation": "multisine"}], {"band_Hz": [1.0, 500.0]}, r"record\[1\].band_Hz.*half the sample rate"),
-    ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"band_Hz": [1.0, 600.0]}, r"record\[1\].band_Hz"),
-    ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"band_Hz": [1.01, 1.02]}, r"record\[1\].band_Hz"),
-    ("avis", [{"excitation": "multisine"}], {"multisine": {"period_s": 1.00005}}, "period_s.*whole number"),
-    ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"duration_s": 1e-4}, r"record\[1\].duration_s"),
-    ("avis", [{"excitation": "rest", "records": 200}], {"duration_s": 600.0}, r"record\[1\].duration_s.*in all"),
-    ("avis", [{"excitation": "rest"}], {"duration_s": 36000.0}, r"record\[1\].duration_s"),
-    ("halcyonics", [{"excitation": "rest"}], {"ambient": {}}, "ambient.velocity_rms_m_per_s: missing"),
-])
+@pytest.mark.parametrize(
+    ("name", "records", "changes", "expected"),
+    [
+        ("avis", [{"excitation": "multisine", "level_V": 9.0}], {}, r"record\[1\].level_V = 9.0: expected at most"),
+        ("avis", [{"excitation": "rest"}, {"excitation": "noise", "level_V": 4.0}], {}, r"record\[2\].level_V = 4.0"),
+        ("avis", [{"excitation": "multisine", "duration_s": 19.0}], {}, r"record\[1\].duration_s = 19.0.*two periods"),
+        (
+            "avis",
+            [{"excitation": "multisine"}],
+            {"band_Hz": [1.0, 500.0]},
+            r"record\[1\].band_Hz.*half the sample rate",
+        ),
+        (
+            "avis",
+            [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}],
+            {"band_Hz": [1.0, 600.0]},
+            r"record\[1\].band_Hz",
+        ),
+        (
+            "avis",
+            [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}],
+            {"band_Hz": [1.01, 1.02]},
+            r"record\[1\].band_Hz",
+        ),
+        ("avis", [{"excitation": "multisine"}], {"multisine": {"period_s": 1.00005}}, "period_s.*whole number"),
+        ("avis", [{"excitation": "floor", "floor_rms_m_per_s": 1e-5}], {"duration_s": 1e-4}, r"record\[1\].duration_s"),
+        ("avis", [{"excitation": "rest", "records": 200}], {"duration_s": 600.0}, r"record\[1\].duration_s.*in all"),
+        ("avis", [{"excitation": "rest"}], {"duration_s": 36000.0}, r"record\[1\].duration_s"),
+        ("halcyonics", [{"excitation": "rest"}], {"ambient": {}}, "ambient.velocity_rms_m_per_s: missing"),
+    ],
+)
 def test_plans_that_a_rig_cannot_follow(name, records, changes, expected):
     with pytest.raises(InputError, match=expected) as caught:
         simulate_campaign(load_rig(name), plan(*records, **changes))

@@ -10,13 +10,18 @@ from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 from avis_ctrl.simulation.rehearsal import perturbed_truth, rehearse
 
-PLAN = {"duration_s": 5.0, "settle_s": 0.0, "ambient": {"velocity_rms_m_per_s": 2e-6},
-        "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
-        "record": [{"excitation": "noise", "level_V": 0.1}]}
+PLAN = {
+    "duration_s": 5.0,
+    "settle_s": 0.0,
+    "ambient": {"velocity_rms_m_per_s": 2e-6},
+    "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+    "record": [{"excitation": "noise", "level_V": 0.1}],
+}
 
 
-@pytest.mark.parametrize(("name", "stiff", "damped"), [("avis", 4 + 12, 12), ("halcyonics", 3 + 7, 5),
-                                                       ("halcyonics_loaded", 7, 5)])
+@pytest.mark.parametrize(
+    ("name", "stiff", "damped"), [("avis", 4 + 12, 12), ("halcyonics", 3 + 7, 5), ("halcyonics_loaded", 7, 5)]
+)
 def test_truths_spread_as_far_as_asked_and_no_farther(name, stiff, damped):
     rig = load_rig(name)
     known = {key: one.value for key, one in rig.parameters().items() if key != "k_s"}

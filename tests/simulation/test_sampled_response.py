@@ -42,9 +42,16 @@ def awkward(loop):
     return loop.with_plant("awkward", loop.rig.with_parameters(changes), drives, sensors)
 
 
-@pytest.mark.parametrize(("name", "delay_s", "corner_Hz"), [
-    ("avis", 1e-3, None), ("avis", 1.5e-3, 300.0), ("avis", 0.0, 300.0), ("halcyonics_loaded", 1e-3, 300.0),
-    ("halcyonics_loaded", 0.5e-3, 200.0)])
+@pytest.mark.parametrize(
+    ("name", "delay_s", "corner_Hz"),
+    [
+        ("avis", 1e-3, None),
+        ("avis", 1.5e-3, 300.0),
+        ("avis", 0.0, 300.0),
+        ("halcyonics_loaded", 1e-3, 300.0),
+        ("halcyonics_loaded", 0.5e-3, 200.0),
+    ],
+)
 def test_tones_through_the_nonlinear_loop_come_out_as_predicted(make_loop, name, delay_s, corner_Hz):
     loop = awkward(make_loop(name, 0.7, loop_delay_s=delay_s, amplifier_corner_Hz=corner_Hz))
     # What an endless sum of images adds beyond those that are folded in.

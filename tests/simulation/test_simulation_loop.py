@@ -72,11 +72,13 @@ def test_large_motion_converges_with_the_second_order(passive):
     """Half a step, a quarter of the error, against DOP853; with one step a millisecond already small."""
     loop = passive("avis").with_plant("skewed", load_rig("avis").with_parameters(SKEW))
     start = START * np.array([2e-3] * 3 + [5e-2] * 3 + [2e-3] * 3 + [5e-3] * 3)
-    records = [simulate(loop, 0.8, settle_s=0.0, floor=at_rest(800), initial=start, extra_substeps=m)
-               for m in (1, 2, 4)]
+    records = [
+        simulate(loop, 0.8, settle_s=0.0, floor=at_rest(800), initial=start, extra_substeps=m) for m in (1, 2, 4)
+    ]
     rig = NonlinearRig(loop.plant.mounted_body())
-    truth = solve_ivp(lambda t, x: rig.derivative(x), (0, 0.8), start, "DOP853", records[0].time, rtol=1e-11,
-                      atol=1e-13)
+    truth = solve_ivp(
+        lambda t, x: rig.derivative(x), (0, 0.8), start, "DOP853", records[0].time, rtol=1e-11, atol=1e-13
+    )
     assert not any(record.diverged for record in records)
     errors = [np.abs(record.q - truth.y[:6].T).max() for record in records]
     linear = simulate(loop, 0.8, settle_s=0.0, floor=at_rest(800), initial=start, nonlinear=False)
@@ -91,8 +93,9 @@ def test_energy_is_kept_without_damping_and_lost_with_it(passive):
     for plant, kept in ((undamped, True), (load_rig("avis"), False)):
         record = simulate(passive().with_plant("plant", plant), 10.0, settle_s=0.0, floor=at_rest(10000), initial=start)
         rig = NonlinearRig(plant.mounted_body())
-        energy = np.array([rig.energy(np.concatenate(row)) for row in zip(record.q[::20], record.q_dot[::20],
-                                                                          strict=True)])
+        energy = np.array(
+            [rig.energy(np.concatenate(row)) for row in zip(record.q[::20], record.q_dot[::20], strict=True)]
+        )
         if kept:
             assert np.abs(energy / energy[0] - 1).max() < 1e-4
         else:
@@ -103,16 +106,17 @@ def test_energy_is_kept_without_damping_and_lost_with_it(passive):
 def test_delay_is_exactly_what_is_asked(periods):
     """From rest, noise makes the first voltage; the table starts to move when the delay has passed, as Newton says."""
     rig = load_rig("avis")
-    loop = SampledLoop(rig, gain(-100.0 * np.eye(2)), ("z", "phi_x"), {}, plain_bank(rig, noise=1e-3), {},
-                       loop_delay_s=periods * 1e-3)
+    loop = SampledLoop(
+        rig, gain(-100.0 * np.eye(2)), ("z", "phi_x"), {}, plain_bank(rig, noise=1e-3), {}, loop_delay_s=periods * 1e-3
+    )
     record = simulate(loop, 0.01, settle_s=0.0, seed=3)
     arrived = int(np.floor(periods))
-    assert np.all(record.q_dot[:arrived + 1] == 0.0)
+    assert np.all(record.q_dot[: arrived + 1] == 0.0)
     eom = rig.equations_of_motion()
     pushed = la.solve(eom.M, eom.T @ record.demanded[0]) * (arrived + 1 - periods) * 1e-3
     assert np.linalg.norm(record.q_dot[arrived + 1] - pushed) < 0.02 * np.linalg.norm(pushed)
     held = int(np.ceil(periods))
-    assert np.array_equal(record.volts[held:], record.demanded[:len(record.demanded) - held])
+    assert np.array_equal(record.volts[held:], record.demanded[: len(record.demanded) - held])
 
 
 def test_a_delay_that_no_division_places_is_refused(make_loop):
@@ -125,8 +129,9 @@ def test_converter_rounds_and_clips_and_drives_clip():
     converter = Converter(6, 2e-3, 1000.0)
     # Sensors that show nothing of the motion, but half their range of noise, often beyond the range.
     bank = replace(plain_bank(rig, converter, 1e-3), chains=(gain(0.0),) * 6)
-    loop = SampledLoop(rig, gain([[200.0, 30.0], [-20.0, 400.0]]), ("z", "phi_x"), {}, bank, {}, limit_V=0.0503,
-                       loop_delay_s=1e-3)
+    loop = SampledLoop(
+        rig, gain([[200.0, 30.0], [-20.0, 400.0]]), ("z", "phi_x"), {}, bank, {}, limit_V=0.0503, loop_delay_s=1e-3
+    )
     record = simulate(loop, 2.0, settle_s=0.0)
     codes = converter.convert(record.sensed)
     rows, columns = rig.sensor_rows()[1], rig.equations_of_motion().T

@@ -32,7 +32,7 @@ def test_moments_of_a_narrow_resonance_agree_with_many_trials(rng):
     """A resonance half a line wide: leakage, and segments that remember each other."""
     segment, count, trials = 400, 6, 1500
     radius, angle = np.exp(-np.pi * 0.5 / segment), 2 * np.pi * 30.3 / segment
-    a = [1.0, -2 * radius * np.cos(angle), radius ** 2]
+    a = [1.0, -2 * radius * np.cos(angle), radius**2]
     samples = segment * (count + 1) // 2
     x = signal.lfilter([1.0], a, rng.standard_normal((trials, samples + 4000)), axis=1)[:, 4000:]
     band = slice(28, 34)
@@ -40,7 +40,7 @@ def test_moments_of_a_narrow_resonance_agree_with_many_trials(rng):
     f = np.arange(45 * POINTS_PER_LINE + 1) / POINTS_PER_LINE / segment
     psd = 2 * np.abs(signal.freqz([1.0], a, 2 * np.pi * f)[1]) ** 2
     mean, covariance = welch_moments(psd, count)
-    variance = sum((1 if d == 0 else 2) * covariance[28:34 - d, d].sum() for d in range(6))
+    variance = sum((1 if d == 0 else 2) * covariance[28 : 34 - d, d].sum() for d in range(6))
     assert power.mean() == pytest.approx(mean[band].sum(), rel=4 * power.std() / power.mean() / np.sqrt(trials))
     assert power.var() == pytest.approx(variance, rel=0.2)
 

@@ -84,9 +84,12 @@ def test_wrong_entries_are_answered_in_one_line(tmp_path, old, new, field, expec
 
 
 def test_files_that_are_no_plans(tmp_path):
-    for name, content, expected in (("broken.toml", b"x = = 1", "TOML"), ("empty.toml", b"", "record: this section is"),
-                                    ("latin.toml", b"title = \"\xe9\"", "UTF-8"), ("deep.toml", b"x=" + b"[" * 5000,
-                                                                                   "TOML")):
+    for name, content, expected in (
+        ("broken.toml", b"x = = 1", "TOML"),
+        ("empty.toml", b"", "record: this section is"),
+        ("latin.toml", b'title = "\xe9"', "UTF-8"),
+        ("deep.toml", b"x=" + b"[" * 5000, "TOML"),
+    ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=expected):
             read_plan(tmp_path / name)
@@ -97,14 +100,40 @@ def test_files_that_are_no_plans(tmp_path):
     assert read_plan(tmp_path / "bom.toml").title == "a plan"
 
 
-TABLE = {"title": "t", "duration_s": 30.0, "band_Hz": [1.0, 80.0], "multisine": {"period_s": 5.0, "group": 4},
-         "ambient": {"velocity_rms_m_per_s": 1e-6}, "truth": {"perturb_percent": 5.0},
-         "record": [{"excitation": "multisine", "level_V": 0.2}]}
-PLACES = [("title",), ("duration_s",), ("band_Hz",), ("band_Hz", 1), ("multisine",), ("multisine", "period_s"),
-          ("multisine", "group"), ("ambient", "velocity_rms_m_per_s"), ("truth",), ("record",), ("record", 0),
-          ("record", 0, "excitation"), ("record", 0, "level_V")]
-hostile = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just(10 ** 400),
-                    st.lists(st.floats(), max_size=4), st.dictionaries(st.text(max_size=3), st.floats(), max_size=2))
+TABLE = {
+    "title": "t",
+    "duration_s": 30.0,
+    "band_Hz": [1.0, 80.0],
+    "multisine": {"period_s": 5.0, "group": 4},
+    "ambient": {"velocity_rms_m_per_s": 1e-6},
+    "truth": {"perturb_percent": 5.0},
+    "record": [{"excitation": "multisine", "level_V": 0.2}],
+}
+PLACES = [
+    ("title",),
+    ("duration_s",),
+    ("band_Hz",),
+    ("band_Hz", 1),
+    ("multisine",),
+    ("multisine", "period_s"),
+    ("multisine", "group"),
+    ("ambient", "velocity_rms_m_per_s"),
+    ("truth",),
+    ("record",),
+    ("record", 0),
+    ("record", 0, "excitation"),
+    ("record", 0, "level_V"),
+]
+hostile = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=5),
+    st.just(10**400),
+    st.lists(st.floats(), max_size=4),
+    st.dictionaries(st.text(max_size=3), st.floats(), max_size=2),
+)
 
 
 @settings(max_examples=200, deadline=None)
@@ -135,8 +164,11 @@ def test_default_plans(name):
 
 
 def test_plans_are_written_as_they_are_read(tmp_path):
-    for plan in (read_plan(written(tmp_path)), default_plan(load_rig("halcyonics")),
-                 plan_from_table(TABLE | {"title": 'a "quoted" \\ \x7f \u00b5 line\nand another'})):
+    for plan in (
+        read_plan(written(tmp_path)),
+        default_plan(load_rig("halcyonics")),
+        plan_from_table(TABLE | {"title": 'a "quoted" \\ \x7f \u00b5 line\nand another'}),
+    ):
         path = tmp_path / "again.toml"
         path.write_text(plan_toml(plan), encoding="utf-8")
         assert read_plan(path) == plan
@@ -146,12 +178,17 @@ def test_the_guide_lists_every_key_of_a_plan_and_no_other():
     guide = (Path(__file__).parents[2] / "docs" / "campaign_plan.md").read_text()
     example = plan_from_table(tomllib.loads(re.search(r"```toml\n(.*?)```", guide, re.S)[1]))
     assert [one.excitation for one in example.record] == ["multisine", "noise", "floor"]
-    listed = {title or "": set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", rows, re.M))))
-              for title, rows in re.findall(r"^## (?:`\[+(\w+)\]+`)?(.*?)(?=^## |\Z)", guide, re.S | re.M)
-              if re.search(r"^\| `", rows, re.M)}
+    listed = {
+        title or "": set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", rows, re.M))))
+        for title, rows in re.findall(r"^## (?:`\[+(\w+)\]+`)?(.*?)(?=^## |\Z)", guide, re.S | re.M)
+        if re.search(r"^\| `", rows, re.M)
+    }
     kept = CampaignPlan.model_fields
     sections = {key: field.annotation for key, field in kept.items() if hasattr(field.annotation, "model_fields")}
     expected = {key: set(section.model_fields) for key, section in sections.items()}
-    assert listed == {**expected, "record": set(RecordPlan.model_fields),
-                      "effect": {*EffectPlan.model_fields, *library()},
-                      "": set(kept) - set(sections) - {"record", "effect"}}
+    assert listed == {
+        **expected,
+        "record": set(RecordPlan.model_fields),
+        "effect": {*EffectPlan.model_fields, *library()},
+        "": set(kept) - set(sections) - {"record", "effect"},
+    }

@@ -24,17 +24,23 @@ from avis_ctrl.study.skyhooks import CUSTOMARY_CORNERS_HZ, classical_skyhook, cr
 
 RIG = Path(__file__).with_name("three_legs.toml")
 # Few candidates: the search is the same.
-QUICK = CompanionSettings(gain_factors=(0.1, 0.2, 0.5), tilt_corners_Hz=(0.1, 0.5), roll_offs_Hz=(20.0, 100.0),
-                          points=200)
+QUICK = CompanionSettings(
+    gain_factors=(0.1, 0.2, 0.5), tilt_corners_Hz=(0.1, 0.5), roll_offs_Hz=(20.0, 100.0), points=200
+)
 
 
 @pytest.fixture(scope="module")
 def table():
-    design = design_from_table({
-        "title": "three legs", "rig": "three_legs.toml", "keep": ["z", "phi_x"],
-        "uncertainty": {"parameters_percent": {"mass": 10.0}},
-        "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
-        "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0}})
+    design = design_from_table(
+        {
+            "title": "three legs",
+            "rig": "three_legs.toml",
+            "keep": ["z", "phi_x"],
+            "uncertainty": {"parameters_percent": {"mass": 10.0}},
+            "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
+            "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+        }
+    )
     rig = load_rig(RIG)
     return design, rig, build_plant(design, rig)
 
@@ -64,8 +70,9 @@ def test_the_classical_rule_is_unstable_with_1_Hz_geophones_and_x_and_y_are_name
     assert spectral_radius(replace(classical, loops=without)) < 1 <= culprit.radius
     # The nonlinear simulation, which shares no eigenvalue with this, grows at that rate until the drives saturate.
     record = simulate(classical, 16.0, seed=1, settle_s=0.0)
-    early, late = (np.sqrt(np.mean(record.velocity("x")[part] ** 2))
-                   for part in (slice(4000, 6000), slice(14000, None)))
+    early, late = (
+        np.sqrt(np.mean(record.velocity("x")[part] ** 2)) for part in (slice(4000, 6000), slice(14000, None))
+    )
     assert np.log(late / early) / 10.0 == pytest.approx(culprit.growth_per_s, rel=0.3)
 
 
@@ -81,8 +88,10 @@ def test_designed_loops_keep_the_gain_margins_that_their_modulus_margin_implies(
 
 def test_designed_loops_lower_the_motion_along_their_axes(bare, companions):
     omega = 2 * np.pi * np.geomspace(0.5, 60.0, 300)
-    rms = [np.sqrt(np.trapezoid(sampled_response(loop, omega).velocity_psd()[:, :2], omega, axis=0))
-           for loop in (bare, replace(bare, loops=companions.systems()))]
+    rms = [
+        np.sqrt(np.trapezoid(sampled_response(loop, omega).velocity_psd()[:, :2], omega, axis=0))
+        for loop in (bare, replace(bare, loops=companions.systems()))
+    ]
     assert np.all(rms[1] < 0.8 * rms[0])
 
 
@@ -100,7 +109,7 @@ def test_a_modulus_margin_below_the_one_asked_is_told(bare, companions):
     strong = until_stable(companions.scaled(2.0), [bare])
     low = strong.below_margin()
     assert [one.axis for one in low] == ["y", "phi_y", "phi_z"] and strong.loops[0].modulus_margin > 0.5
-    said, = strong.remarks()
+    (said,) = strong.remarks()
     assert "below the required 0.5" in said
     assert said.endswith(": " + ", ".join(f"{one.axis} {one.modulus_margin:.2f}" for one in low) + ".")
     # Were the margins those before the gains were doubled, a loop could not be made unstable within them.

@@ -45,91 +45,112 @@ def complaint(table: dict) -> str:
     return text
 
 
-@pytest.mark.parametrize(("place", "value", "words"), [
-    ("titel", "x", ["titel", "did you mean title?"]),
-    ("simulation/durations_s", 60.0, ["simulation.durations_s", "did you mean duration_s?"]),
-    ("transmisibility", {}, ["transmisibility", "did you mean transmissibility?"]),
-    ("synthesis/max_iteration", 3, ["synthesis.max_iteration", "did you mean max_iterations?"]),
-    ("uncertainty/actuator_chain", {}, ["uncertainty.actuator_chain", "did you mean actuator_chains?"]),
-    ("simulation/qqqq", 1, ["simulation.qqqq", "expected one of duration_s, random_plants, seed"]),
-])
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("titel", "x", ["titel", "did you mean title?"]),
+        ("simulation/durations_s", 60.0, ["simulation.durations_s", "did you mean duration_s?"]),
+        ("transmisibility", {}, ["transmisibility", "did you mean transmissibility?"]),
+        ("synthesis/max_iteration", 3, ["synthesis.max_iteration", "did you mean max_iterations?"]),
+        ("uncertainty/actuator_chain", {}, ["uncertainty.actuator_chain", "did you mean actuator_chains?"]),
+        ("simulation/qqqq", 1, ["simulation.qqqq", "expected one of duration_s, random_plants, seed"]),
+    ],
+)
 def test_unknown_and_misspelt_keys_are_answered_with_the_nearest(place, value, words):
     text = complaint(changed(place, value))
     for word in words:
         assert word in text
 
 
-@pytest.mark.parametrize(("place", "value", "expected"), [
-    ("transmissibility/band_kHz", [0.001, 0.01], "band_Hz"), ("simulation/duration_ms", 4e4, "duration_s"),
-    ("control_effort/floor_velocity_mm_per_s", 0.01, "floor_velocity_m_per_s"),
-    ("loop/amplifier_corner_kHz", 0.3, "amplifier_corner_Hz")])
+@pytest.mark.parametrize(
+    ("place", "value", "expected"),
+    [
+        ("transmissibility/band_kHz", [0.001, 0.01], "band_Hz"),
+        ("simulation/duration_ms", 4e4, "duration_s"),
+        ("control_effort/floor_velocity_mm_per_s", 0.01, "floor_velocity_m_per_s"),
+        ("loop/amplifier_corner_kHz", 0.3, "amplifier_corner_Hz"),
+    ],
+)
 def test_a_wrong_unit_in_a_key_is_named(place, value, expected):
     text = complaint(changed(place, value))
     assert "unit" in text
     assert f"expected {expected}" in text
 
 
-@pytest.mark.parametrize(("place", "value", "field"), [
-    ("control_effort/bandwidth_Hz", -1.0, "control_effort.bandwidth_Hz = -1.0"),
-    ("control_effort/bandwidth_Hz", 0.0, "control_effort.bandwidth_Hz = 0.0"),
-    ("control_effort/bandwidth_Hz", float("nan"), "control_effort.bandwidth_Hz = nan"),
-    ("transmissibility/peak_dB", float("inf"), "transmissibility.peak_dB = inf"),
-    ("transmissibility/peak_dB", 1e308, "transmissibility.peak_dB = 1e+308"),
-    ("control_effort/bandwidth_Hz", 1e300, "control_effort.bandwidth_Hz = 1e+300"),
-    ("transmissibility/band_Hz", [1.0, float("nan")], "transmissibility.band_Hz[2] = nan"),
-    ("uncertainty/parameters_percent/mass", -10.0, "uncertainty.parameters_percent.mass = -10.0"),
-    ("uncertainty/parameters_percent/mass", 100.0, "uncertainty.parameters_percent.mass = 100.0"),
-    ("uncertainty/parameters_percent/mass", 250.0, "uncertainty.parameters_percent.mass = 250.0"),
-    ("uncertainty/actuator_chains/low_percent", 150.0, "uncertainty.actuator_chains.low_percent = 150.0"),
-    ("uncertainty/actuator_chains/crossover_Hz", 0.08, "uncertainty.actuator_chains.crossover_Hz = 0.08"),
-    ("uncertainty/actuator_chains/high_percent", 50.0, "uncertainty.actuator_chains.high_percent = 50.0"),
-    ("uncertainty/parameters_absolute", {"com_y": -0.1}, "uncertainty.parameters_absolute.com_y = -0.1"),
-    ("simulation/duration_s", 1e9, "simulation.duration_s = 1000000000.0"),
-    ("simulation/random_plants", -1, "simulation.random_plants = -1"),
-    ("simulation/random_plants", 2.5, "simulation.random_plants = 2.5"),
-    ("simulation/seed", -1, "simulation.seed = -1"),
-    ("synthesis/max_iterations", 0, "synthesis.max_iterations = 0"),
-    ("floor/velocity_rms_m_per_s", 0.0, "floor.velocity_rms_m_per_s = 0.0"),
-    ("compliance", {"limit_m_per_N": -1e-6}, "compliance.limit_m_per_N = -1e-06"),
-    ("requirement", [{"quantity": "mu_upper", "at_most": float("nan")}], "requirement[1].at_most = nan"),
-])
+@pytest.mark.parametrize(
+    ("place", "value", "field"),
+    [
+        ("control_effort/bandwidth_Hz", -1.0, "control_effort.bandwidth_Hz = -1.0"),
+        ("control_effort/bandwidth_Hz", 0.0, "control_effort.bandwidth_Hz = 0.0"),
+        ("control_effort/bandwidth_Hz", float("nan"), "control_effort.bandwidth_Hz = nan"),
+        ("transmissibility/peak_dB", float("inf"), "transmissibility.peak_dB = inf"),
+        ("transmissibility/peak_dB", 1e308, "transmissibility.peak_dB = 1e+308"),
+        ("control_effort/bandwidth_Hz", 1e300, "control_effort.bandwidth_Hz = 1e+300"),
+        ("transmissibility/band_Hz", [1.0, float("nan")], "transmissibility.band_Hz[2] = nan"),
+        ("uncertainty/parameters_percent/mass", -10.0, "uncertainty.parameters_percent.mass = -10.0"),
+        ("uncertainty/parameters_percent/mass", 100.0, "uncertainty.parameters_percent.mass = 100.0"),
+        ("uncertainty/parameters_percent/mass", 250.0, "uncertainty.parameters_percent.mass = 250.0"),
+        ("uncertainty/actuator_chains/low_percent", 150.0, "uncertainty.actuator_chains.low_percent = 150.0"),
+        ("uncertainty/actuator_chains/crossover_Hz", 0.08, "uncertainty.actuator_chains.crossover_Hz = 0.08"),
+        ("uncertainty/actuator_chains/high_percent", 50.0, "uncertainty.actuator_chains.high_percent = 50.0"),
+        ("uncertainty/parameters_absolute", {"com_y": -0.1}, "uncertainty.parameters_absolute.com_y = -0.1"),
+        ("simulation/duration_s", 1e9, "simulation.duration_s = 1000000000.0"),
+        ("simulation/random_plants", -1, "simulation.random_plants = -1"),
+        ("simulation/random_plants", 2.5, "simulation.random_plants = 2.5"),
+        ("simulation/seed", -1, "simulation.seed = -1"),
+        ("synthesis/max_iterations", 0, "synthesis.max_iterations = 0"),
+        ("floor/velocity_rms_m_per_s", 0.0, "floor.velocity_rms_m_per_s = 0.0"),
+        ("compliance", {"limit_m_per_N": -1e-6}, "compliance.limit_m_per_N = -1e-06"),
+        ("requirement", [{"quantity": "mu_upper", "at_most": float("nan")}], "requirement[1].at_most = nan"),
+    ],
+)
 def test_numbers_outside_their_range_are_named(place, value, field):
     text = complaint(changed(place, value))
     assert field in text
     assert "expected" in text
 
 
-@pytest.mark.parametrize(("place", "value", "field"), [
-    ("transmissibility/band_Hz", [10.0, 1.0], "transmissibility.band_Hz = [10.0, 1.0]"),
-    ("transmissibility/band_Hz", [5.0, 5.0], "transmissibility.band_Hz = [5.0, 5.0]"),
-    ("transmissibility/band_Hz", [1.0], "transmissibility.band_Hz = [1.0]"),
-    ("transmissibility/band_Hz", [1.0, 2.0, 3.0], "transmissibility.band_Hz = [1.0, 2.0, 3.0]"),
-    ("floor/band_Hz", [60.0, 0.5], "floor.band_Hz = [60.0, 0.5]"),
-    ("skyhook/roll_off_Hz", [400.0, 30.0], "skyhook.roll_off_Hz = [400.0, 30.0]"),
-    ("skyhook/tilt_corner_Hz", [0.5, 100.0], "skyhook.roll_off_Hz = [5.0, 400.0]"),
-    ("transmissibility/band_dB", 5.0, "transmissibility.band_dB = 5.0"),
-])
+@pytest.mark.parametrize(
+    ("place", "value", "field"),
+    [
+        ("transmissibility/band_Hz", [10.0, 1.0], "transmissibility.band_Hz = [10.0, 1.0]"),
+        ("transmissibility/band_Hz", [5.0, 5.0], "transmissibility.band_Hz = [5.0, 5.0]"),
+        ("transmissibility/band_Hz", [1.0], "transmissibility.band_Hz = [1.0]"),
+        ("transmissibility/band_Hz", [1.0, 2.0, 3.0], "transmissibility.band_Hz = [1.0, 2.0, 3.0]"),
+        ("floor/band_Hz", [60.0, 0.5], "floor.band_Hz = [60.0, 0.5]"),
+        ("skyhook/roll_off_Hz", [400.0, 30.0], "skyhook.roll_off_Hz = [400.0, 30.0]"),
+        ("skyhook/tilt_corner_Hz", [0.5, 100.0], "skyhook.roll_off_Hz = [5.0, 400.0]"),
+        ("transmissibility/band_dB", 5.0, "transmissibility.band_dB = 5.0"),
+    ],
+)
 def test_bands_rise(place, value, field):
     text = complaint(changed(place, value))
     assert field in text
     assert "expected" in text
 
 
-@pytest.mark.parametrize(("place", "value", "words"), [
-    ("keep", ["z", "phi"], ["keep[2] = 'phi'", "'phi_x'"]), ("keep", [], ["keep = []"]),
-    ("keep", ["z", "z"], ["keep", "once"]), ("keep", "z", ["keep = 'z'", "list"]),
-    ("floor/spectrum", "kamioka", ["floor.spectrum = 'kamioka'", "kamioka_quiet"]),
-    ("requirement", [{"quantity": "mu_uper", "at_most": 1.0}], ["requirement[1].quantity = 'mu_uper'", "mu_upper"]),
-    ("requirement", [{"quantity": "mu_upper"}], ["requirement[1]", "exactly one of at_most and at_least"]),
-    ("requirement", [{"quantity": "mu_upper", "at_most": 1.0, "at_least": 0.5}], ["requirement[1]", "exactly one"]),
-    ("requirement", {"quantity": "mu_upper", "at_most": 1.0}, ["requirement", "list"]),
-    ("control_effort/bandwidth_Hz", "100", ["control_effort.bandwidth_Hz = '100'", "number"]),
-    ("control_effort/bandwidth_Hz", True, ["control_effort.bandwidth_Hz = True", "number"]),
-    ("title", 3, ["title = 3", "text in quotes"]), ("transmissibility", "low", ["transmissibility = 'low'", "section"]),
-    ("uncertainty/parameters_percent", [10.0], ["uncertainty.parameters_percent", "section"]),
-    ("title", ABSENT, ["title", "missing"]), ("transmissibility", ABSENT, ["transmissibility", "section is missing"]),
-    ("control_effort/bandwidth_Hz", ABSENT, ["control_effort.bandwidth_Hz", "key is missing"]),
-])
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("keep", ["z", "phi"], ["keep[2] = 'phi'", "'phi_x'"]),
+        ("keep", [], ["keep = []"]),
+        ("keep", ["z", "z"], ["keep", "once"]),
+        ("keep", "z", ["keep = 'z'", "list"]),
+        ("floor/spectrum", "kamioka", ["floor.spectrum = 'kamioka'", "kamioka_quiet"]),
+        ("requirement", [{"quantity": "mu_uper", "at_most": 1.0}], ["requirement[1].quantity = 'mu_uper'", "mu_upper"]),
+        ("requirement", [{"quantity": "mu_upper"}], ["requirement[1]", "exactly one of at_most and at_least"]),
+        ("requirement", [{"quantity": "mu_upper", "at_most": 1.0, "at_least": 0.5}], ["requirement[1]", "exactly one"]),
+        ("requirement", {"quantity": "mu_upper", "at_most": 1.0}, ["requirement", "list"]),
+        ("control_effort/bandwidth_Hz", "100", ["control_effort.bandwidth_Hz = '100'", "number"]),
+        ("control_effort/bandwidth_Hz", True, ["control_effort.bandwidth_Hz = True", "number"]),
+        ("title", 3, ["title = 3", "text in quotes"]),
+        ("transmissibility", "low", ["transmissibility = 'low'", "section"]),
+        ("uncertainty/parameters_percent", [10.0], ["uncertainty.parameters_percent", "section"]),
+        ("title", ABSENT, ["title", "missing"]),
+        ("transmissibility", ABSENT, ["transmissibility", "section is missing"]),
+        ("control_effort/bandwidth_Hz", ABSENT, ["control_effort.bandwidth_Hz", "key is missing"]),
+    ],
+)
 def test_wrong_words_types_and_missing_keys(place, value, words):
     text = complaint(changed(place, value))
     for word in words:
@@ -156,14 +177,22 @@ def value_text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-@pytest.mark.parametrize(("place", "value", "words"), [
-    ("rig", "aviss", ["rig = 'aviss'", "avis, halcyonics, halcyonics_loaded"]),
-    ("rig", "absent.toml", ["rig = 'absent.toml'", "rig file"]), ("rig", "", ["rig = ''"]),
-    ("uncertainty/parameters_percent", {"isolater2.k_z": 15.0}, ["isolater2.k_z", "did you mean isolator2.k_z?"]),
-    ("uncertainty/parameters_percent", {"stiffness?": 15.0}, ["stiffness?", "it has mass, J1"]),
-    ("uncertainty/parameters_percent", {"isolator*.k_z": 15.0, "isolator1.*": 5.0}, ["isolator1.k_z is listed twice"]),
-    ("uncertainty/parameters_percent", {"com_x": 10.0}, ["com_x", "zero", "absolute"]),
-])
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("rig", "aviss", ["rig = 'aviss'", "avis, halcyonics, halcyonics_loaded"]),
+        ("rig", "absent.toml", ["rig = 'absent.toml'", "rig file"]),
+        ("rig", "", ["rig = ''"]),
+        ("uncertainty/parameters_percent", {"isolater2.k_z": 15.0}, ["isolater2.k_z", "did you mean isolator2.k_z?"]),
+        ("uncertainty/parameters_percent", {"stiffness?": 15.0}, ["stiffness?", "it has mass, J1"]),
+        (
+            "uncertainty/parameters_percent",
+            {"isolator*.k_z": 15.0, "isolator1.*": 5.0},
+            ["isolator1.k_z is listed twice"],
+        ),
+        ("uncertainty/parameters_percent", {"com_x": 10.0}, ["com_x", "zero", "absolute"]),
+    ],
+)
 def test_rig_and_parameters_are_checked_with_the_file(place, value, words, tmp_path):
     path = written(tmp_path, changed(place, value))
     read_design(path)  # nothing wrong with the file by itself
@@ -176,8 +205,9 @@ def test_rig_and_parameters_are_checked_with_the_file(place, value, words, tmp_p
 
 def test_a_rig_file_beside_the_design(tmp_path):
     shipped = Path(load_rig.__code__.co_filename).parent / "data" / "avis.toml"
-    (tmp_path / "mine.toml").write_text(shipped.read_text(encoding="utf-8").replace('name = "avis"', 'name = "mine"'),
-                                        encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(
+        shipped.read_text(encoding="utf-8").replace('name = "avis"', 'name = "mine"'), encoding="utf-8"
+    )
     design, rig = read_study(written(tmp_path, changed("rig", "mine.toml")))
     assert (design.rig, rig.name) == ("mine.toml", "mine")
 
@@ -197,8 +227,15 @@ def test_files_that_are_no_design_end_in_one_line_and_code_2(kind, tmp_path, mon
     if kind == "folder":
         path.mkdir()
     elif kind != "missing":
-        path.write_bytes({"empty": b"", "binary": bytes(range(256)), "not TOML": b"title = \n[[[",
-                          "deep nesting": b"a = " + b"[" * 50_000, "null byte": b"a = \x00"}[kind])
+        path.write_bytes(
+            {
+                "empty": b"",
+                "binary": bytes(range(256)),
+                "not TOML": b"title = \n[[[",
+                "deep nesting": b"a = " + b"[" * 50_000,
+                "null byte": b"a = \x00",
+            }[kind]
+        )
     assert command(monkeypatch, "design", str(path), "--out", str(out)) == 2
     said = capsys.readouterr()
     assert said.out == ""
@@ -207,8 +244,15 @@ def test_files_that_are_no_design_end_in_one_line_and_code_2(kind, tmp_path, mon
     assert not out.exists()
 
 
-@pytest.mark.parametrize(("place", "value"), [("rig", "aviss"), ("uncertainty/parameters_percent", {"mas": 10.0}),
-                                              ("control_effort/bandwidth_Hz", -1.0), ("titel", "x")])
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("rig", "aviss"),
+        ("uncertainty/parameters_percent", {"mas": 10.0}),
+        ("control_effort/bandwidth_Hz", -1.0),
+        ("titel", "x"),
+    ],
+)
 def test_wrong_designs_write_nothing(place, value, tmp_path, monkeypatch, capsys):
     path, out = written(tmp_path, changed(place, value)), tmp_path / "out"
     assert command(monkeypatch, "design", str(path), "--out", str(out)) == 2
@@ -243,8 +287,11 @@ def test_shipped_avis_design_asks_what_the_task_asks():
     """Mass +-10 %, vertical stiffness +-15 %, damping +-30 %, chains 10 % rising through 100 % at 80 Hz."""
     design, rig = read_study(DESIGNS / "avis_z_phix.toml")
     spread = {p.name: p.spread for p in design.uncertainty.of(rig)}
-    assert spread == {"mass": pytest.approx(0.10), **{f"isolator{k}.k_z": pytest.approx(0.15) for k in (1, 2, 3, 4)},
-                      **{f"isolator{k}.c_z": pytest.approx(0.30) for k in (1, 2, 3, 4)}}
+    assert spread == {
+        "mass": pytest.approx(0.10),
+        **{f"isolator{k}.k_z": pytest.approx(0.15) for k in (1, 2, 3, 4)},
+        **{f"isolator{k}.c_z": pytest.approx(0.30) for k in (1, 2, 3, 4)},
+    }
     chains = design.uncertainty.actuator_chains
     assert (chains.low_percent, chains.crossover_Hz) == (10.0, 80.0)
     limits = {r.quantity: (r.at_most, r.at_least) for r in design.requirement}
@@ -257,14 +304,30 @@ def test_shipped_avis_design_asks_what_the_task_asks():
     assert design.transmissibility.band_Hz == [1.0, 10.0]
 
 
-leaves = st.one_of(st.none(), st.booleans(), st.integers(-10, 1000), st.floats(), st.text(max_size=8),
-                   st.lists(st.floats(0.1, 100), max_size=3))
-keys = st.one_of(st.sampled_from([*TABLE, *Design.model_fields, "band_Hz", "peak_dB", "mass", "quantity", "band_kHz"]),
-                 st.text(max_size=8))
-tables = st.recursive(leaves, lambda inner: st.one_of(st.dictionaries(keys, inner, max_size=4),
-                                                      st.lists(inner, max_size=3)), max_leaves=10)
-places = st.sampled_from([place for section, content in TABLE.items() for place in
-                          [section, *([f"{section}/{key}" for key in content] if isinstance(content, dict) else [])]])
+leaves = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-10, 1000),
+    st.floats(),
+    st.text(max_size=8),
+    st.lists(st.floats(0.1, 100), max_size=3),
+)
+keys = st.one_of(
+    st.sampled_from([*TABLE, *Design.model_fields, "band_Hz", "peak_dB", "mass", "quantity", "band_kHz"]),
+    st.text(max_size=8),
+)
+tables = st.recursive(
+    leaves,
+    lambda inner: st.one_of(st.dictionaries(keys, inner, max_size=4), st.lists(inner, max_size=3)),
+    max_leaves=10,
+)
+places = st.sampled_from(
+    [
+        place
+        for section, content in TABLE.items()
+        for place in [section, *([f"{section}/{key}" for key in content] if isinstance(content, dict) else [])]
+    ]
+)
 
 
 @settings(max_examples=150, deadline=None)

@@ -35,14 +35,18 @@ def test_script_and_file_have_the_same_inputs(name):
     design, rig = read_study(DESIGNS / f"{name}.toml")
     own, table = study_inputs(script["rig"], **script["sections"])
     assert own == design
-    by_script, by_file = (design_provenance(d, None, r, 0.0)["inputs_sha256"]
-                          for d, r in ((own, table), (design, rig)))
+    by_script, by_file = (design_provenance(d, None, r, 0.0)["inputs_sha256"] for d, r in ((own, table), (design, rig)))
     assert by_script == by_file
 
 
 def test_the_hash_notices_a_change_of_design_and_of_rig():
     design, rig = read_study(DESIGNS / "avis_z_phix.toml")
-    hashes = {design_provenance(d, None, r, 0.0)["inputs_sha256"] for d, r in (
-        (design, rig), (design.model_copy(update={"keep": ["phi_x", "z"]}), rig),
-        (design, rig.with_parameters({"mass": rig.parameters()["mass"].value * (1 + 1e-12)})))}
+    hashes = {
+        design_provenance(d, None, r, 0.0)["inputs_sha256"]
+        for d, r in (
+            (design, rig),
+            (design.model_copy(update={"keep": ["phi_x", "z"]}), rig),
+            (design, rig.with_parameters({"mass": rig.parameters()["mass"].value * (1 + 1e-12)})),
+        )
+    }
     assert len(hashes) == 3

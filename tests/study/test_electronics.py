@@ -41,11 +41,13 @@ def test_filter_is_scipys_butterworth_behind_every_sensor(name, order):
         expected = one.chain().frequency_response(OMEGA)[:, 0, 0] * butterworth(order, 200.0)
         assert other.chain().frequency_response(OMEGA)[:, 0, 0] == pytest.approx(expected, rel=1e-9)
         assert other.as_velocity(OMEGA) * other.gain == pytest.approx(
-            one.as_velocity(OMEGA) * one.gain * butterworth(order, 200.0), rel=1e-9)
+            one.as_velocity(OMEGA) * one.gain * butterworth(order, 200.0), rel=1e-9
+        )
 
 
-@pytest.mark.parametrize("name", ["avis", "halcyonics", *(f"designs/rigs/{one}.toml" for one in (
-    "granite", "twelve_sensors", "skewed"))])
+@pytest.mark.parametrize(
+    "name", ["avis", "halcyonics", *(f"designs/rigs/{one}.toml" for one in ("granite", "twelve_sensors", "skewed"))]
+)
 def test_controller_sees_the_filter_and_does_not_undo_it(name):
     bare = load_rig(name)
     seen, filtered = (sensing(rig, ["z"], 0.1) for rig in (bare, bare.with_electronics(FILTER)))
@@ -70,7 +72,7 @@ def test_identification_knows_the_filter():
 
 def test_default_offset_is_that_of_the_data_sheets():
     """INA128 at a gain of 100: 1.1 mV; two codes of 14 bits over +-10 V: 2.44 mV."""
-    assert load_rig("avis").sensors()[0].offset_V == pytest.approx(1.1e-3 + 2 * 20 / 2 ** 14)
+    assert load_rig("avis").sensors()[0].offset_V == pytest.approx(1.1e-3 + 2 * 20 / 2**14)
     assert load_rig("halcyonics").sensors()[0].offset_V == pytest.approx(1.1e-4)
 
 
@@ -87,12 +89,18 @@ def test_design_file_replaces_keys_of_the_rig_file(tmp_path):
     assert again.equipped(rig).electronics == read.electronics
 
 
-@pytest.mark.parametrize("given, field", [
-    ({"anti_alias_order": 2}, "anti_alias_corner_Hz"), ({"anti_alias_corner_Hz": 100.0}, "anti_alias_corner_Hz"),
-    ({"anti_alias_order": 9, "anti_alias_corner_Hz": 100.0}, "anti_alias_order"),
-    ({"anti_alias_order": 2, "anti_alias_corner_Hz": -1.0}, "anti_alias_corner_Hz"),
-    ({"sensor_offset_V": -1.0}, "sensor_offset_V"), ({"converter_offset_V": float("nan")}, "converter_offset_V"),
-    ({"offset": 1.0}, "offset")])
+@pytest.mark.parametrize(
+    "given, field",
+    [
+        ({"anti_alias_order": 2}, "anti_alias_corner_Hz"),
+        ({"anti_alias_corner_Hz": 100.0}, "anti_alias_corner_Hz"),
+        ({"anti_alias_order": 9, "anti_alias_corner_Hz": 100.0}, "anti_alias_order"),
+        ({"anti_alias_order": 2, "anti_alias_corner_Hz": -1.0}, "anti_alias_corner_Hz"),
+        ({"sensor_offset_V": -1.0}, "sensor_offset_V"),
+        ({"converter_offset_V": float("nan")}, "converter_offset_V"),
+        ({"offset": 1.0}, "offset"),
+    ],
+)
 def test_wrong_electronics_are_named_in_one_line(given, field):
     table = read_study("designs/avis_z_phix.toml")[0].model_dump(exclude_none=True)
     with pytest.raises(InputError, match=field) as caught:
@@ -162,8 +170,10 @@ def test_gate_fails_a_design_whose_offset_uses_too_much():
     design, rig = read_study("designs/avis_z_phix.toml")
     plant = build_plant(design, rig)
     check = type("Check", (), {"plants": (), "duration_s": 1.0, "false_alarm": 0.01})()
-    rows = [check_loop(check, at_rest(bare_loop(design, rig, plant, gain(size * np.eye(2)))), 10.0)[-1]
-            for size in (1e5, 5e7)]
+    rows = [
+        check_loop(check, at_rest(bare_loop(design, rig, plant, gain(size * np.eye(2)))), 10.0)[-1]
+        for size in (1e5, 5e7)
+    ]
     assert [row.met for row in rows] == [True, False]
     assert "mV" in rows[1].note and rows[1].unit == "%"
 
@@ -175,5 +185,6 @@ def test_weight_at_rest_comes_from_the_offset_alone():
     assert plain.magnitude(OMEGA[:1] * 1e-6)[0] == pytest.approx(1e-6)
     assert with_.magnitude(OMEGA[:1] * 1e-6)[0] > 10e-6
     assert with_.magnitude(2 * np.pi * np.array([1.0])) == pytest.approx(
-        plain.magnitude(2 * np.pi * np.array([1.0])), rel=0.2)
+        plain.magnitude(2 * np.pi * np.array([1.0])), rel=0.2
+    )
     assert hinf_norm(with_.system()).gain >= 3e-5

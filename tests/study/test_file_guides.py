@@ -54,7 +54,10 @@ def test_the_page_on_rig_files_lists_every_key():
     example, text = page("rig_file.md")
     rig = rig_from(example)
     assert len(rig.all_drives) == 2 and [one.quantity for one in rig.sensors()] == [
-        "velocity", "acceleration", "displacement"]
+        "velocity",
+        "acceleration",
+        "displacement",
+    ]
     assert listed(text, ("Isolators", "Either")) == keys(AvisFile)
     assert listed(text, ("Springs", "Either")) == keys(HalcyonicsFile)
 

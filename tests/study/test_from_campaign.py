@@ -46,8 +46,9 @@ def study(folder):
 
 def controller(folder) -> StateSpace:
     stored = json.loads((folder / "design" / "controllers" / "mu.json").read_text(encoding="utf-8"))
-    return StateSpace(*(np.array(stored[key]) for key in "ABCD"), 0.0, tuple(stored["inputs"]),
-                      tuple(stored["outputs"]))
+    return StateSpace(
+        *(np.array(stored[key]) for key in "ABCD"), 0.0, tuple(stored["inputs"]), tuple(stored["outputs"])
+    )
 
 
 def test_every_requirement_is_met(folder):

@@ -80,13 +80,23 @@ def test_without_effects_it_is_the_plant_of_the_design(rig, baseline, design):
     assert same(response(plant), response(build_plant(design, rig)), 0.0)
 
 
-@pytest.mark.parametrize("name, place, values", [
-    ("com_offset", "payload", (0.0, 0.0, 0.0)), ("sensor_gain", "Sz1", (1.0,)),
-    ("mount_relaxation", "isolators z", (0.0, 3.0)), ("attached_oscillator", "payload/z", (0.0, 12.0, 0.05, 0.1, 0.1)),
-    ("tilt_coupling", "horizontal geophones", (0.0,)),
-    ("structural_damping", "isolators/causal", (0.0,)), ("leveling_loop", "isolators 1-3 z/plain", (0.0,)),
-    ("base_compliance", "chassis/rocking", (1e12, 0.05, 90.0, 90.0, 90.0, 90.0, 90.0, 90.0,
-                                             1e3, 1e3, 1e3, 0.0, 0.0))])
+@pytest.mark.parametrize(
+    "name, place, values",
+    [
+        ("com_offset", "payload", (0.0, 0.0, 0.0)),
+        ("sensor_gain", "Sz1", (1.0,)),
+        ("mount_relaxation", "isolators z", (0.0, 3.0)),
+        ("attached_oscillator", "payload/z", (0.0, 12.0, 0.05, 0.1, 0.1)),
+        ("tilt_coupling", "horizontal geophones", (0.0,)),
+        ("structural_damping", "isolators/causal", (0.0,)),
+        ("leveling_loop", "isolators 1-3 z/plain", (0.0,)),
+        (
+            "base_compliance",
+            "chassis/rocking",
+            (1e12, 0.05, 90.0, 90.0, 90.0, 90.0, 90.0, 90.0, 1e3, 1e3, 1e3, 0.0, 0.0),
+        ),
+    ],
+)
 def test_effects_without_strength_leave_the_plant(baseline, design, name, place, values):
     plant, _, _ = plant_of(design, with_one(baseline, name, place, values))
     # A chassis that is heavy enough still filters the floor, by design.
@@ -135,8 +145,9 @@ def test_the_controller_keeps_its_decoding(rig, design):
     inputs, outputs = list(plain.full.u), list(plain.full.y)
     before = plain.full.P.select(outputs, inputs).frequency_response(OMEGA)
     assert np.allclose(plant.full.P.select(outputs, inputs).frequency_response(OMEGA), mixing @ before, rtol=1e-9)
-    again, _, _ = plant_of(design, with_one(other, "mount_relaxation", "isolators z", (0.0, 3.0)),
-                           wiring_of(plain, base))
+    again, _, _ = plant_of(
+        design, with_one(other, "mount_relaxation", "isolators z", (0.0, 3.0)), wiring_of(plain, base)
+    )
     assert same(response(again), response(plant))
 
 
@@ -162,10 +173,17 @@ def moved(plant, size: float) -> np.ndarray:
     return lft_upper(P, np.diag(real)).frequency_response(OMEGA)
 
 
-@pytest.mark.parametrize("name, place, values, seen", [
-    (*LAG_40_HZ, True), ("loop_delay", "loop", (3e-3,), True), ("com_offset", "payload", (0.01, 0.03, -0.02), True),
-    ("product_of_inertia", "Jxy", (4.0,), False), ("contact_friction", "actuators", (6e3, 1e-5, *(0.0,) * 7), True),
-    ("actuator_saturation", "actuators", (2.0,), True)])
+@pytest.mark.parametrize(
+    "name, place, values, seen",
+    [
+        (*LAG_40_HZ, True),
+        ("loop_delay", "loop", (3e-3,), True),
+        ("com_offset", "payload", (0.01, 0.03, -0.02), True),
+        ("product_of_inertia", "Jxy", (4.0,), False),
+        ("contact_friction", "actuators", (6e3, 1e-5, *(0.0,) * 7), True),
+        ("actuator_saturation", "actuators", (2.0,), True),
+    ],
+)
 def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, values, seen):
     """The plant that `avis design` makes of rig.toml and design.toml is the updated one."""
     model = with_one(baseline, name, place, values)
@@ -186,7 +204,8 @@ def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
     found = design_files(design, model)
     old = baseline.rig
     assert found.rig.geophones.sensitivity_Vs_per_m[found.rig.geophones.names.index("Sz1")] == pytest.approx(
-        1.2 * old.geophones.sensitivity_Vs_per_m[old.geophones.names.index("Sz1")])
+        1.2 * old.geophones.sensitivity_Vs_per_m[old.geophones.names.index("Sz1")]
+    )
     assert found.rig.parameters()["actuator.Az1"].value == pytest.approx(0.8 * old.parameters()["actuator.Az1"].value)
 
 
@@ -219,14 +238,20 @@ def gap_of(baseline, updated, *effects):
 
 def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, baseline, design):
     """A low-pass of 2 Hz in one sensor would matter to any loop; the linear plant does not hold it."""
-    monkeypatch.setattr("avis_ctrl.study.gap_design.mu_optimal", lambda asked, plant, rig: (
-        SimpleNamespace(K=gain(np.zeros((2, 2)))), SimpleNamespace(status="stand-in")))
+    monkeypatch.setattr(
+        "avis_ctrl.study.gap_design.mu_optimal",
+        lambda asked, plant, rig: (SimpleNamespace(K=gain(np.zeros((2, 2)))), SimpleNamespace(status="stand-in")),
+    )
     same = LoopFigures(True, True, 0.8, 0.79, 3.0, 1.0, 4.0, 2.0, 50.0)
     monkeypatch.setattr("avis_ctrl.study.gap_design.figures", lambda *of: same)
-    monkeypatch.setattr("avis_ctrl.study.gap_design.realise", lambda model: Realised(
-        gain(np.zeros((1, 1))), OMEGA, 0.0, 0.0, notes_on(model)))
-    left_out = (active(SensorLowpass(), baseline, "Sz1", (0.08,)),
-                active(library()["cubic_stiffness"], baseline, "isolators z", (1e9, 0.0, 0.0, 0.0)))
+    monkeypatch.setattr(
+        "avis_ctrl.study.gap_design.realise",
+        lambda model: Realised(gain(np.zeros((1, 1))), OMEGA, 0.0, 0.0, notes_on(model)),
+    )
+    left_out = (
+        active(SensorLowpass(), baseline, "Sz1", (0.08,)),
+        active(library()["cubic_stiffness"], baseline, "isolators z", (1e9, 0.0, 0.0, 0.0)),
+    )
     updated = replace(baseline, effects=left_out)
     hum = SimpleNamespace(name="mains_hum", location="geophones", label="")
     found = design_effect(gap_of(baseline, updated, hum), design)
@@ -255,6 +280,7 @@ def test_two_ways_to_the_same_limit_of_stability(rig, baseline, design):
             middle = (low + high) / 2
             low, high = (middle, high) if stable(middle)[way] else (low, middle)
         return low
+
     first, second = limit(0), limit(1)
     assert 0.5 < first < 59 and second == pytest.approx(first, rel=0.15)
 
@@ -272,8 +298,9 @@ def test_refusals(baseline, design, tmp_path):
     path.write_text("title = 1\n", encoding="utf-8")
     with pytest.raises(InputError):
         design_effect(gap_of(baseline, baseline), path)
-    by_name = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
-        update={"identified": "uncertainty.json"})})
+    by_name = design.model_copy(
+        update={"uncertainty": design.uncertainty.model_copy(update={"identified": "uncertainty.json"})}
+    )
     with pytest.raises(InputError, match="set by hand"):
         design_effect(gap_of(baseline, baseline), by_name)
     halcyonics = TableModel(ResponseModel.of(load_rig("halcyonics"), ("mass",), unit="m/s"))
@@ -297,8 +324,12 @@ def test_an_amplifier_lag_costs_the_controller_and_a_new_one_wins_it_back(baseli
 @pytest.mark.slow
 def test_an_iteration_that_stalls_above_its_target_goes_on(baseline, design):
     """D-K iteration alone stalls at 1.24 on the plant of these files and reaches 0.88 on the model's own."""
-    model = with_one(with_one(baseline, "contact_friction", "actuators", (1.5e4, 5e-6, *(0.0,) * 7)),
-                     "stiffness_drift", "isolators/linear", (-0.037,))
+    model = with_one(
+        with_one(baseline, "contact_friction", "actuators", (1.5e4, 5e-6, *(0.0,) * 7)),
+        "stiffness_drift",
+        "isolators/linear",
+        (-0.037,),
+    )
     found = design_files(design, model, -0.5)
     plant = build_plant(found.design, found.rig)
     candidate, made = mu_optimal(found.design, plant, found.rig)
@@ -309,8 +340,9 @@ def test_an_iteration_that_stalls_above_its_target_goes_on(baseline, design):
 @pytest.mark.slow
 def test_an_effect_that_does_nothing_leaves_mu(baseline, design):
     lines = []
-    found = compare_designs(baseline, with_one(baseline, "mount_relaxation", "isolators z", (0.0, 3.0)), design,
-                            lines.append)
+    found = compare_designs(
+        baseline, with_one(baseline, "mount_relaxation", "isolators z", (0.0, 3.0)), design, lines.append
+    )
     assert found.after.mu_upper == pytest.approx(found.before.mu_upper, rel=1e-2)
     assert "does not matter" in found.sentences[0] and len(lines) == 5
 

@@ -24,8 +24,19 @@ AVIS = load_rig("avis")
 assert isinstance(AVIS, AvisTable)
 RIG = AVIS.with_channels_apart()
 DESIGN = without_ranges(default_design(RIG, "z and phi_x", PARAMETERS_PERCENT))
-MECHANICS = ("mass", "J1", "com_y", "isolator1.k_z", "isolator2.k_z", "isolator3.k_z", "isolator4.k_z",
-             "isolator1.c_z", "isolator2.p_y", "actuator.Az1", "actuator.Az2")
+MECHANICS = (
+    "mass",
+    "J1",
+    "com_y",
+    "isolator1.k_z",
+    "isolator2.k_z",
+    "isolator3.k_z",
+    "isolator4.k_z",
+    "isolator1.c_z",
+    "isolator2.p_y",
+    "actuator.Az1",
+    "actuator.Az2",
+)
 SENSORS = tuple(f"sensor.{name}" for name in RIG.sensor_rows()[0])
 DRIVES = tuple(name for name in RIG.parameters() if name.startswith("actuator."))
 
@@ -56,14 +67,17 @@ def test_tables_drawn_from_the_covariance_lie_in_the_blocks(rng):
     def felt(N: np.ndarray) -> np.ndarray:
         """Of the drives only what the controller's allocation uses."""
         return np.hstack([N[..., :6], N[..., 6:] @ A])
-    bases = [felt(np.array([one.change for one in found.blocks if one.coordinate == name])).T
-             for name in ("z", "phi_x")]
+
+    bases = [
+        felt(np.array([one.change for one in found.blocks if one.coordinate == name])).T for name in ("z", "phi_x")
+    ]
     scale = np.max(np.abs(np.hstack(bases)), axis=1)
     scale[scale == 0] = 1.0
     for _ in range(400):
         change = size * (root @ rng.standard_normal(len(MECHANICS)))
-        moved = RIG.with_parameters({name: RIG.parameters()[name].value + float(d)
-                                     for name, d in zip(MECHANICS, change, strict=True)})
+        moved = RIG.with_parameters(
+            {name: RIG.parameters()[name].value + float(d) for name, d in zip(MECHANICS, change, strict=True)}
+        )
         away = felt(matrices(moved) - nominal) / scale
         deltas = []
         for base, row in zip(bases, away, strict=True):
@@ -84,14 +98,20 @@ def test_a_mass_known_to_a_percent():
     change = np.abs(found.blocks[0].change)
     assert change[0] == pytest.approx(k * 0.03 * RIG.mass, rel=1e-4) and np.all(change[1:] <= 1e-9 * change[0])
     eom, s = RIG.equations_of_motion(), 1j * SETTINGS.omega
-    inertia = s ** 2 * RIG.mass
+    inertia = s**2 * RIG.mass
     largest = np.max(np.abs(k * 0.03 * inertia / (inertia + s * eom.C[2, 2] + eom.K[2, 2])))
     assert found.effect[0] == pytest.approx(largest, rel=1e-2)
 
 
 def test_blocks_are_single_copies_and_move_one_row(rng):
-    changes = [UncertainEquation(f"fit {k} of {name}", name, rng.standard_normal(6 + len(DRIVES)) * 1e-2 * np.max(
-        np.abs(matrices(RIG)), axis=0)) for k, name in enumerate(("z", "phi_x", "z"))]
+    changes = [
+        UncertainEquation(
+            f"fit {k} of {name}",
+            name,
+            rng.standard_normal(6 + len(DRIVES)) * 1e-2 * np.max(np.abs(matrices(RIG)), axis=0),
+        )
+        for k, name in enumerate(("z", "phi_x", "z"))
+    ]
     uncertain = uncertain_rig(RIG, changes)
     assert [block.rows for block in uncertain.blocks.blocks] == [1, 1, 1]
     deltas, omega = np.array([0.7, -1.0, -0.4]), 2 * np.pi * np.array([0.5, 3.0, 30.0])
@@ -99,10 +119,11 @@ def test_blocks_are_single_copies_and_move_one_row(rng):
     for one, delta in zip(changes, deltas, strict=True):
         N[("z", "phi_x").index(one.coordinate)] += delta * one.change
     system = lft_upper(uncertain.system, np.diag(deltas)).select(
-        ["z_dot", "phi_x_edge_dot"], list(RIG.equations_of_motion().actuators))
+        ["z_dot", "phi_x_edge_dot"], list(RIG.equations_of_motion().actuators)
+    )
     for w, found in zip(omega, system.frequency_response(omega), strict=True):
         s = 1j * w
-        B = s ** 2 * N[:, :2] + s * N[:, 2:4] + N[:, 4:6]
+        B = s**2 * N[:, :2] + s * N[:, 2:4] + N[:, 4:6]
         assert np.allclose(found, -s * np.linalg.solve(B, N[:, 6:]), rtol=1e-9)
 
 
@@ -121,10 +142,10 @@ def test_what_sensors_read_is_made_up_for_by_all_drives_alike():
     names = tuple(name for name in RIG.parameters() if name.startswith("direction.A"))
     model = TableModel(ResponseModel.of(RIG, (*SENSORS, *DRIVES, *names)))
     tilt = 1e-3 * np.random.default_rng(5).standard_normal(len(names))
-    model = model.at(np.concatenate([model.values[:-len(names)], model.values[-len(names):] + tilt]))
-    size = np.concatenate([0.01 * model.values[:len(SENSORS)], np.zeros(len(model.names) - len(SENSORS))])
+    model = model.at(np.concatenate([model.values[: -len(names)], model.values[-len(names) :] + tilt]))
+    size = np.concatenate([0.01 * model.values[: len(SENSORS)], np.zeros(len(model.names) - len(SENSORS))])
     wiring = wiring_of(plant_of(DESIGN, TableModel(ResponseModel.of(RIG, ())))[0], model)
-    found = fit_uncertainty(DESIGN, model, np.diag(size ** 2), wiring, replace(SETTINGS, left_out=1e-3))
+    found = fit_uncertainty(DESIGN, model, np.diag(size**2), wiring, replace(SETTINGS, left_out=1e-3))
     own = -np.array([model.effective.rig.equations_of_motion().T[2]])
     for one in found.blocks:
         assert np.max(np.abs(one.change[6:])) < 0.1 * np.max(np.abs(own))

@@ -18,14 +18,22 @@ from avis_ctrl.study.hidden_effects import rehearse_with_effects
 from avis_ctrl.study.plan_file import plan_from_table, plan_toml, read_plan
 
 RIG = load_rig("avis")
-QUIET = {"duration_s": 8.0, "settle_s": 2.0, "ambient": {"velocity_rms_m_per_s": 0.0},
-         "sensors": {"noise": False, "quantiser": False},
-         "record": [{"excitation": "noise", "level_V": 0.2}, {"excitation": "floor", "floor_rms_m_per_s": 1e-4}]}
+QUIET = {
+    "duration_s": 8.0,
+    "settle_s": 2.0,
+    "ambient": {"velocity_rms_m_per_s": 0.0},
+    "sensors": {"noise": False, "quantiser": False},
+    "record": [{"excitation": "noise", "level_V": 0.2}, {"excitation": "floor", "floor_rms_m_per_s": 1e-4}],
+}
 
 
 def signals(*effects, **changed):
-    return [one.y for one in rehearse_with_effects(RIG, plan_from_table(QUIET | {"effect": list(effects)} | changed), 4
-                                       ).campaign.records]
+    return [
+        one.y
+        for one in rehearse_with_effects(
+            RIG, plan_from_table(QUIET | {"effect": list(effects)} | changed), 4
+        ).campaign.records
+    ]
 
 
 def error(found, true):
@@ -60,8 +68,15 @@ def test_a_cubic_spring_grows_with_the_cube_of_the_level():
 
 
 def test_a_plan_with_effects_is_written_as_it_is_read(tmp_path):
-    plan = plan_from_table(QUIET | {"effect": [{"name": "sensor_gain", "place": "Sz2", "values": {"gain": 1.2}},
-                                               {"name": "loop_delay", "values": {"extra_delay_s": 1e-3}}]})
+    plan = plan_from_table(
+        QUIET
+        | {
+            "effect": [
+                {"name": "sensor_gain", "place": "Sz2", "values": {"gain": 1.2}},
+                {"name": "loop_delay", "values": {"extra_delay_s": 1e-3}},
+            ]
+        }
+    )
     path = tmp_path / "plan.toml"
     path.write_text(plan_toml(plan), encoding="utf-8")
     assert read_plan(path) == plan
@@ -69,15 +84,19 @@ def test_a_plan_with_effects_is_written_as_it_is_read(tmp_path):
         rehearse(RIG, plan)
 
 
-@pytest.mark.parametrize(("effect", "said"), [
-    ({"name": "gremlins"}, r"effect\[1\].name.*gremlins.*cubic_stiffness"),
-    ({"name": "sensor_gain", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz2"),
-    ({"name": "sensor_gain", "place": "Sz9", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz9"),
-    ({"name": "loop_delay", "values": {"delay": 1.0}}, r"effect\[1\].values.*extra_delay_s.*0 to 0.2 s"),
-    ({"name": "loop_delay", "values": {"extra_delay_s": 1.0}}, r"extra_delay_s.*0 to 0.2 s"),
-    ({"name": "loop_delay"}, r"effect\[1\].values.*with an effect.*extra_delay_s"),
-    ({"name": "loop_delay", "values": {"extra_delay_s": "long"}}, r"extra_delay_s.*number"),
-    ({"nam": "loop_delay"}, "nam")])
+@pytest.mark.parametrize(
+    ("effect", "said"),
+    [
+        ({"name": "gremlins"}, r"effect\[1\].name.*gremlins.*cubic_stiffness"),
+        ({"name": "sensor_gain", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz2"),
+        ({"name": "sensor_gain", "place": "Sz9", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz9"),
+        ({"name": "loop_delay", "values": {"delay": 1.0}}, r"effect\[1\].values.*extra_delay_s.*0 to 0.2 s"),
+        ({"name": "loop_delay", "values": {"extra_delay_s": 1.0}}, r"extra_delay_s.*0 to 0.2 s"),
+        ({"name": "loop_delay"}, r"effect\[1\].values.*with an effect.*extra_delay_s"),
+        ({"name": "loop_delay", "values": {"extra_delay_s": "long"}}, r"extra_delay_s.*number"),
+        ({"nam": "loop_delay"}, "nam"),
+    ],
+)
 def test_wrong_effects_are_one_line(effect, said):
     with pytest.raises(InputError, match=said) as caught:
         signals(effect)
@@ -110,8 +129,24 @@ def test_the_command_with_an_effect_of_ones_own(tmp_path):
     plan = plan_from_table(QUIET | {"effect": [{"name": "half_gain", "place": "Sy1", "values": {"gain": 0.5}}]})
     (tmp_path / "plan.toml").write_text(plan_toml(plan))
     files = {name: str(tmp_path / name) for name in ("plan.toml", "own.py", "c.h5", "truth.toml")}
-    app(["simulate-campaign", "--rig", "avis", "--plan", files["plan.toml"], "--effects", files["own.py"], "--out",
-         files["c.h5"], "--truth", files["truth.toml"], "--seed", "4"], standalone_mode=False)
+    app(
+        [
+            "simulate-campaign",
+            "--rig",
+            "avis",
+            "--plan",
+            files["plan.toml"],
+            "--effects",
+            files["own.py"],
+            "--out",
+            files["c.h5"],
+            "--truth",
+            files["truth.toml"],
+            "--seed",
+            "4",
+        ],
+        standalone_mode=False,
+    )
     k, (plain, _) = list(RIG.sensor_rows()[0]).index("Sy1"), signals()
     y = read_measurements(files["c.h5"]).records[0].load().y
     assert np.std(y[:, k] - 0.5 * plain[:, k]) < 0.02 * np.std(plain[:, k])
@@ -119,14 +154,27 @@ def test_the_command_with_an_effect_of_ones_own(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("effect", "parameter", "true"), [
-    ({"name": "actuator_lag", "place": "actuators", "values": {"time_constant_s": 1.3e-3}}, "time_constant_s", 1.3e-3),
-    ({"name": "geophone_corner", "place": "Sz2", "values": {"corner_Hz": 4.95}}, "corner_Hz", 4.95)])
+@pytest.mark.parametrize(
+    ("effect", "parameter", "true"),
+    [
+        (
+            {"name": "actuator_lag", "place": "actuators", "values": {"time_constant_s": 1.3e-3}},
+            "time_constant_s",
+            1.3e-3,
+        ),
+        ({"name": "geophone_corner", "place": "Sz2", "values": {"corner_Hz": 4.95}}, "corner_Hz", 4.95),
+    ],
+)
 def test_an_effect_is_named_behind_an_anti_alias_filter(effect, parameter, true):
     rig = RIG.with_electronics(Electronics(anti_alias_order=3, anti_alias_corner_Hz=200.0))
-    plan = {"duration_s": 30.0, "band_Hz": [0.5, 60.0], "floor_sensor": {"recorded": False}, "effect": [effect],
-            "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
-            "record": [{"excitation": "noise", "level_V": level, "records": 2} for level in (0.08, 0.2, 0.4)]}
+    plan = {
+        "duration_s": 30.0,
+        "band_Hz": [0.5, 60.0],
+        "floor_sensor": {"recorded": False},
+        "effect": [effect],
+        "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+        "record": [{"excitation": "noise", "level_V": level, "records": 2} for level in (0.08, 0.2, 0.4)],
+    }
     gap = find_gap(rehearse_with_effects(rig, plan_from_table(plan), 4).campaign, rig).gap
     assert [one.name for one in gap.effects] == [effect["name"]] and gap.verdict == "explained"
     found = gap.effects[0].parameters[parameter]

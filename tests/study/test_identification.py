@@ -44,7 +44,7 @@ def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
     sigma, V = information.directions
     z = (V.T @ ((information.values - truth) / information.scale) / sigma)[information.determined]
     assert information.rank == 20
-    assert np.mean(z ** 2) < 2.5 and np.max(np.abs(z)) < 4.5
+    assert np.mean(z**2) < 2.5 and np.max(np.abs(z)) < 4.5
     alone = information.known
     assert np.all(np.abs(information.values - truth)[alone] < 5 * information.standard_deviation[alone])
     start = np.array([found.start.parameters()[name].value for name in information.names])
@@ -60,10 +60,19 @@ def test_a_design_whose_weights_nobody_stated_says_for_which_table_they_are(foun
     assert not design_start(found, stated)[0][DESIGN_FILE].startswith("#")
 
 
-@pytest.mark.parametrize(("name", "lines"), [
-    ("designs/rigs/skewed.toml", ('shipped: "avis", 500 kg, modes from 1.94 to 5.24 Hz',
-                                  'this table: "skewed", 120 kg, modes from 7.54 to 15.6 Hz')),
-    ("halcyonics", ('shipped: "halcyonics", 29.3 kg', 'this table: "halcyonics", 19.3 kg'))])
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        (
+            "designs/rigs/skewed.toml",
+            (
+                'shipped: "avis", 500 kg, modes from 1.94 to 5.24 Hz',
+                'this table: "skewed", 120 kg, modes from 7.54 to 15.6 Hz',
+            ),
+        ),
+        ("halcyonics", ('shipped: "halcyonics", 29.3 kg', 'this table: "halcyonics", 19.3 kg')),
+    ],
+)
 def test_the_comparison_of_tables_is_a_comment(name, lines):
     path = Path(__file__).resolve().parents[2] / name
     text = assumed_weights(load_rig(path if path.is_file() else name))
@@ -130,12 +139,18 @@ def test_hold_out_and_parameters_as_asked(rehearsal):
     assert found.model.names == ("mass", "J1", "J2", "J3")
 
 
-@pytest.mark.parametrize(("change", "said"), [
-    ({"hold_out": ("09",)}, "09"), ({"hold_out": ("00", "01", "02", "03", "04", "05", "06")}, "not all"),
-    ({"parameters": ("weight*",)}, "weight"), ({"parameters": ("mass", "corner.Sz1")}, "one suspension for all"),
-    ({"priors": {"weight": (1.0, 1.0)}}, "weight"),
-    ({"band_Hz": (300.0, 300.001)}, "band"),
-    ({"band_Hz": (200.0, 400.0)}, r"excited from [\d.]+ to \d+(\.\d)? Hz; expected a band that overlaps")])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"hold_out": ("09",)}, "09"),
+        ({"hold_out": ("00", "01", "02", "03", "04", "05", "06")}, "not all"),
+        ({"parameters": ("weight*",)}, "weight"),
+        ({"parameters": ("mass", "corner.Sz1")}, "one suspension for all"),
+        ({"priors": {"weight": (1.0, 1.0)}}, "weight"),
+        ({"band_Hz": (300.0, 300.001)}, "band"),
+        ({"band_Hz": (200.0, 400.0)}, r"excited from [\d.]+ to \d+(\.\d)? Hz; expected a band that overlaps"),
+    ],
+)
 def test_options_that_do_not_fit_are_answered(rehearsal, change, said):
     with pytest.raises(InputError, match=said) as error:
         identify(rehearsal.campaign, load_rig("avis"), IdentifyOptions(**({"starts": 1} | change)))
@@ -165,9 +180,15 @@ def test_a_campaign_through_a_file_gives_the_same(rehearsal, found, tmp_path):
     assert again.provenance["measurement_sha256"] == found.provenance["measurement_sha256"]
 
 
-@pytest.mark.parametrize(("name", "content", "said"), [
-    ("result.json", None, "avis identify or avis gap"), ("result.json", "{", "JSON"),
-    ("result.json", "[]", "avis-identification.*avis identify or avis gap"), ("rig.toml", None, "rig.toml")])
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("result.json", None, "avis identify or avis gap"),
+        ("result.json", "{", "JSON"),
+        ("result.json", "[]", "avis-identification.*avis identify or avis gap"),
+        ("rig.toml", None, "rig.toml"),
+    ],
+)
 def test_a_folder_that_is_none_is_answered(found, tmp_path, name, content, said):
     write_identification(found, tmp_path)
     (tmp_path / name).unlink()

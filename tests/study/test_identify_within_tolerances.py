@@ -39,8 +39,9 @@ def test_parameters_lie_within_their_standard_deviations(case, found):
     """Those of the table without its traces, which are what no parameter stands for."""
     plant, information = build_plant(replace(case, traces=())), found.information
     truth = {"mass": plant.m, **{f"J{k + 1}": plant.J[k, k] for k in range(3)}}
-    truth |= {f"isolator{k + 1}.{kind}_z": values[k, 2] for kind, values in (("k", plant.k), ("c", plant.c))
-              for k in range(4)}
+    truth |= {
+        f"isolator{k + 1}.{kind}_z": values[k, 2] for kind, values in (("k", plant.k), ("c", plant.c)) for k in range(4)
+    }
     at = [information.names.index(name) for name in truth]
     error = information.values[at] - np.array(list(truth.values()))
     assert np.all(np.abs(error) < 4 * information.standard_deviation[at])
@@ -48,7 +49,7 @@ def test_parameters_lie_within_their_standard_deviations(case, found):
 
 
 def test_the_error_on_held_out_records_falls(found):
-    held, = found.validation.held_out
+    (held,) = found.validation.held_out
     assert held.nrms_all < 0.1 * held.nrms_all_exact
     assert any("taken as exact" in sentence for sentence in found.validation.sentences)
 

@@ -42,8 +42,9 @@ def shipped() -> tuple[Design, DesignPlant]:
 def one_axis() -> tuple[Design, DesignPlant]:
     """z alone; mass and the damping of one isolator uncertain, no chains."""
     design, rig = read_study(DESIGNS / "avis_z_phix.toml")
-    uncertainty = design.uncertainty.model_copy(update={
-        "parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}, "actuator_chains": None})
+    uncertainty = design.uncertainty.model_copy(
+        update={"parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}, "actuator_chains": None}
+    )
     design = design.model_copy(update={"keep": ["z"], "uncertainty": uncertainty})
     return design, build_plant(design, rig)
 
@@ -52,8 +53,10 @@ def one_axis() -> tuple[Design, DesignPlant]:
 def measured(one_axis) -> dict[str, ControllerResult]:
     design, plant = one_axis
     samples = random_perturbations(plant, 3, 1)
-    return {c.name: analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
-            for c in (passive(), classical_skyhook(plant, load_rig("avis"), design))}
+    return {
+        c.name: analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
+        for c in (passive(), classical_skyhook(plant, load_rig("avis"), design))
+    }
 
 
 def test_a_command_waits_for_the_delay_and_half_a_sample(shipped):
@@ -80,12 +83,12 @@ def test_sensor_noise_is_that_of_the_rig_file(shipped):
     """1 mV r.m.s. and the rounding of 14 bits over 20 V, white to 500 Hz, over 3125 V s/m, through the decoding."""
     design, _ = shipped
     plant = build_plant(design, load_rig("avis").with_electronics(Electronics(sensor_flicker_corner_Hz=0.0)))
-    density = np.hypot(1e-3, 20 / 2 ** 14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125
+    density = np.hypot(1e-3, 20 / 2**14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125
     inputs = [f"noise_{a}" for a in plant.axes]
     # Far above all loops' band nothing but the noise path is left: take it without the rig by u = 0.
     G = plant.full.nominal().P.select([f"seen_{a}_dot" for a in plant.axes], inputs)(2j * np.pi * 20.0)
     G = G * plant.floor_density
-    np.testing.assert_allclose(G @ G.conj().T, density ** 2 * plant.decoding @ plant.decoding.T, rtol=1e-9)
+    np.testing.assert_allclose(G @ G.conj().T, density**2 * plant.decoding @ plant.decoding.T, rtol=1e-9)
 
 
 def test_site_motion_is_the_spectrum_through_the_table(one_axis, measured):
@@ -95,16 +98,17 @@ def test_site_motion_is_the_spectrum_through_the_table(one_axis, measured):
     m, c, k = equations.M[2, 2], equations.C[2, 2], equations.K[2, 2]
     f = np.arange(plant.floor.low_Hz, 250.0, 2e-3)
     s = 2j * np.pi * f
-    density = np.abs((c * s + k) / (m * s ** 2 + c * s + k)) * plant.floor.asd(f, "velocity")
+    density = np.abs((c * s + k) / (m * s**2 + c * s + k)) * plant.floor.asd(f, "velocity")
     site = measured["passive"].site
     band = (f >= design.floor.band_Hz[0]) & (f <= design.floor.band_Hz[1])
     assert site.velocity_rms["z"] == pytest.approx(np.sqrt(np.trapezoid(density[band] ** 2, f[band])), rel=5e-3)
     assert site.noise_rms["z"] == 0.0
     for number in (3, 10):  # third octaves about 2 and 10 Hz: edges 10^(+-1/20)
         mid = site.third_octave_Hz[number]
-        inside = (f >= mid * 10 ** -0.05) & (f < mid * 10 ** 0.05)
+        inside = (f >= mid * 10**-0.05) & (f < mid * 10**0.05)
         assert site.payload_third_octaves[number, 0] == pytest.approx(
-            np.sqrt(np.trapezoid(density[inside] ** 2, f[inside])), rel=2e-2)
+            np.sqrt(np.trapezoid(density[inside] ** 2, f[inside])), rel=2e-2
+        )
 
 
 def test_noise_reaches_the_payload_through_the_loop(one_axis, measured):
@@ -116,10 +120,11 @@ def test_noise_reaches_the_payload_through_the_loop(one_axis, measured):
     P = plant.full.nominal().P
     G = P.select("z_dot", "command_z").frequency_response(omega)[:, 0, 0]
     seen = P.select("seen_z_dot", "command_z").frequency_response(omega)[:, 0, 0]
-    density = np.hypot(1e-3, 20 / 2 ** 14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125 * np.linalg.norm(plant.decoding)
+    density = np.hypot(1e-3, 20 / 2**14 / np.sqrt(12)) * np.sqrt(2 / 1000) / 3125 * np.linalg.norm(plant.decoding)
     moved = np.abs(G * K / (1 - seen * K)) * density
     assert measured["skyhook_classical"].site.noise_rms["z"] == pytest.approx(
-        np.sqrt(np.trapezoid(moved ** 2, f)), rel=5e-3)
+        np.sqrt(np.trapezoid(moved**2, f)), rel=5e-3
+    )
 
 
 def test_worst_case_in_the_band_is_that_of_the_worst_rebuilt_rig(one_axis, measured):
@@ -131,7 +136,7 @@ def test_worst_case_in_the_band_is_that_of_the_worst_rebuilt_rig(one_axis, measu
     c, k1, gains = nominal.C[2, 2], 45.0e3, []
     for dm, dk in product(np.linspace(-0.1, 0.1, 9), (-0.15, 0.15)):
         m, k = nominal.M[2, 2] * (1 + dm), nominal.K[2, 2] + dk * k1
-        gains.append(np.max(np.abs((c * s + k) / (m * s ** 2 + c * s + k))))
+        gains.append(np.max(np.abs((c * s + k) / (m * s**2 + c * s + k))))
     found = measured["passive"].worst_band
     assert max(gains) <= found.upper
     assert max(gains) == pytest.approx(found.upper, rel=1e-2)
@@ -143,12 +148,19 @@ def test_each_axis_lies_between_what_sampled_plants_reach_and_its_bound(shipped)
     part = plant.full.restricted([*plant.floor_velocities], [*plant.velocities]).closed(None)
     blocks = plant.synthesis.blocks
     stability = bound(plant, blocks, mu_peak(part.select(slice(blocks.n_z), slice(blocks.n_w)), blocks))
-    upper, lower = (np.array([worst_of_axis(design, plant, k, None, one) for k in range(len(plant.axes))])
-                    for one in (stability, None))
+    upper, lower = (
+        np.array([worst_of_axis(design, plant, k, None, one) for k in range(len(plant.axes))])
+        for one in (stability, None)
+    )
     low, high = design.transmissibility.band_Hz
     response = part.frequency_response(2 * np.pi * np.geomspace(low, high, 200))
-    reached = np.max([np.linalg.norm(perturbed(response, delta[None]), axis=2).max(axis=0)
-                      for delta in random_perturbations(plant, 30, 5)], axis=0)
+    reached = np.max(
+        [
+            np.linalg.norm(perturbed(response, delta[None]), axis=2).max(axis=0)
+            for delta in random_perturbations(plant, 30, 5)
+        ],
+        axis=0,
+    )
     assert np.all(reached <= upper) and np.all(lower <= upper) and np.all(reached <= lower)
 
 
@@ -158,29 +170,43 @@ def with_bounds(c: ControllerResult, name: str, lower: float, upper: float) -> C
 
 
 def asking(design: Design, **limits: float) -> Design:
-    return design.model_copy(update={"requirement": [RequirementSection(quantity=quantity, **{
-        "at_least" if quantity.startswith("advantage") else "at_most": value}) for quantity, value in limits.items()]})
+    return design.model_copy(
+        update={
+            "requirement": [
+                RequirementSection(
+                    quantity=quantity, **{"at_least" if quantity.startswith("advantage") else "at_most": value}
+                )
+                for quantity, value in limits.items()
+            ]
+        }
+    )
 
 
 def test_advantage_counts_the_bounds_against_the_controller(one_axis, measured):
     """What the skyhook surely reaches over what mu surely stays below: 20 log10(4 / 2)."""
     design, _ = one_axis
-    controllers = [measured["passive"], with_bounds(measured["passive"], "skyhook", 4.0, 8.0),
-                   with_bounds(measured["passive"], "mu", 1.0, 2.0)]
-    line, = check_requirements(asking(design, advantage_over_skyhook_dB=6.0), controllers)
+    controllers = [
+        measured["passive"],
+        with_bounds(measured["passive"], "skyhook", 4.0, 8.0),
+        with_bounds(measured["passive"], "mu", 1.0, 2.0),
+    ]
+    (line,) = check_requirements(asking(design, advantage_over_skyhook_dB=6.0), controllers)
     assert (line.value, line.met) == (pytest.approx(20 * np.log10(2.0)), True)
 
 
 def test_a_skyhook_that_may_be_unstable_is_no_rival(one_axis, measured):
     design, _ = one_axis
-    controllers = [measured["passive"], with_bounds(measured["passive"], "skyhook", np.inf, np.inf),
-                   with_bounds(measured["passive"], "mu", 1.0, 2.0)]
-    line, = check_requirements(asking(design, advantage_over_skyhook_dB=6.0), controllers)
+    controllers = [
+        measured["passive"],
+        with_bounds(measured["passive"], "skyhook", np.inf, np.inf),
+        with_bounds(measured["passive"], "mu", 1.0, 2.0),
+    ]
+    (line,) = check_requirements(asking(design, advantage_over_skyhook_dB=6.0), controllers)
     assert np.isnan(line.value)
     assert not line.met
 
 
-@pytest.mark.parametrize(("asked_dB", "own", "limit"), [(6.0, 1.5, 10 ** 0.3), (6.0, 3.0, 3.0)])
+@pytest.mark.parametrize(("asked_dB", "own", "limit"), [(6.0, 1.5, 10**0.3), (6.0, 3.0, 3.0)])
 def test_the_skyhook_may_peak_as_high_as_asked_or_as_its_rival(one_axis, measured, asked_dB, own, limit):
     design, _ = one_axis
     mu = with_bounds(measured["passive"], "mu", own, own)
@@ -193,22 +219,25 @@ def test_a_controller_no_better_than_none_is_called_so(one_axis, measured):
     rest = measured["passive"]
     idle = gain(np.zeros((1, 1)), plant.synthesis.y, plant.synthesis.u)
     nothing = replace(rest, name="mu", K=idle)
-    line, = check_requirements(asking(design, fastest_controller_pole_Hz=250.0),
-                               [rest, replace(rest, name="skyhook"), nothing])
+    (line,) = check_requirements(
+        asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), nothing]
+    )
     assert np.isnan(line.value) and not line.met
     text = best_found(plant, nothing, [rest])
     assert "no controller better than none" in text and "ended too early" not in text
     better = replace(nothing, mu=replace(rest.mu, upper=0.9 * rest.mu.upper), fastest_pole_Hz=20.0)
-    line, = check_requirements(asking(design, fastest_controller_pole_Hz=250.0),
-                               [rest, replace(rest, name="skyhook"), better])
+    (line,) = check_requirements(
+        asking(design, fastest_controller_pole_Hz=250.0), [rest, replace(rest, name="skyhook"), better]
+    )
     assert (line.value, line.met) == (20.0, True)
 
 
 def test_reduction_is_compared_where_the_table_at_rest_peaks(shipped):
     """The weighted norm of the table at rest on that grid is its peak, which the even grid missed by a factor 3."""
     _, plant = shipped
-    nominal = plant.synthesis.closed(None).select(slice(plant.synthesis.blocks.n_z, None),
-                                                  slice(plant.synthesis.blocks.n_w, None))
+    nominal = plant.synthesis.closed(None).select(
+        slice(plant.synthesis.blocks.n_z, None), slice(plant.synthesis.blocks.n_w, None)
+    )
     omega = reduction_grid(plant, 1.0)
     seen = np.max(np.linalg.norm(nominal.frequency_response(omega), 2, axis=(1, 2)))
     assert seen > 0.99 * hinf_norm(nominal).gain

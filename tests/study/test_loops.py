@@ -25,14 +25,22 @@ HOLD = 2 / np.pi  # at half the sample rate
 
 
 def table_of(**changes):
-    return design_from_table({
-        "title": "small", "rig": "avis", "keep": ["z", "phi_x"],
-        "uncertainty": {"parameters_percent": {"mass": 10.0}, "actuator_chains": {
-            "low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 200.0}},
-        "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
-        "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
-        "synthesis": {"max_iterations": 1, "polish": False},
-        "simulation": {"duration_s": 15.0, "random_plants": 1}} | changes)
+    return design_from_table(
+        {
+            "title": "small",
+            "rig": "avis",
+            "keep": ["z", "phi_x"],
+            "uncertainty": {
+                "parameters_percent": {"mass": 10.0},
+                "actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 200.0},
+            },
+            "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
+            "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+            "synthesis": {"max_iterations": 1, "polish": False},
+            "simulation": {"duration_s": 15.0, "random_plants": 1},
+        }
+        | changes
+    )
 
 
 def test_the_limit_keeps_the_loop_gain_of_every_sampled_plant_below_one():
@@ -42,7 +50,7 @@ def test_the_limit_keeps_the_loop_gain_of_every_sampled_plant_below_one():
     limit = gain_limit(plant, rig.sample_rate_Hz)
     assert limit.omega[0] == pytest.approx(np.pi * rig.sample_rate_Hz)
     blocks, P = plant.full.blocks, plant.full.P
-    M = P.select([*P.outputs[:blocks.n_z], *plant.full.y], [*P.inputs[:blocks.n_w], *plant.full.u])
+    M = P.select([*P.outputs[: blocks.n_z], *plant.full.y], [*P.inputs[: blocks.n_w], *plant.full.u])
     M, n_w, n_z = M.frequency_response(limit.omega), blocks.n_w, blocks.n_z
     images = np.where(limit.omega == limit.omega[0], 2.0, 1.0)  # that of half the rate falls onto it
     # Chains of full size in phase with the table are the worst; random ones beside them.
@@ -50,7 +58,8 @@ def test_the_limit_keeps_the_loop_gain_of_every_sampled_plant_below_one():
     gains = []
     for delta in (full, *random_perturbations(plant, 20, 0)):
         table = M[:, n_z:, n_w:] + M[:, n_z:, :n_w] @ delta @ np.linalg.solve(
-            np.eye(n_z) - M[:, :n_z, :n_w] @ delta, M[:, :n_z, n_w:])
+            np.eye(n_z) - M[:, :n_z, :n_w] @ delta, M[:, :n_z, n_w:]
+        )
         gains.append(np.linalg.norm(table, 2, (1, 2)) * limit.most * images * (2 + HOLD))
     assert np.all(np.array(gains) <= 1 + 1e-4)
     assert np.all(np.max(gains, axis=0)[:5] > 0.9)  # further up the worst phase is another one
@@ -101,8 +110,10 @@ def test_a_design_that_asks_for_the_loops_has_them(loops):
 @pytest.mark.parametrize("asked", [[], ["loops"]])
 def test_only_a_design_that_asks_has_loops(loops, monkeypatch, asked):
     """Those that cannot be made do not stop it."""
+
     def none(*arguments):
         raise ComputationError("no loops")
+
     plant, rig, skyhook, _ = loops
     monkeypatch.setattr("avis_ctrl.study.runner.tuned_loops", none)
     candidates = [replace(skyhook, name="mu", title="mu"), replace(skyhook, name="passive", K=None)]

@@ -25,7 +25,9 @@ from avis_ctrl.study.output import FILES, FOLDERS
 
 SIZE = 300_000
 
-WRITER = f"SIZE = {SIZE}" + """
+WRITER = (
+    f"SIZE = {SIZE}"
+    + """
 import sys
 from pathlib import Path
 from avis_ctrl import files
@@ -38,6 +40,7 @@ while True:
         print("writing", flush=True)
     k += 1
 """
+)
 
 
 @pytest.mark.parametrize("way", ["nameless", "renamed"])
@@ -96,6 +99,7 @@ def test_a_file_that_the_system_cuts_short_leaves_the_old_one(way, tmp_path):
 def test_a_full_disk_leaves_the_old_file_and_says_so(step, tmp_path, monkeypatch):
     def full(*args, **kwargs):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
     (tmp_path / "report.pdf").write_bytes(b"old")
     if step == "write":
         monkeypatch.setattr(files.os, "open", full)
@@ -119,6 +123,7 @@ def test_without_nameless_files_the_renamed_way_is_taken(tmp_path, monkeypatch):
         if flags & os.O_TMPFILE == os.O_TMPFILE:
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
         return opened(path, flags, *args, **kwargs)
+
     monkeypatch.setattr(files.os, "open", unsupported)
     write_whole(tmp_path / "plant.json", b"{}")
     assert (tmp_path / "plant.json").read_bytes() == b"{}"
@@ -127,8 +132,10 @@ def test_without_nameless_files_the_renamed_way_is_taken(tmp_path, monkeypatch):
 
 def test_without_links_a_copy_takes_the_name(tmp_path, monkeypatch):
     """Without /proc a file that has no name cannot get one."""
+
     def absent(*args, **kwargs):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+
     monkeypatch.setattr(files.os, "link", absent)
     write_whole(tmp_path / "plant.json", b"{}" * 10000)
     assert (tmp_path / "plant.json").read_bytes() == b"{}" * 10000
@@ -147,6 +154,7 @@ def test_several_files_are_all_written_or_none(tmp_path, monkeypatch):
         if len(synced) == 3:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(descriptor)
+
     monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(ComputationError, match=r"before is untouched.*No space left"):
         write_together(tmp_path, contents, [tmp_path / "old.pdf", tmp_path / "absent"])
@@ -165,6 +173,7 @@ def refused_rename(monkeypatch, path):
         if Path(target) == path:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         replace(source, target)
+
     monkeypatch.setattr(files.os, "replace", refuse)
 
 
@@ -173,11 +182,15 @@ def test_a_rename_that_fails_after_old_files_went_says_what_is_missing(tmp_path,
         (tmp_path / name).write_bytes(b"old")
     refused_rename(monkeypatch, tmp_path / "report.html")
     with pytest.raises(ComputationError) as caught:
-        write_together(tmp_path, {"controllers/mu.json": b"1", "report.html": b"2", "result.json": b"3"},
-                       [tmp_path / name for name in ("result.json", "report.html", "old.pdf", "absent")])
+        write_together(
+            tmp_path,
+            {"controllers/mu.json": b"1", "report.html": b"2", "result.json": b"3"},
+            [tmp_path / name for name in ("result.json", "report.html", "old.pdf", "absent")],
+        )
     assert caught.value.failed == (
         f"{tmp_path} is incomplete, do not use what is in it (missing: report.html, result.json, old.pdf; "
-        f"new: {os.path.join('controllers', 'mu.json')})")
+        f"new: {os.path.join('controllers', 'mu.json')})"
+    )
     assert caught.value.cause == os.strerror(errno.EIO)
     assert [one for one in tmp_path.rglob("*") if one.is_file()] == [tmp_path / "controllers" / "mu.json"]
 
@@ -224,7 +237,11 @@ def test_what_was_made_goes_again_where_an_error_leaves_it_empty(tmp_path):
         (path / "result.json").write_text("{}")
         raise KeyError
     assert sorted(one.relative_to(tmp_path).as_posix() for one in tmp_path.rglob("*")) == [
-        "mine", "written", "written/b", "written/b/result.json"]
+        "mine",
+        "written",
+        "written/b",
+        "written/b/result.json",
+    ]
 
 
 def test_what_is_read_is_never_written(tmp_path):
@@ -288,10 +305,12 @@ def test_a_file_in_place_of_the_controllers_is_refused(tmp_path):
     assert (tmp_path / "controllers").read_bytes() == b"precious"
 
 
-numbers = st.one_of(st.floats(), st.integers(-2 ** 53, 2 ** 53), st.booleans(), st.none(), st.text(max_size=5))
-values = st.recursive(numbers, lambda inner: st.one_of(st.lists(inner, max_size=3),
-                                                       st.dictionaries(st.text(max_size=3), inner, max_size=3)),
-                      max_leaves=10)
+numbers = st.one_of(st.floats(), st.integers(-(2**53), 2**53), st.booleans(), st.none(), st.text(max_size=5))
+values = st.recursive(
+    numbers,
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=3), inner, max_size=3)),
+    max_leaves=10,
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -308,11 +327,18 @@ def test_json_is_strict_and_exact(value):
         if isinstance(one, list):
             return [finite(inner) for inner in one]
         return None if isinstance(one, float) and not np.isfinite(one) else one
+
     assert json.loads(text, parse_constant=refuse) == finite(value)
 
 
 def test_json_of_numpy_values():
-    text = as_json({"a": np.array([[1.0, np.nan], [np.inf, 0.1]]), "b": np.float64(2.5), "c": np.int64(3),
-                    "d": np.bool_(True), "e": ("x", np.float32(0.5))})
-    assert json.loads(text) == {"a": [[1.0, None], [None, 0.1]], "b": 2.5, "c": 3,
-                                                            "d": True, "e": ["x", 0.5]}
+    text = as_json(
+        {
+            "a": np.array([[1.0, np.nan], [np.inf, 0.1]]),
+            "b": np.float64(2.5),
+            "c": np.int64(3),
+            "d": np.bool_(True),
+            "e": ("x", np.float32(0.5)),
+        }
+    )
+    assert json.loads(text) == {"a": [[1.0, None], [None, 0.1]], "b": 2.5, "c": 3, "d": True, "e": ["x", 0.5]}

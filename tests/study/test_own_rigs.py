@@ -38,7 +38,7 @@ def direct(rig, design, omega, axes):
     found = np.empty((len(omega), len(axes), 2 * len(axes)), complex)
     delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, 2).frequency_response(omega)[:, 0, 0]
     for k, one in enumerate(s):
-        D = eom.K[pick] + one * eom.C[pick] + one ** 2 * eom.M[pick]
+        D = eom.K[pick] + one * eom.C[pick] + one**2 * eom.M[pick]
         floor = np.diag(1 / lever) / one
         q_floor = np.linalg.solve(D, (eom.K_floor[pick] + one * eom.C_floor[pick]) @ floor)
         lag = delay[k] / (1 + one / (2 * np.pi * design.loop.amplifier_corner_Hz))
@@ -49,13 +49,14 @@ def direct(rig, design, omega, axes):
         for j, (sensor, filter_) in enumerate(zip(rig.sensors(), filters, strict=True)):
             volts = sensor.gain * sensor.as_velocity(np.array([omega[k]]))[0] * one
             moved = H[j, kept] @ (against if sensor.quantity == "displacement" else q)
-            digital = filter_.leading * np.prod([one - z for z in filter_.zeros]) / np.prod(
-                [one - p for p in filter_.poles])
+            digital = (
+                filter_.leading * np.prod([one - z for z in filter_.zeros]) / np.prod([one - p for p in filter_.poles])
+            )
             if sensor.inertial:
                 # A tilt phi turns the direction d by phi x d: the mass feels g e_z . (phi x d) as acceleration.
                 turned = np.zeros((6, q.shape[1]), complex)
                 turned[kept] = q
-                moved = moved + 9.80665 * np.cross(sensor.direction, [0.0, 0.0, 1.0]) @ turned[3:] / one ** 2
+                moved = moved + 9.80665 * np.cross(sensor.direction, [0.0, 0.0, 1.0]) @ turned[3:] / one**2
             seen[j] = digital * volts / sensor.gain * moved
         found[k] = lever[:, None] * (decoder.decoding @ seen)
     return found
@@ -82,7 +83,7 @@ def test_noise_of_an_axis_is_that_of_its_sensors(name):
     response = plant.full.nominal().P.select([f"seen_{axis}_dot" for axis in plant.axes], list(plant.noises))
     power = np.sum(np.abs(response.frequency_response(omega)[0] * plant.floor_density) ** 2, axis=1)
     decoding = sensor_axes(rig, KEEP).decoding * np.array([1.0, rig.edge_m])[:, None]
-    lsb = 2 * rig.acquisition.adc_range_V / 2 ** rig.acquisition.adc_bits
+    lsb = 2 * rig.acquisition.adc_range_V / 2**rig.acquisition.adc_bits
     expected = np.zeros(2)
     for one, filter_, column in zip(rig.sensors(), conditioning(rig, 0.1), decoding.T, strict=True):
         volts = np.hypot(one.noise_rms_V, lsb / np.sqrt(12)) * np.sqrt(2 / fs)

@@ -13,8 +13,9 @@ NAMES = ("mass", "J1", "J2", "J3", "isolator1.k_z", "isolator2.k_z", "isolator3.
 
 def start() -> ResponseModel:
     rig = load_rig("avis")
-    return ResponseModel.of(rig, NAMES, "V", [one.name for one in rig.sensors()], rig.equations_of_motion().actuators,
-                            True)
+    return ResponseModel.of(
+        rig, NAMES, "V", [one.name for one in rig.sensors()], rig.equations_of_motion().actuators, True
+    )
 
 
 def fitted(model: ResponseModel, factors, sigma: float = 1e-3) -> Information:
@@ -25,12 +26,12 @@ def fitted(model: ResponseModel, factors, sigma: float = 1e-3) -> Information:
 
 
 def test_common_factor_is_blamed_on_the_gains():
-    sentence, = far_from_file(start(), fitted(start(), [5.0, 5.1, 4.9, 5.0, 5.0, 4.8, 5.2, 20.0]))
+    (sentence,) = far_from_file(start(), fitted(start(), [5.0, 5.1, 4.9, 5.0, 5.0, 4.8, 5.2, 20.0]))
     assert "5 times the rig file's" in sentence and "force constants and sensitivities" in sentence
 
 
 def test_one_mass_alone_is_named():
-    sentence, = far_from_file(start(), fitted(start(), [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
+    (sentence,) = far_from_file(start(), fitted(start(), [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
     assert sentence.startswith("mass is identified as") and "Check the rig file" in sentence
 
 

@@ -42,11 +42,11 @@ def by_hand(rig, omega: np.ndarray) -> np.ndarray:
     if rig.geophones is not None:
         g = rig.geophones
         wc = 2 * np.pi * g.compensated_Hz
-        chain = s * s ** 2 / (s ** 2 + 2 * g.compensated_damping * wc * s + wc ** 2)
+        chain = s * s**2 / (s**2 + 2 * g.compensated_damping * wc * s + wc**2)
         gains = np.array(g.sensitivity_Vs_per_m) * g.preamplifier_gain
     else:
         a = rig.accelerometers
-        chain = s ** 2 * s / (s + 2 * np.pi * a.low_corner_Hz) / (1 + s / (2 * np.pi * 300))
+        chain = s**2 * s / (s + 2 * np.pi * a.low_corner_Hz) / (1 + s / (2 * np.pi * 300))
         gains = np.full(len(rows), a.sensitivity_Vs2_per_m)
     return (chain * late)[:, None, None] * gains[:, None] * (rows @ q)
 
@@ -67,8 +67,12 @@ def campaign(rig, G=None, seed: int = 1) -> Campaign:
 
 
 def changed(measured: Campaign, u=1.0, y=1.0, **header) -> Campaign:
-    return replace(measured, records=tuple(
-        replace(one, u=one.u * u, y=one.y * y, header=replace(one.header, **header)) for one in measured.records))
+    return replace(
+        measured,
+        records=tuple(
+            replace(one, u=one.u * u, y=one.y * y, header=replace(one.header, **header)) for one in measured.records
+        ),
+    )
 
 
 def model_of(rig, measured: Campaign) -> ResponseModel:
@@ -97,11 +101,11 @@ def test_volts_per_g_are_doubted(sound):
     """A factor of 9.81 is no slip of decades: it is told, with what it may be, and the fit goes on."""
     rig, measured = sound
     wrong = changed(measured, y=9.80665)
-    doubt, = check_records(wrong, model_of(rig, wrong))
+    (doubt,) = check_records(wrong, model_of(rig, wrong))
     assert set(doubt.channels) == set(measured.y_names) and "9.8" in doubt.sentence
     assert ("V/g" in doubt.sentence) == (rig.accelerometers is not None)
     one = changed(measured, y=only(len(measured.y_names), 2, 0.2))
-    doubt, = check_records(one, model_of(rig, one))
+    (doubt,) = check_records(one, model_of(rig, one))
     assert doubt.channels == (measured.y_names[2],) and "is 0.2" in doubt.sentence
 
 
@@ -111,20 +115,36 @@ def test_sensors_that_are_off_by_different_factors_are_told_apart(sound):
     n = len(measured.y_names)
     wrong = changed(measured, y=only(n, 1, 3.0) * only(n, 2, 1 / 3.0))
     said = {one.channels: one.value for one in check_records(wrong, model_of(rig, wrong))}
-    assert said == {(measured.y_names[1],): pytest.approx(3.0, rel=0.1),
-                    (measured.y_names[2],): pytest.approx(1 / 3.0, rel=0.1)}
+    assert said == {
+        (measured.y_names[1],): pytest.approx(3.0, rel=0.1),
+        (measured.y_names[2],): pytest.approx(1 / 3.0, rel=0.1),
+    }
 
 
-@pytest.mark.parametrize("change, said", [
-    (lambda m: changed(m, u=1e3), r"^u of the records = .*limit of drive A\w+ is 10 V: did you mean .*\(given in mV\)"),
-    (lambda m: changed(m, u=1e-3), "all channels differ by the same factor: are the records' y in mV or u in kV"),
-    (lambda m: changed(m, y=1e-3), "all channels differ by the same factor: are the records' y in kV or u in mV"),
-    (lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)), "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) differs"),
-    (lambda m: changed(m, u=only(len(m.u_names), 3, 1e3)), "force constant of A(z2|4): .* did you mean 0.001 times"),
-    (lambda m: changed(m, y_unit="m/s"), r"^unit of y = 'm/s': .*did you mean V\?"),
-    (lambda m: changed(m, sample_rate_Hz=1.0),
-     r"sample_rate_Hz of the records = 1\.0: .*did you mean 1000 \(given in kHz\)"),
-])
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (
+            lambda m: changed(m, u=1e3),
+            r"^u of the records = .*limit of drive A\w+ is 10 V: did you mean .*\(given in mV\)",
+        ),
+        (lambda m: changed(m, u=1e-3), "all channels differ by the same factor: are the records' y in mV or u in kV"),
+        (lambda m: changed(m, y=1e-3), "all channels differ by the same factor: are the records' y in kV or u in mV"),
+        (
+            lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)),
+            "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) differs",
+        ),
+        (
+            lambda m: changed(m, u=only(len(m.u_names), 3, 1e3)),
+            "force constant of A(z2|4): .* did you mean 0.001 times",
+        ),
+        (lambda m: changed(m, y_unit="m/s"), r"^unit of y = 'm/s': .*did you mean V\?"),
+        (
+            lambda m: changed(m, sample_rate_Hz=1.0),
+            r"sample_rate_Hz of the records = 1\.0: .*did you mean 1000 \(given in kHz\)",
+        ),
+    ],
+)
 def test_a_slip_of_the_records_is_named(sound, change, said):
     rig, measured = sound
     wrong = change(measured)
@@ -133,13 +153,15 @@ def test_a_slip_of_the_records_is_named(sound, change, said):
     assert "\n" not in str(refused.value)
 
 
-RIG_SLIPS = [("avis", r"isolator\d\.k_.", 1e3, "isolator.stiffness_N_per_m = 20000000.0", "20000 "),
-             ("avis", r"isolator\d\.c_.", 1e3, "isolator.damping_Ns_per_m = 90000.0", "90 "),
-             ("avis", "mass", 1e-3, "payload.mass_kg = 0.5", "500 "),
-             ("avis", r"actuator\..*", 1e-3, "actuators.constant_N_per_V = 0.002", "2,"),
-             ("halcyonics", "k_s", 1e3, "suspension.k_s_N_per_m = 11300000.0", "11300 "),
-             ("halcyonics", r"e\d", 1e3, "actuators.constant_N_per_V = 6590.0", "6.59,"),
-             ("halcyonics", "I..", 1e-3, "payload.inertia_kgm2 = 0.00034", "0.34 ")]
+RIG_SLIPS = [
+    ("avis", r"isolator\d\.k_.", 1e3, "isolator.stiffness_N_per_m = 20000000.0", "20000 "),
+    ("avis", r"isolator\d\.c_.", 1e3, "isolator.damping_Ns_per_m = 90000.0", "90 "),
+    ("avis", "mass", 1e-3, "payload.mass_kg = 0.5", "500 "),
+    ("avis", r"actuator\..*", 1e-3, "actuators.constant_N_per_V = 0.002", "2,"),
+    ("halcyonics", "k_s", 1e3, "suspension.k_s_N_per_m = 11300000.0", "11300 "),
+    ("halcyonics", r"e\d", 1e3, "actuators.constant_N_per_V = 6590.0", "6.59,"),
+    ("halcyonics", "I..", 1e-3, "payload.inertia_kgm2 = 0.00034", "0.34 "),
+]
 
 
 @pytest.mark.parametrize("name, pattern, factor, field, meant", RIG_SLIPS)
@@ -153,11 +175,18 @@ def test_a_slip_of_the_rig_is_named(name, pattern, factor, field, meant):
     assert f"did you mean {meant}" in str(refused.value)
 
 
-EFFECTS = [("sensor_gain", "Sz1", (0.5,)), ("actuator_gain", "Az1", (0.5,)), ("loop_delay", "loop", (20e-3,)),
-           ("actuator_lag", "actuators", (1 / (2 * np.pi * 10),)), ("geophone_corner", "Sz2", (12.0, 0.3)),
-           ("mount_relaxation", "isolators z", (2.0, 3.0)), ("com_offset", "payload", (0.1, 0.1, 0.1)),
-           ("attached_oscillator", "payload/z", (100.0, 12.0, 0.02, 0.1, 0.1)),
-           ("product_of_inertia", "Jxy", (15.0,)), ("structural_damping", "isolators/causal", (0.3,))]
+EFFECTS = [
+    ("sensor_gain", "Sz1", (0.5,)),
+    ("actuator_gain", "Az1", (0.5,)),
+    ("loop_delay", "loop", (20e-3,)),
+    ("actuator_lag", "actuators", (1 / (2 * np.pi * 10),)),
+    ("geophone_corner", "Sz2", (12.0, 0.3)),
+    ("mount_relaxation", "isolators z", (2.0, 3.0)),
+    ("com_offset", "payload", (0.1, 0.1, 0.1)),
+    ("attached_oscillator", "payload/z", (100.0, 12.0, 0.02, 0.1, 0.1)),
+    ("product_of_inertia", "Jxy", (15.0,)),
+    ("structural_damping", "isolators/causal", (0.3,)),
+]
 
 
 @pytest.mark.parametrize("name, place, values", EFFECTS)
@@ -176,11 +205,14 @@ def test_rigs_off_by_thirty_per_cent_pass_with_room(name, seed):
     rig = load_rig(name)
     measured = campaign(rig)
     rng = np.random.default_rng(seed)
-    moved = {n: p.value * rng.uniform(0.7, 1.3) for n, p in rig.parameters().items() if p.unit != "m"
-             and not n.startswith(("I", "J"))}
+    moved = {
+        n: p.value * rng.uniform(0.7, 1.3)
+        for n, p in rig.parameters().items()
+        if p.unit != "m" and not n.startswith(("I", "J"))
+    }
     other = model_of(rig.with_parameters(moved), measured)
     seen = record_spectra(measured)
-    decades = seen.decades(other.response(seen.omega)[:, :, :len(measured.u_names)])
+    decades = seen.decades(other.response(seen.omega)[:, :, : len(measured.u_names)])
     check_records(measured, other)
     assert np.nanmean(np.abs(decades)) < 0.6 * SETTINGS.far
 
@@ -200,7 +232,7 @@ def test_the_warning_is_among_the_findings_of_identify_and_of_gap(sound, monkeyp
     rig, measured = sound
     monkeypatch.setattr("avis_ctrl.study.record_checks.examine", lambda *of: ())
     wrong, said = changed(measured, y=9.80665), []
-    finding, = check_campaign(wrong, model_of(rig, wrong), False, said.append, named_later)
+    (finding,) = check_campaign(wrong, model_of(rig, wrong), False, said.append, named_later)
     assert finding.gate == "units" and finding.severity == "warning" and said == [f"  warning: {finding.sentence}"]
 
 

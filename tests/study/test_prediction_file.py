@@ -57,7 +57,7 @@ def test_noise_is_what_differs_between_the_periods_after_the_first(tmp_path):
     path = tmp_path / "p.h5"
     with h5py.File(path, "w") as file:
         file["records/00/y"] = y
-    one, = prediction_errors(path, Campaign("avis", (plain,)))
+    (one,) = prediction_errors(path, Campaign("avis", (plain,)))
     size = np.std(plain.y, axis=0)
     assert one.noise == pytest.approx(np.sqrt(np.mean(([0.03, 0.04e-3] / size) ** 2)), rel=0.03)
     assert one.noise == pytest.approx(one.relative["y"], rel=0.05)

@@ -56,16 +56,20 @@ def test_a_campaign_of_another_rig_says_so_and_both_roles_at_once(rig):
     own = campaign(rig.equations_of_motion().actuators, rig.sensor_rows()[0], "avis")
     with pytest.raises(InputError, match="the file is a campaign of avis") as caught:
         with_rig_names(load_rig("halcyonics"), own)
-    for said in ("the actuators of the rig halcyonics are A1", "the sensors of the rig halcyonics are acc_A1",
-                 "not of halcyonics"):
+    for said in (
+        "the actuators of the rig halcyonics are A1",
+        "the sensors of the rig halcyonics are acc_A1",
+        "not of halcyonics",
+    ):
         assert said in str(caught.value)
 
 
 def test_frequency_responses_too(rig):
     frequency = np.arange(1.0, 6.0)
     value = np.ones((5, 6, 8), complex)
-    response = FrequencyResponse(frequency, value, None, None, numbered("u", 8), numbered("y", 6), "V", "V",
-                                 entry_variance=np.ones(value.shape))
+    response = FrequencyResponse(
+        frequency, value, None, None, numbered("u", 8), numbered("y", 6), "V", "V", entry_variance=np.ones(value.shape)
+    )
     taken = with_rig_names(rig, response)
     assert taken.outputs == rig.sensor_rows()[0] and taken.inputs == rig.equations_of_motion().actuators
     assert with_rig_names(rig, replace(taken, inputs=(*taken.inputs[:7], "vz"))).inputs[-1] == "vz"

@@ -35,8 +35,9 @@ DESIGN = Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml"
 def one_axis() -> tuple[Design, DesignPlant]:
     """z alone; mass and the stiffness of one isolator uncertain, no chains."""
     design, _ = read_study(DESIGN)
-    uncertainty = design.uncertainty.model_copy(update={
-        "parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}, "actuator_chains": None})
+    uncertainty = design.uncertainty.model_copy(
+        update={"parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}, "actuator_chains": None}
+    )
     synthesis = design.synthesis.model_copy(update={"max_iterations": 1, "time_limit_s": 1e-3})
     design = design.model_copy(update={"keep": ["z"], "uncertainty": uncertainty, "synthesis": synthesis})
     return design, build_plant(design, load_rig("avis"))
@@ -46,8 +47,10 @@ def bounds(design: Design, plant: DesignPlant, K) -> tuple[float, float]:
     """Worst-case transmissibility over all frequencies and in the band, over the whole set."""
     closed = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(K)
     band = tuple(2 * np.pi * f for f in design.transmissibility.band_Hz)
-    return (worst_case_gain(closed, plant.full.blocks, slack=5e-3).upper,
-            worst_case_gain(closed, plant.full.blocks, band=band, slack=5e-3).upper)
+    return (
+        worst_case_gain(closed, plant.full.blocks, slack=5e-3).upper,
+        worst_case_gain(closed, plant.full.blocks, band=band, slack=5e-3).upper,
+    )
 
 
 def test_the_worst_case_of_a_bound_is_a_plant_whose_stability_counts(one_axis):
@@ -71,7 +74,7 @@ def test_tuned_skyhook_loses_to_no_classical_one(one_axis, limit_dB, keep_it):
     peak, band = bounds(design, plant, tuned.K)
     assert peak <= limit
     assert not any("no skyhook tuning found" in note for note in tuned.notes)
-    critical, = critical_gains(load_rig("avis"), ["z"])
+    (critical,) = critical_gains(load_rig("avis"), ["z"])
     met = 0
     for factor, (tilt, roll) in product((0.5, 1.0, 2.0), ((0.1, 100.0), (0.03, 30.0))):
         other = bounds(design, plant, Skyhook(plant.axes, (factor * critical,), tilt, roll).controller())
@@ -90,11 +93,17 @@ def test_a_limit_out_of_reach_is_said_and_the_least_peak_is_taken(one_axis):
     assert 1.0 <= peak <= bounds(design, plant, classical_skyhook(plant, load_rig("avis"), design).K)[0]
 
 
-@pytest.mark.parametrize(("gain", "roll", "said"), [(1.0, 100.0, []), (0.05, 100.0, ["the gain of z is at"]),
-                                                    (20.0, 400.0, ["the gain of z and the roll-off are at"])])
+@pytest.mark.parametrize(
+    ("gain", "roll", "said"),
+    [
+        (1.0, 100.0, []),
+        (0.05, 100.0, ["the gain of z is at"]),
+        (20.0, 400.0, ["the gain of z and the roll-off are at"]),
+    ],
+)
 def test_values_at_an_end_of_the_range_searched_are_told(gain, roll, said):
     found = at_limits(Skyhook(("z",), (gain * 300.0,), 0.1, roll), TuningRange((300.0,)))
-    assert [text[:len(start)] for text, start in zip(found, said, strict=True)] == said
+    assert [text[: len(start)] for text, start in zip(found, said, strict=True)] == said
 
 
 def test_mu_controller_is_never_worse_than_a_rival(one_axis):
@@ -114,8 +123,15 @@ def test_mu_controller_is_never_worse_than_a_rival(one_axis):
 
 def result(name: str, title: str, mu: float, K, stable: bool = True, notes: tuple[str, ...] = ()) -> ControllerResult:
     """A result with the parts that `best_of` does not look at left empty."""
-    given = {"name": name, "title": title, "kind": name, "K": K, "stable": stable, "notes": notes,
-             "mu": Bound(mu, 0.9 * mu, 1.0, True, None, (), np.zeros(0), np.zeros(0), np.zeros(0))}
+    given = {
+        "name": name,
+        "title": title,
+        "kind": name,
+        "K": K,
+        "stable": stable,
+        "notes": notes,
+        "mu": Bound(mu, 0.9 * mu, 1.0, True, None, (), np.zeros(0), np.zeros(0), np.zeros(0)),
+    }
     return ControllerResult(**{field.name: given.get(field.name) for field in fields(ControllerResult)})
 
 

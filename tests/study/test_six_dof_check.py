@@ -29,12 +29,14 @@ def by_hand(rig, omega: np.ndarray) -> np.ndarray:
 def test_peaks_between_the_points_of_the_grid_are_found(band_Hz):
     """The resonance at 3.05 Hz lies between two points of the grid, 0.5 dB above both; the second band between two."""
     design, rig = read_study(Path(__file__).parents[2] / "designs" / "avis_z_phix.toml")
-    asked = design.model_copy(update={"transmissibility": design.transmissibility.model_copy(
-        update={"band_Hz": band_Hz})})
+    asked = design.model_copy(
+        update={"transmissibility": design.transmissibility.model_copy(update={"band_Hz": band_Hz})}
+    )
     omega = 2 * np.pi * PLOT_HZ
     model = SimpleNamespace(omega=omega, sigma=by_hand(rig, omega))
-    found = six_dof_check(asked, rig, build_plant(design, rig), SimpleNamespace(transmissibility=model, K=None),
-                          Companions(()))
+    found = six_dof_check(
+        asked, rig, build_plant(design, rig), SimpleNamespace(transmissibility=model, K=None), Companions(())
+    )
     fine, inside = 2 * np.pi * np.geomspace(0.1, 200.0, 40001), 2 * np.pi * np.geomspace(*band_Hz, 2001)
     assert np.max(found.kept) == pytest.approx(np.max(by_hand(rig, fine)), rel=5e-4)
     there = (found.omega >= 2 * np.pi * band_Hz[0]) & (found.omega <= 2 * np.pi * band_Hz[1])

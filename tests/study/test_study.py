@@ -31,26 +31,69 @@ from avis_ctrl.uncertainty.generalized_plant import sample_lft
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 FLOOR_HZ = np.geomspace(0.1, 100.0, 40)
 
-PLANT_KEYS = {"format", "version", "A", "B", "C", "D", "dt", "inputs", "outputs", "nmeas", "ncon", "blocks",
-              "performance"}
-CONTROLLER_KEYS = {"format", "version", "name", "A", "B", "C", "D", "dt", "inputs", "outputs", "input_units",
-                   "output_units"}
+PLANT_KEYS = {
+    "format",
+    "version",
+    "A",
+    "B",
+    "C",
+    "D",
+    "dt",
+    "inputs",
+    "outputs",
+    "nmeas",
+    "ncon",
+    "blocks",
+    "performance",
+}
+CONTROLLER_KEYS = {
+    "format",
+    "version",
+    "name",
+    "A",
+    "B",
+    "C",
+    "D",
+    "dt",
+    "inputs",
+    "outputs",
+    "input_units",
+    "output_units",
+}
 RESULT_KEYS = {"format", "version", "plant", "controllers", "dk_history", "requirements", "simulation", "seconds"}
-ROW_KEYS = {"name", "kind", "file", "order", "gamma", "mu_upper", "mu_lower", "mu_peak_Hz", "stable",
-            "peak_transmissibility_dB", "worst_case_peak_transmissibility_dB", "note", "at_rest"}
+ROW_KEYS = {
+    "name",
+    "kind",
+    "file",
+    "order",
+    "gamma",
+    "mu_upper",
+    "mu_lower",
+    "mu_peak_Hz",
+    "stable",
+    "peak_transmissibility_dB",
+    "worst_case_peak_transmissibility_dB",
+    "note",
+    "at_rest",
+}
 
 
 def read(path: Path) -> dict[str, Any]:
     def refuse(constant: str) -> None:
         raise AssertionError(f"{path.name} holds {constant}, which JSON does not have")
+
     return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
 
 
 def system(stored: dict[str, Any]) -> Any:
     """python-control's state space of a stored system."""
     n = np.size(stored["A"], 0)
-    return control.ss(np.reshape(stored["A"], (n, n)), np.reshape(stored["B"], (n, len(stored["inputs"]))),
-                      np.reshape(stored["C"], (len(stored["outputs"]), n)), stored["D"])
+    return control.ss(
+        np.reshape(stored["A"], (n, n)),
+        np.reshape(stored["B"], (n, len(stored["inputs"]))),
+        np.reshape(stored["C"], (len(stored["outputs"]), n)),
+        stored["D"],
+    )
 
 
 def check_plant(plant: dict[str, Any]) -> None:
@@ -62,13 +105,15 @@ def check_plant(plant: dict[str, Any]) -> None:
     for block in plant["blocks"]:
         assert set(block) == {"kind", "rows", "cols", "name"}
         assert block["kind"] == "full" or block["rows"] == block["cols"]
-    assert D.shape == (cols + plant["performance"]["cols"] + plant["nmeas"],
-                       rows + plant["performance"]["rows"] + plant["ncon"])
+    assert D.shape == (
+        cols + plant["performance"]["cols"] + plant["nmeas"],
+        rows + plant["performance"]["rows"] + plant["ncon"],
+    )
     # Order (w_delta, w, u) and (z_delta, z, y); u and y last.
     assert all(name.startswith("w:") for name in plant["inputs"][:rows])
     assert all(name.startswith("z:") for name in plant["outputs"][:cols])
-    assert all(name.startswith("command_") for name in plant["inputs"][-plant["ncon"]:])
-    assert all(name.startswith("seen_") for name in plant["outputs"][-plant["nmeas"]:])
+    assert all(name.startswith("command_") for name in plant["inputs"][-plant["ncon"] :])
+    assert all(name.startswith("seen_") for name in plant["outputs"][-plant["nmeas"] :])
     names = [name[2:].partition("[")[0] for name in plant["inputs"][:rows]]
     # Signal names are the blocks' without the dots that python-control forbids.
     assert names == [block["name"].replace(".", "_") for block in plant["blocks"] for _ in range(block["rows"])]
@@ -78,8 +123,8 @@ def check_controller(stored: dict[str, Any], plant: dict[str, Any], row: dict[st
     assert set(stored) == CONTROLLER_KEYS
     assert (stored["format"], stored["version"], stored["name"]) == ("avis-controller", 1, row["name"])
     assert stored["dt"] == 0.0
-    assert stored["inputs"] == plant["outputs"][-plant["nmeas"]:]
-    assert stored["outputs"] == plant["inputs"][-plant["ncon"]:]
+    assert stored["inputs"] == plant["outputs"][-plant["nmeas"] :]
+    assert stored["outputs"] == plant["inputs"][-plant["ncon"] :]
     assert stored["input_units"] == ["m/s"] * plant["nmeas"]
     assert stored["output_units"] == ["N"] * plant["ncon"]
     assert np.shape(stored["A"])[0] == row["order"]
@@ -90,15 +135,19 @@ def closed_loop(plant: dict[str, Any], controller: dict[str, Any] | None) -> Any
     P = system(plant)
     n_u, n_y = plant["ncon"], plant["nmeas"]
     if controller is None:
-        return P[:P.noutputs - n_y, :P.ninputs - n_u]
+        return P[: P.noutputs - n_y, : P.ninputs - n_u]
     return P.lft(system(controller), n_u, n_y)
 
 
 def single(structure: BlockStructure) -> BlockStructure:
     """Every repeated scalar as so many independent ones: a larger set, hence an upper bound that is no smaller."""
-    return BlockStructure.of([RealScalar(1) if block.kind == "real" else ComplexScalar(1) if block.kind == "complex"
-                              else block for block in structure.blocks
-                              for _ in range(block.rows if block.repeated else 1)])
+    return BlockStructure.of(
+        [
+            RealScalar(1) if block.kind == "real" else ComplexScalar(1) if block.kind == "complex" else block
+            for block in structure.blocks
+            for _ in range(block.rows if block.repeated else 1)
+        ]
+    )
 
 
 def check_figures(plant: dict[str, Any], controller: dict[str, Any] | None, row: dict[str, Any]) -> None:
@@ -114,12 +163,14 @@ def check_figures(plant: dict[str, Any], controller: dict[str, Any] | None, row:
     if not stable:
         return
     nominal = N[cols:, rows:]
-    assert row["gamma"] == pytest.approx(hinf_norm_slicot(StateSpace(nominal.A, nominal.B, nominal.C, nominal.D)),
-                                         rel=1e-5)
+    assert row["gamma"] == pytest.approx(
+        hinf_norm_slicot(StateSpace(nominal.A, nominal.B, nominal.C, nominal.D)), rel=1e-5
+    )
     if row["mu_upper"] is None:  # the set holds an unstable plant
         return
-    structure = BlockStructure.from_dicts(plant["blocks"]).with_performance(plant["performance"]["rows"],
-                                                                            plant["performance"]["cols"])
+    structure = BlockStructure.from_dicts(plant["blocks"]).with_performance(
+        plant["performance"]["rows"], plant["performance"]["cols"]
+    )
     assert row["mu_lower"] <= row["mu_upper"] * (1 + 1e-9)
     grid = np.array([N(2j * np.pi * f) for f in [*FLOOR_HZ, row["mu_peak_Hz"]]])
     repeated = any(block.repeated for block in structure.blocks)
@@ -153,10 +204,14 @@ def check_folder(folder: Path) -> dict[str, Any]:
 
 def small_design(**changes: Any) -> Design:
     """z alone, mass and one stiffness uncertain: bounds in a second."""
-    table = {"title": "small", "rig": "avis", "keep": ["z"],
-             "uncertainty": {"parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}},
-             "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
-             "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0}}
+    table = {
+        "title": "small",
+        "rig": "avis",
+        "keep": ["z"],
+        "uncertainty": {"parameters_percent": {"mass": 10.0, "isolator1.k_z": 15.0}},
+        "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
+        "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+    }
     return design_from_table(table | changes)
 
 
@@ -175,15 +230,31 @@ def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
     design, plant = small
     rig = load_rig("avis")
     samples = random_perturbations(plant, 5, 1)
-    controllers = [analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
-                   for c in (passive(), classical_skyhook(plant, rig, design))]
-    result = partial_result(design=design, rig=rig, plant=plant, controllers=tuple(controllers), dk_history=(),
-                            requirements=(), provenance=design_provenance(design, None, rig, 1.0), seconds=1.0,
-                            notes=())
+    controllers = [
+        analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
+        for c in (passive(), classical_skyhook(plant, rig, design))
+    ]
+    result = partial_result(
+        design=design,
+        rig=rig,
+        plant=plant,
+        controllers=tuple(controllers),
+        dk_history=(),
+        requirements=(),
+        provenance=design_provenance(design, None, rig, 1.0),
+        seconds=1.0,
+        notes=(),
+    )
     written = write_study(result, tmp_path, b"<html>", b"%PDF")
     assert written[-1] == tmp_path / "result.json"
     assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == {
-        "result.json", "study.json", "plant.json", "controllers/skyhook_classical.json", "report.html", "report.pdf"}
+        "result.json",
+        "study.json",
+        "plant.json",
+        "controllers/skyhook_classical.json",
+        "report.html",
+        "report.pdf",
+    }
     stored = check_folder(tmp_path)
     assert [row["name"] for row in stored["controllers"]] == ["passive", "skyhook_classical"]
     passive_row, skyhook_row = stored["controllers"]
@@ -201,8 +272,9 @@ def test_a_failed_rewrite_leaves_the_old_result_whole(small, tmp_path, monkeypat
 
     design, plant = small
     rig = load_rig("avis")
-    result = partial_result(design=design, rig=rig, plant=plant, controllers=(), dk_history=(), requirements=(),
-                            provenance={}, seconds=1.0)
+    result = partial_result(
+        design=design, rig=rig, plant=plant, controllers=(), dk_history=(), requirements=(), provenance={}, seconds=1.0
+    )
     write_study(result, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert tmp_path / "result.json" in before
@@ -213,6 +285,7 @@ def test_a_failed_rewrite_leaves_the_old_result_whole(small, tmp_path, monkeypat
             raise ComputationError("disk full")
         written.append(path)
         real(path, content)
+
     monkeypatch.setattr(files, "write_whole", full)
     with pytest.raises(ComputationError, match="untouched"):
         write_study(partial_result(**{**vars(result), "seconds": 2.0}), tmp_path)
@@ -234,7 +307,7 @@ def test_transmissibility_of_the_plant_is_that_of_the_rig(small):
     m, c, k = equations.M[2, 2], equations.C[2, 2], equations.K[2, 2]
     s = 2j * np.pi * FLOOR_HZ
     passive_loop = plant.full.closed(None).select("z_dot", "floor_z_dot").frequency_response(2 * np.pi * FLOOR_HZ)
-    np.testing.assert_allclose(passive_loop[:, 0, 0], (c * s + k) / (m * s ** 2 + c * s + k), rtol=1e-9)
+    np.testing.assert_allclose(passive_loop[:, 0, 0], (c * s + k) / (m * s**2 + c * s + k), rtol=1e-9)
 
 
 def test_compliance_bound_joins_the_weights():
@@ -276,8 +349,9 @@ def test_sensor_chains_err_where_they_stand(rig_name):
 
 
 def test_simulated_plants_have_their_sensor_chains():
-    design = small_design(uncertainty={"sensor_chains": {"low_percent": 10.0, "crossover_Hz": 60.0,
-                                                         "high_percent": 400.0}})
+    design = small_design(
+        uncertainty={"sensor_chains": {"low_percent": 10.0, "crossover_Hz": 60.0, "high_percent": 400.0}}
+    )
     rig = load_rig("avis")
     plant = build_plant(design, rig)
     nominal = nominal_loop(design, rig, plant, None)
@@ -311,9 +385,12 @@ def test_shipped_designs_build(name):
 def test_whole_study_of_a_shipped_design(name, tmp_path):
     """Few iterations, plants and seconds; the figures are reproduced from the files alone."""
     design, rig = read_study(DESIGNS / f"{name}.toml")
-    short = design.model_copy(update={
-        "synthesis": design.synthesis.model_copy(update={"max_iterations": 3}),
-        "simulation": design.simulation.model_copy(update={"duration_s": 20.0, "random_plants": 2})})
+    short = design.model_copy(
+        update={
+            "synthesis": design.synthesis.model_copy(update={"max_iterations": 3}),
+            "simulation": design.simulation.model_copy(update={"duration_s": 20.0, "random_plants": 2}),
+        }
+    )
     said: list[str] = []
     result = run_design(short, rig, said.append)
     from avis_ctrl.report import rendered

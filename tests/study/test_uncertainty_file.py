@@ -63,8 +63,9 @@ def information(rig) -> Information:
 
 def spread(keep=("z", "phi_x")) -> FrfSpread:
     f = np.geomspace(0.5, 60, 200)
-    measured = 2e-3 * (1 + 10 / (1 + 30 * np.log(f / 2.2) ** 2)) * np.exp(
-        0.2 * np.random.default_rng(1).standard_normal(200))
+    measured = (
+        2e-3 * (1 + 10 / (1 + 30 * np.log(f / 2.2) ** 2)) * np.exp(0.2 * np.random.default_rng(1).standard_normal(200))
+    )
     return FrfSpread(keep, f, measured, np.outer([1.0, 1.2, 1.4, 1.8], measured), CONFIDENCES)
 
 
@@ -115,8 +116,13 @@ def test_a_design_reads_it_beside_itself(folder, content):
     omega = plant.identified.weight.omega
     assert np.all(plant.weights[RESPONSE].magnitude(omega) >= content.spread[0].values().bound(0.95) * (1 - 1e-9))
     # The hash of the inputs follows the content, not the place of the file.
-    other = design.model_copy(update={"uncertainty": design.uncertainty.model_copy(
-        update={"identified": content.model_copy(update={"undetermined": 2})})})
+    other = design.model_copy(
+        update={
+            "uncertainty": design.uncertainty.model_copy(
+                update={"identified": content.model_copy(update={"undetermined": 2})}
+            )
+        }
+    )
     hashes = {design_provenance(d, None, rig, 0.0)["inputs_sha256"] for d in (design, other)}
     assert len(hashes) == 2
 
@@ -134,9 +140,13 @@ def test_sensors_are_left_to_the_measured_spread(rig, content):
     assert all("sensor" not in name for direction in found.directions for name, _ in direction.changes)
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"mass": 508.0}, ["mass of the rig avis = 508.0", "the identification found 507.123"]),
-    ({"isolator1.k_x": 1e5}, ["other parameters"])])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"mass": 508.0}, ["mass of the rig avis = 508.0", "the identification found 507.123"]),
+        ({"isolator1.k_x": 1e5}, ["other parameters"]),
+    ],
+)
 def test_another_rig_is_refused_in_one_line(folder, rig, change, words):
     (folder / "rig.toml").write_text(rig_toml(rig.with_parameters(change)), encoding="utf-8")
     with pytest.raises(InputError) as refused:
@@ -162,17 +172,29 @@ def complaint(folder, text: str) -> str:
     return said
 
 
-@pytest.mark.parametrize(("place", "value", "words"), [
-    (("format",), "avis-plant", "format"), (("version",), 2, "version"), (("rig",), 3, "rig"),
-    (("parameter", 0, "value"), None, "parameter[1].value"), (("parameter", 0, "scale"), 0.0, "parameter[1].scale"),
-    (("parameter", 1, "name"), "mass", "each parameter once"), (("covariance", 0), [1.0], "covariance"),
-    (("covariance", 0, 0), 1e6, "covariance that is that of the directions"),
-    (("direction", 0, "standard_deviation"), -1.0, "direction[1].standard_deviation"),
-    (("direction", 0, "vector"), [0.5], "directions with a number for each"),
-    (("spread",), [], "spread"), (("spread", 0, "frequency_Hz", 1), 0.5, "increasing"),
-    (("spread", 0, "measured", 0), -0.1, "spread[1].measured[1]"), (("spread", 0, "noise"), [], "row of noise"),
-    (("spread", 0, "confidence", 0), 1.5, "spread[1].confidence[1]"), (("spread", 0, "keep"), "z", "keep"),
-    (("spreads",), [], "did you mean spread"), (("spread", 0, "weight", "gain"), 0.0, "gain")])
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (("format",), "avis-plant", "format"),
+        (("version",), 2, "version"),
+        (("rig",), 3, "rig"),
+        (("parameter", 0, "value"), None, "parameter[1].value"),
+        (("parameter", 0, "scale"), 0.0, "parameter[1].scale"),
+        (("parameter", 1, "name"), "mass", "each parameter once"),
+        (("covariance", 0), [1.0], "covariance"),
+        (("covariance", 0, 0), 1e6, "covariance that is that of the directions"),
+        (("direction", 0, "standard_deviation"), -1.0, "direction[1].standard_deviation"),
+        (("direction", 0, "vector"), [0.5], "directions with a number for each"),
+        (("spread",), [], "spread"),
+        (("spread", 0, "frequency_Hz", 1), 0.5, "increasing"),
+        (("spread", 0, "measured", 0), -0.1, "spread[1].measured[1]"),
+        (("spread", 0, "noise"), [], "row of noise"),
+        (("spread", 0, "confidence", 0), 1.5, "spread[1].confidence[1]"),
+        (("spread", 0, "keep"), "z", "keep"),
+        (("spreads",), [], "did you mean spread"),
+        (("spread", 0, "weight", "gain"), 0.0, "gain"),
+    ],
+)
 def test_wrong_entries_are_named(folder, content, place, value, words):
     table = copy.deepcopy(content.model_dump())
     *parents, last = place
@@ -211,9 +233,14 @@ def test_a_missing_file_and_a_wrong_kind_of_entry(folder):
 
 
 def test_a_design_whose_file_was_not_read_says_so(rig):
-    table = {"title": "t", "rig": "avis", "keep": ["z"], "uncertainty": {"identified": "u.json"},
-             "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0]},
-             "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0}}
+    table = {
+        "title": "t",
+        "rig": "avis",
+        "keep": ["z"],
+        "uncertainty": {"identified": "u.json"},
+        "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0]},
+        "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+    }
     with pytest.raises(InputError, match="read_study"):
         build_plant(design_from_table(table), rig)
 
@@ -224,10 +251,16 @@ def test_channels_alike_serve_the_axes_alike():
 
 
 def test_the_generated_design_reads_back(folder, rig, content):
-    template = design_from_table({**_table(), "uncertainty": {
-        "parameters_percent": {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.k_x": 15.0},
-        "parameters_absolute": {"com_y": 0.01},
-        "actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0}}})
+    template = design_from_table(
+        {
+            **_table(),
+            "uncertainty": {
+                "parameters_percent": {"mass": 10.0, "isolator*.k_z": 15.0, "isolator*.k_x": 15.0},
+                "parameters_absolute": {"com_y": 0.01},
+                "actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0},
+            },
+        }
+    )
     (folder / "design.toml").write_text(identification_design(content, template, rig), encoding="utf-8")
     design, _ = read_study(folder / "design.toml")
     assert design.uncertainty.identified == content and design.rig == "rig.toml"
@@ -241,10 +274,17 @@ def test_the_generated_design_reads_back(folder, rig, content):
 
 
 def _table() -> dict:
-    return {"title": 'A "quoted" title', "rig": "avis", "keep": ["z", "phi_x"], "requirement": [
-        {"quantity": "mu_upper", "at_most": 1.0}, {"quantity": "advantage_over_skyhook_dB", "at_least": 6.0}],
-            "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0]},
-            "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0}}
+    return {
+        "title": 'A "quoted" title',
+        "rig": "avis",
+        "keep": ["z", "phi_x"],
+        "requirement": [
+            {"quantity": "mu_upper", "at_most": 1.0},
+            {"quantity": "advantage_over_skyhook_dB", "at_least": 6.0},
+        ],
+        "transmissibility": {"peak_dB": 3.5, "band_dB": -7.0, "band_Hz": [1.0, 10.0]},
+        "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+    }
 
 
 def test_a_member_of_the_set_is_simulated_as_it_is(folder):
@@ -280,7 +320,7 @@ def test_a_member_of_the_set_is_simulated_as_it_is(folder):
     kept, S = [changed.coordinates.index(name) for name in design.keep], np.diag([1.0, 1 / rig.edge_m])
     M, C, K = (S @ X[np.ix_(kept, kept)] @ S for X in (changed.M, changed.C, changed.K))
     delay = next(p.system for p in plant.full.parts if p.name == "delay and amplifier z")(1j * omega)[0, 0]
-    table = 1j * omega * np.linalg.inv(K + 1j * omega * C - omega ** 2 * M)
+    table = 1j * omega * np.linalg.inv(K + 1j * omega * C - omega**2 * M)
     assert np.allclose(closed, delay * table @ (np.eye(2) + W * np.asarray(Delta)), rtol=1e-8, atol=1e-14)
 
 

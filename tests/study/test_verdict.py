@@ -41,8 +41,9 @@ def test_an_unstable_loop_comes_before_requirements_that_are_met():
     assert [row.met for row in found.requirements] == [False, True, False, True]
 
 
-@pytest.mark.parametrize("bad", [plant("nominal", 1.0 + 1e-9), plant("nominal", 0.99, diverged=True),
-                                 plant("nominal", np.nan)])
+@pytest.mark.parametrize(
+    "bad", [plant("nominal", 1.0 + 1e-9), plant("nominal", 0.99, diverged=True), plant("nominal", np.nan)]
+)
 def test_a_slow_growth_a_divergence_and_a_radius_that_is_no_number_are_all_unstable(bad):
     found = result([bad], CULPRIT)
     assert not found.stable and first_sentence(found).startswith("UNSTABLE")
@@ -51,19 +52,28 @@ def test_a_slow_growth_a_divergence_and_a_radius_that_is_no_number_are_all_unsta
 def test_stable_loops_count_and_nothing_is_raised():
     found = result([plant("nominal", 0.9999), plant("random 1", 0.999, clipped=3)])
     refuse_unstable(found)
-    assert first_sentence(found) == ("1 of 3 requirements is not met: voltages stay within the limits of drives and "
-                                     "converter.")
+    assert first_sentence(found) == (
+        "1 of 3 requirements is not met: voltages stay within the limits of drives and converter."
+    )
     stable, limits, _ = found.requirements
     assert (stable.value, stable.limit, stable.met) == (2, 2, True) and (limits.value, limits.met) == (1, False)
 
 
-@pytest.mark.parametrize("band_bound, said", [(0.5, "is at most +6.0 dB, and at most -8.0 dB from 1 to 10 Hz."),
-                                              (0.3, "loop exceeds them: -8.0 dB from 1 to 10 Hz (bound -10.5 dB).")])
+@pytest.mark.parametrize(
+    "band_bound, said",
+    [
+        (0.5, "is at most +6.0 dB, and at most -8.0 dB from 1 to 10 Hz."),
+        (0.3, "loop exceeds them: -8.0 dB from 1 to 10 Hz (bound -10.5 dB)."),
+    ],
+)
 def test_all_six_degrees_of_freedom_stand_beside_the_bounds_of_the_design_model(band_bound, said):
     """The band is 1 to 10 Hz; 2 at 0.5 Hz is outside, 0.4 at 2 Hz inside."""
     mu = SimpleNamespace(worst_peak=SimpleNamespace(upper=2.5), worst_band=SimpleNamespace(upper=band_bound))
-    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]),
-                          alone=np.array([[9.0] * 6, [2.0, 1.0, 0.4, 0.3, 0.5, 4.0], [9.0] * 6]))
+    six = SimpleNamespace(
+        omega=2 * np.pi * np.array([0.5, 2.0, 20.0]),
+        kept=np.array([2.0, 0.4, 1.0]),
+        alone=np.array([[9.0] * 6, [2.0, 1.0, 0.4, 0.3, 0.5, 4.0], [9.0] * 6]),
+    )
     design = SimpleNamespace(transmissibility=SimpleNamespace(band_Hz=[1.0, 10.0]), keep=["z", "phi_x"])
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))
     assert said in found and "z and phi_x" in found and "locked" in found
@@ -74,8 +84,11 @@ def test_all_six_degrees_of_freedom_stand_beside_the_bounds_of_the_design_model(
 def test_without_bounds_none_are_said_to_hold():
     """Robust stability is not proved: the worst cases are infinite, and the nominal loop alone can be told."""
     nothing = SimpleNamespace(upper=np.inf)
-    six = SimpleNamespace(omega=2 * np.pi * np.array([0.5, 2.0, 20.0]), kept=np.array([2.0, 0.4, 1.0]),
-                          alone=np.array([[9.0] * 6, [2.0, 1.0, 0.4, 0.3, 0.5, 4.0], [9.0] * 6]))
+    six = SimpleNamespace(
+        omega=2 * np.pi * np.array([0.5, 2.0, 20.0]),
+        kept=np.array([2.0, 0.4, 1.0]),
+        alone=np.array([[9.0] * 6, [2.0, 1.0, 0.4, 0.3, 0.5, 4.0], [9.0] * 6]),
+    )
     design = SimpleNamespace(transmissibility=SimpleNamespace(band_Hz=[1.0, 10.0]), keep=["z", "phi_x"])
     mu = SimpleNamespace(worst_peak=nothing, worst_band=nothing)
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))

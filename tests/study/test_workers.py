@@ -59,6 +59,7 @@ def test_who_leaves_early_waits_for_nobody(stop):
 def test_ctrl_c_is_not_kept_for_later():
     def interrupt() -> None:
         raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt), Workers(1) as workers:
         workers.submit(interrupt)
 
@@ -78,6 +79,7 @@ def test_an_error_is_the_one_of_the_function_and_nothing_is_left_over():
         if k == 3:
             raise InputError("expected another", field="k", value=k)
         return os.getpid()
+
     with pytest.raises(InputError, match="k = 3: expected another"):
         each(fails, range(5))
     if len(os.sched_getaffinity(0)) > 1:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-FUNCTION = '''
+FUNCTION = """
 import os
 import signal
 import time
@@ -26,7 +26,7 @@ def figures(point):
     with open(point["log"], "a") as log:
         log.write(f"ended {point['k']} {os.getpid()}\\n")
     return {"cost": point["k"] ** 2, "error": 1 / (1 + point["k"])}
-'''
+"""
 COMMAND = [sys.executable, "-c", "from avis_ctrl.cli import main; main()", "sweep"]
 
 
@@ -34,8 +34,10 @@ def write_points(folder: Path, count: int, **constants: Any) -> Path:
     """A file of `count` points k = 0, 1, ...; constants are further keys of all of them. Returns its path."""
     (folder / "own.py").write_text(FUNCTION)
     constants = {"log": str(folder / "log"), **constants}
-    axes = "".join(f"[[vary]]\nkey = {json.dumps(key)}\nvalues = {json.dumps(values)}\n"
-                   for key, values in {"k": list(range(count)), **{k: [v] for k, v in constants.items()}}.items())
+    axes = "".join(
+        f"[[vary]]\nkey = {json.dumps(key)}\nvalues = {json.dumps(values)}\n"
+        for key, values in {"k": list(range(count)), **{k: [v] for k, v in constants.items()}}.items()
+    )
     path = folder / "points.toml"
     path.write_text(f'kind = "function"\nbase = "own.py:figures"\npareto = ["cost", "error"]\n{axes}')
     return path
@@ -61,8 +63,14 @@ def environment() -> dict[str, str]:
 
 def start(*arguments: str | Path) -> subprocess.Popen[str]:
     """The command in a process group of its own."""
-    return subprocess.Popen([*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                            text=True, env=environment(), start_new_session=True)
+    return subprocess.Popen(
+        [*COMMAND, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+        start_new_session=True,
+    )
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

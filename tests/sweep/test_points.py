@@ -46,8 +46,9 @@ def drawn(key: str, **changes: object) -> dict[str, object]:
 
 
 def test_listed_points_times_grids():
-    found = points(point=[{"a": {"b": 1}}, {"a.b": 2}], vary=[{"key": "c", "values": [[1], [2]]},
-                                                             {"key": "d", "values": ["x"]}])
+    found = points(
+        point=[{"a": {"b": 1}}, {"a.b": 2}], vary=[{"key": "c", "values": [[1], [2]]}, {"key": "d", "values": ["x"]}]
+    )
     assert found == [{"a.b": b, "c": [c], "d": "x"} for b in (1, 2) for c in (1, 2)]
 
 
@@ -79,7 +80,8 @@ def test_every_parameter_of_a_wildcard_is_drawn_by_itself(tmp_path):
         name = key.removeprefix("rig_factor.")
         assert after[name].value == pytest.approx(factor * before[name].value, rel=1e-12)
     assert {name for name in before if after[name].value != before[name].value} == {
-        f"isolator{n}.k_z" for n in (1, 2, 3, 4)}
+        f"isolator{n}.k_z" for n in (1, 2, 3, 4)
+    }
 
 
 def small(folder) -> DesignBase:
@@ -90,9 +92,15 @@ def small(folder) -> DesignBase:
 def test_values_reach_the_design_and_the_rig(tmp_path):
     base = small(tmp_path)
     (tmp_path / "other.toml").write_text(SMALL.replace('["z"]', '["z", "phi_x"]'))
-    job = base.job({"transmissibility.band_dB": -5.0, "uncertainty.parameters_percent.isolator1.k_z": 20.0,
-                    "uncertainty.actuator_chains": {"low_percent": 5.0, "crossover_Hz": 90.0, "high_percent": 300.0},
-                    "rig.mass": 550.0, "base": "other.toml"})
+    job = base.job(
+        {
+            "transmissibility.band_dB": -5.0,
+            "uncertainty.parameters_percent.isolator1.k_z": 20.0,
+            "uncertainty.actuator_chains": {"low_percent": 5.0, "crossover_Hz": 90.0, "high_percent": 300.0},
+            "rig.mass": 550.0,
+            "base": "other.toml",
+        }
+    )
     design = job.design
     assert (design.keep, design.transmissibility.band_dB) == (["z", "phi_x"], -5.0)
     assert design.uncertainty.parameters_percent == {"mass": 10.0, "isolator1.k_z": 20.0}
@@ -107,47 +115,71 @@ def test_the_identity_is_that_of_the_resolved_input(tmp_path):
     inputs = base.job({}).inputs
     assert base.job({"title": "another name", "rig_factor.mass": 1.0}).inputs == inputs
     assert base.job({"transmissibility.band_dB": -3.0}).inputs == inputs
-    different = [{"transmissibility.band_dB": -3.1}, {"rig_factor.mass": 1.01}, {"rig": "halcyonics_loaded",
-                 "uncertainty.parameters_percent": {"load.mass": 10.0}}]
+    different = [
+        {"transmissibility.band_dB": -3.1},
+        {"rig_factor.mass": 1.01},
+        {"rig": "halcyonics_loaded", "uncertainty.parameters_percent": {"load.mass": 10.0}},
+    ]
     assert len({inputs, *(base.job(point).inputs for point in different)}) == 4
 
 
-@pytest.mark.parametrize(("text", "words"), [
-    ('kind = "design"', "base: this key is missing"),
-    ('base = "nowhere.toml"', "no such file; expected a design file"),
-    ('base = "small.toml"\nkind = "dream"', "kind = 'dream': expected 'design', 'skyhook', 'gap' or 'function'"),
-    ('base = "small.toml"\nvarry = 1', "unknown key; did you mean vary?"),
-    ('base = "small.toml"\n[[vary]]\nkey = "keep"\nvalues = []', "at least 1 item"),
-    ('base = "small.toml"\n[[vary]]\nkey = "keep"', "exactly one of values and random for keep"),
-    ('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_db"\nvalues = [1]',
-     "unknown key; did you mean transmissibility.band_dB"),
-    ('base = "small.toml"\n[[vary]]\nkey = "crossover_Hz"\nvalues = [1]',
-     "uncertainty.actuator_chains.crossover_Hz"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.masss"\nvalues = [1]', "did you mean rig.mass"),
-    ('base = "small.toml"\n[[point]]\n"rig.masss" = 1', "did you mean rig.mass"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = [1]\n[[vary]]\nkey = "rig.mass"\nvalues = [2]',
-     "key = 'rig.mass': expected each key once"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = ["much", true, inf]', "expected a number"),
-    ('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\nvalues = ["deep"]', "expected a number"),
-    ('base = "small.toml"\n[[vary]]\nkey = "base"\nvalues = [3]', "expected the name of a design file"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 3.0, high = 2.0}',
-     "expected low below high"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 0.0, high = 2.0, '
-     'scale = "log"}', "positive low on a log scale"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 1.0, high = 2.0}\n'
-     '[[vary]]\nkey = "rig.com_x"\nrandom = {count = 3, seed = 1, low = 1.0, high = 2.0}', "one count"),
-    ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 200000000, seed = 1, low = 1.0, high = 2.0}',
-     "points = 200000000: expected at most 20000; here are 1 x 200000000"),
-    ('base = "small.toml"\npareto = ["mu_upper", "band"]', "pareto = 'band': expected some of mu_upper, mu_lower"),
-    ('base = "small.toml"\npareto = ["mu_upper"]', "at least 2 items"),
-    ('base = "small.toml"\nkind = "gap"', "rig: this key is missing"),
-    ('base = "nowhere.h5"\nkind = "gap"\nrig = "avis"', "nowhere.h5"),
-    ('base = "small.toml"\nrig = "avis"', "the design file names it"),
-    ('base = "own.py"\nkind = "function"', "expected FILE.py:NAME"),
-    ('base = "nowhere.py:f"\nkind = "function"', "expected a Python file (No such file"),
-    ('base = "broken.py:f"\nkind = "function"', "expected a Python file that runs: ZeroDivisionError"),
-    ('base = "own.py:g"\nkind = "function"', "expected the name of a function"),
-    ("base = ", "expected a TOML file")])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('kind = "design"', "base: this key is missing"),
+        ('base = "nowhere.toml"', "no such file; expected a design file"),
+        ('base = "small.toml"\nkind = "dream"', "kind = 'dream': expected 'design', 'skyhook', 'gap' or 'function'"),
+        ('base = "small.toml"\nvarry = 1', "unknown key; did you mean vary?"),
+        ('base = "small.toml"\n[[vary]]\nkey = "keep"\nvalues = []', "at least 1 item"),
+        ('base = "small.toml"\n[[vary]]\nkey = "keep"', "exactly one of values and random for keep"),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_db"\nvalues = [1]',
+            "unknown key; did you mean transmissibility.band_dB",
+        ),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "crossover_Hz"\nvalues = [1]',
+            "uncertainty.actuator_chains.crossover_Hz",
+        ),
+        ('base = "small.toml"\n[[vary]]\nkey = "rig.masss"\nvalues = [1]', "did you mean rig.mass"),
+        ('base = "small.toml"\n[[point]]\n"rig.masss" = 1', "did you mean rig.mass"),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = [1]\n[[vary]]\nkey = "rig.mass"\nvalues = [2]',
+            "key = 'rig.mass': expected each key once",
+        ),
+        ('base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = ["much", true, inf]', "expected a number"),
+        ('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\nvalues = ["deep"]', "expected a number"),
+        ('base = "small.toml"\n[[vary]]\nkey = "base"\nvalues = [3]', "expected the name of a design file"),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 3.0, high = 2.0}',
+            "expected low below high",
+        ),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 0.0, high = 2.0, '
+            'scale = "log"}',
+            "positive low on a log scale",
+        ),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 2, seed = 1, low = 1.0, high = 2.0}\n'
+            '[[vary]]\nkey = "rig.com_x"\nrandom = {count = 3, seed = 1, low = 1.0, high = 2.0}',
+            "one count",
+        ),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nrandom = {count = 200000000, seed = 1, low = 1.0, '
+            "high = 2.0}",
+            "points = 200000000: expected at most 20000; here are 1 x 200000000",
+        ),
+        ('base = "small.toml"\npareto = ["mu_upper", "band"]', "pareto = 'band': expected some of mu_upper, mu_lower"),
+        ('base = "small.toml"\npareto = ["mu_upper"]', "at least 2 items"),
+        ('base = "small.toml"\nkind = "gap"', "rig: this key is missing"),
+        ('base = "nowhere.h5"\nkind = "gap"\nrig = "avis"', "nowhere.h5"),
+        ('base = "small.toml"\nrig = "avis"', "the design file names it"),
+        ('base = "own.py"\nkind = "function"', "expected FILE.py:NAME"),
+        ('base = "nowhere.py:f"\nkind = "function"', "expected a Python file (No such file"),
+        ('base = "broken.py:f"\nkind = "function"', "expected a Python file that runs: ZeroDivisionError"),
+        ('base = "own.py:g"\nkind = "function"', "expected the name of a function"),
+        ("base = ", "expected a TOML file"),
+    ],
+)
 def test_hostile_files_are_one_line(text, words, tmp_path):
     (tmp_path / "small.toml").write_text(SMALL)
     (tmp_path / "own.py").write_text("def f(point):\n    return {}\n")
@@ -171,8 +203,9 @@ def test_a_grid_beyond_the_limit_is_refused_before_it_is_made():
 def test_a_point_that_cannot_be_made_is_a_task_less(tmp_path):
     """The others are computed; `band_dB` above `peak_dB` is refused by the design file's own check."""
     (tmp_path / "small.toml").write_text(SMALL)
-    (tmp_path / "p.toml").write_text('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\n'
-                                     "values = [-3.0, 9.0]")
+    (tmp_path / "p.toml").write_text(
+        'base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\nvalues = [-3.0, 9.0]'
+    )
     plan = plan_sweep(tmp_path / "p.toml", tmp_path / "out")
     made, refused = plan.tasks
     assert isinstance(refused, InputError) and "below peak_dB = 6" in str(refused)
@@ -181,16 +214,23 @@ def test_a_point_that_cannot_be_made_is_a_task_less(tmp_path):
 
 def test_wrong_values_are_said_before_the_other_points_are_computed(tmp_path):
     (tmp_path / "small.toml").write_text(SMALL)
-    (tmp_path / "p.toml").write_text('base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\n'
-                                     'values = ["a", -3.0, 9.0]')
+    (tmp_path / "p.toml").write_text(
+        'base = "small.toml"\n[[vary]]\nkey = "transmissibility.band_dB"\nvalues = ["a", -3.0, 9.0]'
+    )
     said = []
 
     def backend(tasks):
         assert len(tasks) == 1 and len(said) == 2
         yield lost(tasks[0], "")
+
     found = run_sweep(plan_sweep(tmp_path / "p.toml", tmp_path), backend, lambda done, total, text: said.append(text))
-    assert said[0].startswith("2 of 3 points have values that do not fit and are not computed; the first: "
-                              "transmissibility.band_dB = 'a': expected a number") and "\n" not in said[0]
+    assert (
+        said[0].startswith(
+            "2 of 3 points have values that do not fit and are not computed; the first: "
+            "transmissibility.band_dB = 'a': expected a number"
+        )
+        and "\n" not in said[0]
+    )
     assert [row.status for row in found.rows] == ["failed", "lost", "failed"]
 
 
@@ -203,6 +243,7 @@ def test_the_hash_of_the_points_file_is_that_of_the_text_that_was_read(tmp_path)
     def backend(tasks):
         path.write_text("edited during the sweep")
         yield lost(tasks[0], "")
+
     found = run_sweep(plan_sweep(path, tmp_path), backend)
     assert found.provenance["points_sha256"] == hashlib.sha256(read).hexdigest()
 
@@ -220,7 +261,16 @@ def test_the_guide_s_examples_are_points(tmp_path):
 
 def test_keys_are_those_of_the_design_file():
     """Each key of the shipped files is one that may vary."""
-    assert {"keep", "rig", "base", "transmissibility.band_Hz", "uncertainty.sensor_chains.crossover_Hz", "requirement",
-            "synthesis.max_iterations"} <= set(KEYS)
-    assert [key for key, free in KEYS.items() if free] == ["uncertainty.parameters_percent",
-                                                           "uncertainty.parameters_absolute"]
+    assert {
+        "keep",
+        "rig",
+        "base",
+        "transmissibility.band_Hz",
+        "uncertainty.sensor_chains.crossover_Hz",
+        "requirement",
+        "synthesis.max_iterations",
+    } <= set(KEYS)
+    assert [key for key, free in KEYS.items() if free] == [
+        "uncertainty.parameters_percent",
+        "uncertainty.parameters_absolute",
+    ]

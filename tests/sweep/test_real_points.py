@@ -38,8 +38,14 @@ values = [-6.0, 9.0]
 key = "rig_factor.mass"
 values = [1.1]
 """)
-    done = subprocess.run([*COMMAND, str(tmp_path / "points.toml"), "--out", str(tmp_path / "out"), "--workers", "1"],
-                          capture_output=True, text=True, env=environment(), timeout=600, check=False)
+    done = subprocess.run(
+        [*COMMAND, str(tmp_path / "points.toml"), "--out", str(tmp_path / "out"), "--workers", "1"],
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=600,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     row, refused = rows_of(tmp_path / "out")
     assert refused["status"] == "failed" and "below peak_dB" in refused["message"]

@@ -46,13 +46,19 @@ def scheduler(tmp_path_factory) -> Iterator[tuple[str, Callable[[], subprocess.P
 
     def process(*arguments: str) -> subprocess.Popen:
         log = (folder / f"{len(running)}.log").open("w")
-        one = subprocess.Popen([sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]], stdout=log,
-                               stderr=log, env=environment(), cwd=folder)
+        one = subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]],
+            stdout=log,
+            stderr=log,
+            env=environment(),
+            cwd=folder,
+        )
         running.append(one)
         return one
 
     def worker() -> subprocess.Popen:
         return process("dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+
     process("dask_scheduler", "--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--no-dashboard")
     worker()
     yield address, worker
@@ -94,6 +100,7 @@ def test_points_of_a_killed_worker_go_to_the_other(scheduler, tmp_path):
     write_points(tmp_path, 14, wait_s=0.2)
     other = worker()
     from distributed import Client
+
     with Client(address, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=60)
     killed = []
@@ -103,14 +110,16 @@ def test_points_of_a_killed_worker_go_to_the_other(scheduler, tmp_path):
             if not killed:
                 other.send_signal(signal.SIGSTOP)  # so that it is where the log says when it is killed
                 time.sleep(0.02)
-                of_other = [line for line in (tmp_path / "log").read_text().splitlines()
-                            if line.endswith(f" {other.pid}")]
+                of_other = [
+                    line for line in (tmp_path / "log").read_text().splitlines() if line.endswith(f" {other.pid}")
+                ]
                 if of_other and of_other[-1].startswith("began"):
                     other.kill()
                     killed.append(other.wait())
                 else:
                     other.send_signal(signal.SIGCONT)
             yield content
+
     found = swept(tmp_path, on_both)
     assert killed == [-signal.SIGKILL]
     assert [row.status for row in found.rows] == ["done"] * 14
@@ -196,8 +205,9 @@ def test_an_interrupt_keeps_what_is_finished(how, tmp_path):
     os.killpg(child.pid, signal.SIGINT)
     _, complained = child.communicate(timeout=30)
     assert child.returncode == 130 and "Traceback" not in complained
-    assert complained.splitlines()[-1] == ("avis: interrupted; finished points are kept: the same command computes the "
-                                           "others")
+    assert complained.splitlines()[-1] == (
+        "avis: interrupted; finished points are kept: the same command computes the others"
+    )
     assert len(list((out / "points").glob("*.json"))) >= 1
 
 
@@ -212,8 +222,10 @@ def test_no_scheduler_and_no_worker_are_one_line(tmp_path):
 def test_a_scheduler_without_workers_is_one_line():
     from distributed import LocalCluster
 
-    with (LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as cluster,
-          pytest.raises(InputError, match=r"expected a scheduler with a worker; none came within 0\.5 s")):
+    with (
+        LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as cluster,
+        pytest.raises(InputError, match=r"expected a scheduler with a worker; none came within 0\.5 s"),
+    ):
         list(on_cluster([], cluster.scheduler_address, 0, SweepSettings(patience_s=0.5)))
 
 
@@ -237,6 +249,7 @@ def test_a_disk_that_refuses_a_point_ends_the_sweep(tmp_path, monkeypatch):
 
     def full(path: Path, content: bytes) -> None:
         raise ComputationError(f"{path.name} was not written", cause="No space left on device")
+
     write_points(tmp_path, 3)
     monkeypatch.setattr(task, "write_whole", full)
     with pytest.raises(ComputationError, match="No space left"):

@@ -20,8 +20,9 @@ from avis_ctrl.sweep.run import plan_sweep, run_sweep
 def by_definition(values: np.ndarray) -> set[int]:
     """Points that no other is at most equal to in both figures and below in one."""
     known = [k for k in range(len(values)) if np.all(np.isfinite(values[k]))]
-    return {k for k in known if not any(np.all(values[j] <= values[k]) and np.any(values[j] < values[k])
-                                        for j in known)}
+    return {
+        k for k in known if not any(np.all(values[j] <= values[k]) and np.any(values[j] < values[k]) for j in known)
+    }
 
 
 def test_the_front_is_that_of_its_definition(rng):
@@ -50,16 +51,19 @@ def swept(folder, count, **constants):
 
 
 def test_files_say_the_same(tmp_path):
-    found = swept(tmp_path, 4, refused=2, note="a, \"quoted\" = text")
+    found = swept(tmp_path, 4, refused=2, note='a, "quoted" = text')
     written = write_sweep(found, tmp_path / "out")
     assert [path.name for path in written] == ["sweep.csv", "pareto.png", "sweep.html", "sweep.json"]
     with (tmp_path / "out" / "sweep.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     stored = json.loads((tmp_path / "out" / "sweep.json").read_text())
-    assert [row["k"] for row in table] == ["0", "1", "2", "3"] and table[1]["note"] == "a, \"quoted\" = text"
+    assert [row["k"] for row in table] == ["0", "1", "2", "3"] and table[1]["note"] == 'a, "quoted" = text'
     for row, point in zip(table, stored["points"], strict=True):
-        assert (row["status"], row["message"], row["identity"]) == (point["status"], point["message"],
-                                                                    point["identity"])
+        assert (row["status"], row["message"], row["identity"]) == (
+            point["status"],
+            point["message"],
+            point["identity"],
+        )
         assert {name: json.loads(row[name]) for name in point["figures"]} == point["figures"]
     assert table[2]["cost"] == "" and table[2]["message"] == "ValueError: no value at this point"
     assert stored["pareto"] == {"quantities": ["cost", "error"], "front": [1, 2, 4]}  # rows, counted from 1
@@ -71,8 +75,9 @@ def test_files_say_the_same(tmp_path):
 
 def test_a_quantity_that_no_point_has(tmp_path):
     found = swept(tmp_path, 2)
-    (tmp_path / "points.toml").write_text((tmp_path / "points.toml").read_text().replace('"cost", "error"',
-                                                                                        '"cost", "eror"'))
+    (tmp_path / "points.toml").write_text(
+        (tmp_path / "points.toml").read_text().replace('"cost", "error"', '"cost", "eror"')
+    )
     found = run_sweep(plan_sweep(tmp_path / "points.toml", tmp_path / "out"))
     with pytest.raises(InputError, match="pareto = 'eror': expected some of cost, error"):
         write_sweep(found, tmp_path / "out")

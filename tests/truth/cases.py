@@ -37,8 +37,8 @@ LIBRARY: dict[str, Effect] = {effect.name: effect for effect in (*SIGNALS, *MECH
 OUTSIDE_LIBRARY: dict[str, Effect] = {effect.name: effect for effect in OUTSIDE}
 KINDS = {"none": 0.20, "one": 0.45, "two": 0.15, "outside": 0.20}
 STRENGTH_SHARES = {"faint": 0.25, "clear": 0.45, "gross": 0.30}
-UNSIZED = {"tilt_coupling"}     # given by gravity: always called clear
-SETTLE_S = 12.0         # ambient motion before a record; the table's slowest mode decays by e^-3.8 within it
+UNSIZED = {"tilt_coupling"}  # given by gravity: always called clear
+SETTLE_S = 12.0  # ambient motion before a record; the table's slowest mode decays by e^-3.8 within it
 (_PARAMETERS, _PLAN, _EFFECTS, _SIGNAL, _FLOOR, _NOISE, _HOOKS, _PAUSES, _CLUTTER, _TRACES, _PILOT) = range(11)
 
 
@@ -98,8 +98,19 @@ def _bare_case(seed: int, duration_s: float) -> Case:
     levels = np.repeat(np.array([0.08, 0.2, 0.5]) * rng.uniform(0.7, 1.2, 3), 2)
     if rng.random() < 0.5:
         levels = rng.permutation(levels)
-    return Case(seed, "none", (), "multisine" if period else "noise", period, band, tuple(levels.tolist()),
-                _starts(rng, 6, duration_s), duration_s, bool(rng.random() < 0.5), float(rng.uniform(0.0, 1.0)))
+    return Case(
+        seed,
+        "none",
+        (),
+        "multisine" if period else "noise",
+        period,
+        band,
+        tuple(levels.tolist()),
+        _starts(rng, 6, duration_s),
+        duration_s,
+        bool(rng.random() < 0.5),
+        float(rng.uniform(0.0, 1.0)),
+    )
 
 
 def _pick(rng: np.random.Generator, kind: str) -> list[str]:
@@ -115,8 +126,15 @@ def _pick(rng: np.random.Generator, kind: str) -> list[str]:
     return [str(first), str(second)]
 
 
-def draw_case(seed: int, kind: str | None = None, effect: str | None = None, strength: str | None = None,
-              duration_s: float = 60.0, clutter: bool = False, variant: str | None = None) -> Case:
+def draw_case(
+    seed: int,
+    kind: str | None = None,
+    effect: str | None = None,
+    strength: str | None = None,
+    duration_s: float = 60.0,
+    clutter: bool = False,
+    variant: str | None = None,
+) -> Case:
     """A case; the same arguments give the same case.
 
     kind : "none", "one", "two", "outside"; drawn 20/45/15/20 by default. effect : a name of LIBRARY or
@@ -166,14 +184,22 @@ def build_plant(case: Case) -> Plant:
 
 def _pilot_of(case: Case) -> Pilot:
     """A short record of the case's table alone, on a still floor."""
+
     def respond(plant: Plant, u: np.ndarray) -> np.ndarray:
         return run(plant, u, np.zeros((len(u) + 1, 9)), 0, 0.0, _rng(case.seed, _HOOKS))[0]
-    return Pilot(lambda: build_plant(replace(case, traces=(), effects=())), respond, case.band_Hz, case.levels_V,
-                 _rng(case.seed, _PILOT))
+
+    return Pilot(
+        lambda: build_plant(replace(case, traces=(), effects=())),
+        respond,
+        case.band_Hz,
+        case.levels_V,
+        _rng(case.seed, _PILOT),
+    )
 
 
-def held_voltage(samples: int, before: int, dt: float, delay_s: float,
-                 clock_error: float) -> tuple[np.ndarray, np.ndarray]:
+def held_voltage(
+    samples: int, before: int, dt: float, delay_s: float, clock_error: float
+) -> tuple[np.ndarray, np.ndarray]:
     """(first, switch) of kernel.integrate for sample intervals -before .. samples - 1.
 
     The voltage u[n] is held from (n + delay/dt)/(1 + clock_error) to the next one, in sample intervals.
@@ -186,8 +212,15 @@ def held_voltage(samples: int, before: int, dt: float, delay_s: float,
     return first.astype(np.int64), switch
 
 
-def run(plant: Plant, u: np.ndarray, floor: np.ndarray, before: int, start_s: float, rng: np.random.Generator,
-        states: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def run(
+    plant: Plant,
+    u: np.ndarray,
+    floor: np.ndarray,
+    before: int,
+    start_s: float,
+    rng: np.random.Generator,
+    states: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
     """Analogue sensor voltages (samples, 6) under commanded u (samples, 8), and the states if asked for.
 
     floor : (before + samples + 1, 9), from `before` samples ahead of the record, where the table starts at rest.
@@ -207,8 +240,18 @@ def run(plant: Plant, u: np.ndarray, floor: np.ndarray, before: int, start_s: fl
     clock = start_s + np.arange(-before, len(u)) * dt
     y = np.empty((before + len(u), 6))
     trace = np.empty((len(y) if states else 0, len(x)))
-    integrate(P, x, np.ascontiguousarray(held), first, switch, np.ascontiguousarray(floor),
-              np.ascontiguousarray(plant.stiffness(clock), dtype=float), dt, y, trace)
+    integrate(
+        P,
+        x,
+        np.ascontiguousarray(held),
+        first,
+        switch,
+        np.ascontiguousarray(floor),
+        np.ascontiguousarray(plant.stiffness(clock), dtype=float),
+        dt,
+        y,
+        trace,
+    )
     y = y[before:]
     if not np.all(np.isfinite(y)) or np.abs(y).max() > 1e4:
         raise ArithmeticError("the simulated table is unstable")
@@ -238,8 +281,13 @@ def _signals(case: Case, number: int, unseen: bool) -> tuple[np.ndarray, np.ndar
         u = multisine(rng, samples, 8, round(case.period_s * rate), case.band_Hz, rate, level)
     else:
         u = noise(rng, samples, 8, case.band_Hz, rate, level)
-    floor = floor_motion(_rng(case.seed, _FLOOR, *key), before + samples + 1, rate,
-                         rig().ambient.floor_velocity_rms_m_per_s, case.floor_slope)
+    floor = floor_motion(
+        _rng(case.seed, _FLOOR, *key),
+        before + samples + 1,
+        rate,
+        rig().ambient.floor_velocity_rms_m_per_s,
+        case.floor_slope,
+    )
     return u, floor, before
 
 
@@ -250,8 +298,18 @@ def _record(case: Case, plant: Plant, number: int, start_s: float, unseen: bool,
     y, _ = run(plant, u, floor, before, start_s, _rng(case.seed, _HOOKS, *key))
     y = convert(plant, y, start_s, _rng(case.seed, _NOISE, *key))
     names = FLOOR_NAMES if case.floor_recorded else ()
-    header = RecordHeader(f"{number:02d}", plant.rig.sample_rate_Hz, len(u), plant.motors, plant.sensors,
-                          case.excitation, case.levels_V[number], start_s, case.period_s, floor_names=names)
+    header = RecordHeader(
+        f"{number:02d}",
+        plant.rig.sample_rate_Hz,
+        len(u),
+        plant.motors,
+        plant.sensors,
+        case.excitation,
+        case.levels_V[number],
+        start_s,
+        case.period_s,
+        floor_names=names,
+    )
     return Record(header, u, y, floor[before:-1, 3:6] if names else None)
 
 
@@ -264,8 +322,10 @@ def best_prediction(case: Case, unseen: bool = False) -> list[np.ndarray]:
     plant = build_plant(replace(case, traces=()))
     plant.noise_V, plant.jitter_s, plant.digital = np.zeros(6), 0.0, []
     plant.floor_factor = plant.floor_factor if case.floor_recorded else 0.0
-    return [np.asarray(_record(case, plant, number, start, unseen).y)
-            for number, start in enumerate(_starts_of(case, unseen))]
+    return [
+        np.asarray(_record(case, plant, number, start, unseen).y)
+        for number, start in enumerate(_starts_of(case, unseen))
+    ]
 
 
 def _starts_of(case: Case, unseen: bool) -> tuple[float, ...]:
@@ -279,8 +339,9 @@ def simulate_case(case: Case, unseen: bool = False) -> Campaign:
     other pauses. Whatever drifts starts again from its beginning.
     """
     plant = build_plant(case)
-    records = tuple(_record(case, plant, number, start, unseen)
-                    for number, start in enumerate(_starts_of(case, unseen)))
+    records = tuple(
+        _record(case, plant, number, start, unseen) for number, start in enumerate(_starts_of(case, unseen))
+    )
     return Campaign("avis", records, source=f"truth, seed {case.seed}")
 
 
@@ -294,8 +355,9 @@ def channel_change(case: Case) -> np.ndarray:
     full = build_plant(case)
     power = np.zeros(6)
     for number, start in enumerate(case.starts_s):
-        power += np.mean((_record(case, full, number, start, False).y
-                          - _record(case, bare, number, start, False).y) ** 2, axis=0)
+        power += np.mean(
+            (_record(case, full, number, start, False).y - _record(case, bare, number, start, False).y) ** 2, axis=0
+        )
     rest = _record(case, bare, 0, case.starts_s[0], False, driven=False).y
     if case.floor_recorded:
         _, floor, before = _signals(case, 0, False)

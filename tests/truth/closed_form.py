@@ -42,8 +42,9 @@ def response(P: Physics, f_Hz: float) -> np.ndarray:
     def apart(on_payload: np.ndarray, on_chassis: np.ndarray, mount: int) -> np.ndarray:
         """(3, n) of the payload less that of the chassis."""
         out = motion(on_payload, mount)
-        out[:, 6 + modes:] -= carry(on_chassis)[:, free]
+        out[:, 6 + modes :] -= carry(on_chassis)[:, free]
         return out
+
     stretch = [apart(P.r[i], P.base_r[i], i) for i in range(4)]
     Z = np.zeros((n, n), complex)
     Z[:3, :3] = s**2 * P.m * np.eye(3)
@@ -53,14 +54,14 @@ def response(P: Physics, f_Hz: float) -> np.ndarray:
         Z[6 + j, 6 + j] = s**2 + 2 * P.mode_z[j] * P.mode_w[j] * s + P.mode_w[j] ** 2
     if chassis:
         own = np.diag(s**2 / P.base_Mi) + s * P.base_C + P.base_K
-        Z[6 + modes:, 6 + modes:] = own[np.ix_(free, free)]
+        Z[6 + modes :, 6 + modes :] = own[np.ix_(free, free)]
     k = mount_stiffness(P, s)
     for i in range(4):
         Z += stretch[i].T @ np.diag(k[i]) @ stretch[i]
     for p, d, kc, cc in zip(P.cable_r, P.cable_d, P.cable_k, P.cable_c, strict=True):
         row = np.zeros(n)
         row[:6] = d @ carry(p)
-        row[6 + modes:] -= np.append(d, np.zeros(3))[free]
+        row[6 + modes :] -= np.append(d, np.zeros(3))[free]
         Z += np.outer(row, row) * (kc + cc * s)
     for p, d, m, ko, co in zip(P.osc_r, P.osc_d, P.osc_m, P.osc_k, P.osc_c, strict=True):
         row = np.zeros(n)
@@ -70,13 +71,17 @@ def response(P: Physics, f_Hz: float) -> np.ndarray:
     for poles in (P.lag, P.lag2):
         if len(poles):
             lag = lag * np.array([w / (s + w) if w > 0 else 1.0 for w in poles])
-    T = np.array([d @ apart(p, c, i) * tau * w for p, c, d, i, tau, w in
-                  zip(P.motor_r, P.base_motor_r, P.motor_d, P.motor_at, P.motor, lag, strict=True)]).T
+    T = np.array(
+        [
+            d @ apart(p, c, i) * tau * w
+            for p, c, d, i, tau, w in zip(P.motor_r, P.base_motor_r, P.motor_d, P.motor_at, P.motor, lag, strict=True)
+        ]
+    ).T
     q = np.linalg.solve(Z, T)
     out = np.empty((6, 8), complex)
     for j in range(6):
         tilt = np.zeros(n)
-        tilt[3:6] = P.g * np.array([P.sensor_n[j, 1], -P.sensor_n[j, 0], 0.0])   # of y by +phi_x, of x by -phi_y
+        tilt[3:6] = P.g * np.array([P.sensor_n[j, 1], -P.sensor_n[j, 0], 0.0])  # of y by +phi_x, of x by -phi_y
         acceleration = (s**2 * P.sensor_n[j] @ motion(P.sensor_r[j], P.sensor_at[j]) + tilt) @ q
         coil = P.S[j] * s / (s**2 + 2 * P.zn[j] * P.wn[j] * s + P.wn[j] ** 2)
         compensation = 1 + (P.b1[j] * s + P.b0[j]) / (s**2 + 2 * P.zc * P.wc * s + P.wc**2)
@@ -89,9 +94,11 @@ def sampled_response(P: Physics, f_Hz: float, rate_Hz: float, delay_s: float, al
 
     Beyond the first `aliases` the response falls as 1/s (a velocity per force), and their sum is taken as that.
     """
+
     def hold(n: np.ndarray | int) -> np.ndarray:
         s = 2j * np.pi * (f_Hz + n * rate_Hz)
         return (1 - np.exp(-s / rate_Hz)) / (s / rate_Hz) * np.exp(-s * delay_s)
+
     total = sum(response(P, f_Hz + n * rate_Hz) * hold(n) for n in range(-aliases, aliases + 1))
     for sign in (-1, 1):
         n = sign * np.arange(aliases + 1, 4000)

@@ -22,11 +22,18 @@ from .signals import multisine
 from .table import Plant
 
 # One standard deviation each, where the rig file says nothing (the contract's section "Tolerances").
-DEFAULTS = {"place_m": 0.001, "direction_rad": 0.005, "actuator_gain_percent": 1.0, "sensor_gain_percent": 1.0,
-            "sensor_corner_percent": 1.0, "sensor_damping_percent": 3.0, "centre_of_mass_m": 0.001,
-            "product_of_inertia_kgm2": 0.2}
-UNEXPLAINED = 0.003, 0.01           # by all traces together
-PILOT_S = 16.0                      # at each level
+DEFAULTS = {
+    "place_m": 0.001,
+    "direction_rad": 0.005,
+    "actuator_gain_percent": 1.0,
+    "sensor_gain_percent": 1.0,
+    "sensor_corner_percent": 1.0,
+    "sensor_damping_percent": 3.0,
+    "centre_of_mass_m": 0.001,
+    "product_of_inertia_kgm2": 0.2,
+}
+UNEXPLAINED = 0.003, 0.01  # by all traces together
+PILOT_S = 16.0  # at each level
 
 
 def tolerances(rig: AvisTable) -> dict[str, float]:
@@ -49,13 +56,16 @@ def turned(axes: np.ndarray, angle_rad: float, rng: np.random.Generator) -> np.n
 
 def disturb(plant: Plant, limits: dict[str, float], rng: np.random.Generator) -> None:
     """Draw all that the rig file states within its tolerance; both ends of a mount have errors of their own."""
+
     def errors(name: str, *shape: int) -> np.ndarray:
         return limits[name] * rng.standard_normal(shape)
+
     for name in ("points", "chassis_points", "motor_p", "sensor_p"):
         places = getattr(plant, name)
         setattr(plant, name, places + errors("place_m", *places.shape))
-    plant.motor_d, plant.sensor_n = (turned(axes, limits["direction_rad"], rng)
-                                     for axes in (plant.motor_d, plant.sensor_n))
+    plant.motor_d, plant.sensor_n = (
+        turned(axes, limits["direction_rad"], rng) for axes in (plant.motor_d, plant.sensor_n)
+    )
     plant.motor = plant.motor * (1 + errors("actuator_gain_percent", 8))
     plant.S = plant.S * (1 + errors("sensor_gain_percent", 6))
     plant.wn = plant.wn * (1 + errors("sensor_corner_percent", 6))
@@ -71,8 +81,14 @@ class Pilot:
     build : () -> the table, without traces and hidden effects. run : (plant, u) -> sensor voltages.
     """
 
-    def __init__(self, build: Callable[[], Plant], run: Callable[[Plant, np.ndarray], np.ndarray],
-                 band_Hz: tuple[float, float], levels_V: tuple[float, ...], rng: np.random.Generator):
+    def __init__(
+        self,
+        build: Callable[[], Plant],
+        run: Callable[[Plant, np.ndarray], np.ndarray],
+        band_Hz: tuple[float, float],
+        levels_V: tuple[float, ...],
+        rng: np.random.Generator,
+    ):
         self.build, self.run = build, run
         rate, ordered = build().rig.sample_rate_Hz, sorted(levels_V)
         n = round(PILOT_S * rate)
@@ -80,9 +96,13 @@ class Pilot:
         self.u = multisine(rng, n, 8, n, band_Hz, rate, 1.0)
         self.y = self._responses(build(), self.levels)
         # The table alone is linear in the level, so that one level tells what refitting changes at all of them.
-        changes = [np.outer(self.levels / self.levels[1],
-                            self._changed(lambda plant, one=one: nudge(plant, one, NUDGE), slice(1, 2)))
-                   for one in RIGID]
+        changes = [
+            np.outer(
+                self.levels / self.levels[1],
+                self._changed(lambda plant, one=one: nudge(plant, one, NUDGE), slice(1, 2)),
+            )
+            for one in RIGID
+        ]
         self.refit, self.size = np.linalg.qr(np.stack(changes, axis=-1).reshape(-1, len(RIGID)))
 
     def _responses(self, plant: Plant, levels: np.ndarray) -> np.ndarray:
@@ -102,8 +122,11 @@ class Pilot:
 
 
 # Mass, moments of inertia, and the 8 stiffnesses and 8 dampings that payload motion tells apart: attribute, index.
-RIGID = (("m", ()), *(("J", (a, a)) for a in range(3)),
-         *((name, at) for name in "kc" for at in ((0, 0), (2, 0), (0, 1), (1, 1), *((i, 2) for i in range(4)))))
+RIGID = (
+    ("m", ()),
+    *(("J", (a, a)) for a in range(3)),
+    *((name, at) for name in "kc" for at in ((0, 0), (2, 0), (0, 1), (1, 1), *((i, 2) for i in range(4)))),
+)
 NUDGE = 1e-3
 
 
@@ -125,9 +148,17 @@ def _friction(d: Draw) -> tuple[str, dict[str, float], dict[str, Any]]:
     stiffness = 100.0
     coulomb = stiffness * float(np.mean(d.middle.stretch)) * d.between(0.2, 1.0)
     each = about_one(d.rng.uniform(0.8, 1.2, 8))
-    return "actuators", {"coulomb_N": coulomb, "stiffness_N_per_m": stiffness}, {
-        "coulomb_each_N": (coulomb * each).tolist(), "stiffness_each": (stiffness * each).tolist(), "stiction": 1.0,
-        "bristle_damping": 0.0, "stribeck_m_per_s": 1.0}
+    return (
+        "actuators",
+        {"coulomb_N": coulomb, "stiffness_N_per_m": stiffness},
+        {
+            "coulomb_each_N": (coulomb * each).tolist(),
+            "stiffness_each": (stiffness * each).tolist(),
+            "stiction": 1.0,
+            "bristle_damping": 0.0,
+            "stribeck_m_per_s": 1.0,
+        },
+    )
 
 
 def _stiffening(d: Draw) -> tuple[str, dict[str, float], dict[str, Any]]:
@@ -139,10 +170,15 @@ def _hum(d: Draw) -> tuple[str, dict[str, float], dict[str, Any]]:
     harmonics = [1, 2, 3, *(n for n in (5, 7) if d.rng.random() < 0.5)]
     fundamental = d.between(0.3, 1.0, 6)
     largest, fall = 1e-3, [1.0, *d.between(0.05, 0.5, len(harmonics) - 1)]
-    return "geophones", {"frequency_Hz": float(d.rng.choice([50.0, 60.0]) + d.rng.uniform(-0.1, 0.1)),
-                         "amplitude_V": largest}, {
-        "harmonics": harmonics, "phases": d.rng.uniform(0, 2 * np.pi, (6, len(harmonics))).tolist(),
-        "amplitudes_V": (largest * np.outer(fundamental / fundamental.max(), fall)).tolist()}
+    return (
+        "geophones",
+        {"frequency_Hz": float(d.rng.choice([50.0, 60.0]) + d.rng.uniform(-0.1, 0.1)), "amplitude_V": largest},
+        {
+            "harmonics": harmonics,
+            "phases": d.rng.uniform(0, 2 * np.pi, (6, len(harmonics))).tolist(),
+            "amplitudes_V": (largest * np.outer(fundamental / fundamental.max(), fall)).tolist(),
+        },
+    )
 
 
 def _loss(d: Draw) -> tuple[str, dict[str, float], dict[str, Any]]:
@@ -150,10 +186,12 @@ def _loss(d: Draw) -> tuple[str, dict[str, float], dict[str, Any]]:
 
 
 # How each trace is drawn at some small size, and the parameters and details that grow with it.
-TRACES = {"contact_friction": (_friction, ("coulomb_N", "stiffness_N_per_m", "coulomb_each_N", "stiffness_each")),
-          "cubic_stiffness": (_stiffening, ("cubic_N_per_m3",)),
-          "mains_hum": (_hum, ("amplitude_V", "amplitudes_V")),
-          "structural_damping": (_loss, ("loss_factor",))}
+TRACES = {
+    "contact_friction": (_friction, ("coulomb_N", "stiffness_N_per_m", "coulomb_each_N", "stiffness_each")),
+    "cubic_stiffness": (_stiffening, ("cubic_N_per_m3",)),
+    "mains_hum": (_hum, ("amplitude_V", "amplitudes_V")),
+    "structural_damping": (_loss, ("loss_factor",)),
+}
 
 
 def scaled(trace: Hidden, factor: float) -> Hidden:
@@ -162,6 +200,7 @@ def scaled(trace: Hidden, factor: float) -> Hidden:
 
     def grown(values: dict[str, Any]) -> dict[str, Any]:
         return {key: (factor * np.array(value)).tolist() if key in grows else value for key, value in values.items()}
+
     return replace(trace, parameters=grown(trace.parameters), details=grown(trace.details))
 
 
@@ -173,7 +212,7 @@ def draw_traces(d: Draw, pilot: Pilot, library: dict[str, Effect], leave_out: tu
     found = []
     for name, fraction in zip(names, each, strict=True):
         trace = Hidden(name, *(drawn := TRACES[name][0](d))[:2], "trace", drawn[2])
-        for _ in range(2):      # nearly linear in its size: the second step is small already
+        for _ in range(2):  # nearly linear in its size: the second step is small already
             left, refit = pilot.after_refit(lambda plant, trace=trace: library[trace.name].apply(plant, trace))
             trace = scaled(trace, float(fraction) / left)
         refit *= fraction / left

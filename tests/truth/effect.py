@@ -37,9 +37,9 @@ class Draw:
     middle: Pilot
     high: Pilot
     strength: str
-    span_s: float            # campaign clock at the end of the last record
+    span_s: float  # campaign clock at the end of the last record
     band_Hz: tuple[float, float]
-    tolerances: dict[str, float] = field(default_factory=dict)      # of a cluttered table, SI; empty: none
+    tolerances: dict[str, float] = field(default_factory=dict)  # of a cluttered table, SI; empty: none
 
     def size(self, faint: float, gross: float, least: float = 0.0) -> float:
         """A size between the faintest and the grossest, log-uniform within the third that the strength names.

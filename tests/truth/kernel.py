@@ -20,76 +20,85 @@ class Physics(NamedTuple):
     """Numbers of one table. Points are body-fixed, from the centre of mass; arrays of length 0: effect absent."""
 
     m: float
-    J: np.ndarray            # (3, 3) kg m^2 about the centre of mass
-    Ji: np.ndarray           # its inverse
-    rotor: np.ndarray        # (3,) N m s, angular momentum of a spinning rotor
-    drag: float              # N s^2/m^2, quadratic damping of the payload
-    r: np.ndarray            # (4, 3) mounts on the payload
-    k: np.ndarray            # (4, 3) N/m
-    c: np.ndarray            # (4, 3) N s/m
-    k2: np.ndarray           # (4,) N/m^2, vertical
-    k3: np.ndarray           # (4,) N/m^3, vertical
-    k5: np.ndarray           # (4,) N/m^5, vertical
-    motor_r: np.ndarray      # (8, 3)
-    motor_d: np.ndarray      # (8, 3) direction of the force, earth axes
-    motor_at: np.ndarray     # (8,) mount of each motor, with which it moves where the payload bends
-    motor: np.ndarray        # (8,) N/V
-    motor_b1: np.ndarray     # (8,) 1/m, change of the force constant with displacement
-    motor_b2: np.ndarray     # (8,) 1/m^2
-    sensor_r: np.ndarray     # (6, 3)
-    sensor_at: np.ndarray    # (6,) mount of each sensor
-    sensor_n: np.ndarray     # (6, 3) axis in the body
-    S: np.ndarray            # (6,) V s/m, preamplifier included
-    wn: np.ndarray           # (6,) rad/s suspension
-    zn: np.ndarray           # (6,)
-    b1: np.ndarray           # (6,) numerator minus denominator of the compensation filter, s^1
-    b0: np.ndarray           # (6,) s^0
+    J: np.ndarray  # (3, 3) kg m^2 about the centre of mass
+    Ji: np.ndarray  # its inverse
+    rotor: np.ndarray  # (3,) N m s, angular momentum of a spinning rotor
+    drag: float  # N s^2/m^2, quadratic damping of the payload
+    r: np.ndarray  # (4, 3) mounts on the payload
+    k: np.ndarray  # (4, 3) N/m
+    c: np.ndarray  # (4, 3) N s/m
+    k2: np.ndarray  # (4,) N/m^2, vertical
+    k3: np.ndarray  # (4,) N/m^3, vertical
+    k5: np.ndarray  # (4,) N/m^5, vertical
+    motor_r: np.ndarray  # (8, 3)
+    motor_d: np.ndarray  # (8, 3) direction of the force, earth axes
+    motor_at: np.ndarray  # (8,) mount of each motor, with which it moves where the payload bends
+    motor: np.ndarray  # (8,) N/V
+    motor_b1: np.ndarray  # (8,) 1/m, change of the force constant with displacement
+    motor_b2: np.ndarray  # (8,) 1/m^2
+    sensor_r: np.ndarray  # (6, 3)
+    sensor_at: np.ndarray  # (6,) mount of each sensor
+    sensor_n: np.ndarray  # (6, 3) axis in the body
+    S: np.ndarray  # (6,) V s/m, preamplifier included
+    wn: np.ndarray  # (6,) rad/s suspension
+    zn: np.ndarray  # (6,)
+    b1: np.ndarray  # (6,) numerator minus denominator of the compensation filter, s^1
+    b0: np.ndarray  # (6,) s^0
     wc: float
     zc: float
-    g: float                 # m/s^2 that a tilted sensor feels
-    lag: np.ndarray          # (8,) rad/s of the amplifiers, 0: none; or (0,)
-    lag2: np.ndarray         # (8,) rad/s of a second pole, not that of lag; or (0,)
-    mode_shape: np.ndarray   # (modes, 4, 3) 1/sqrt(kg), at the mounts
+    g: float  # m/s^2 that a tilted sensor feels
+    lag: np.ndarray  # (8,) rad/s of the amplifiers, 0: none; or (0,)
+    lag2: np.ndarray  # (8,) rad/s of a second pole, not that of lag; or (0,)
+    mode_shape: np.ndarray  # (modes, 4, 3) 1/sqrt(kg), at the mounts
     mode_w: np.ndarray
     mode_z: np.ndarray
-    osc_r: np.ndarray        # (oscillators, 3)
-    osc_d: np.ndarray        # (oscillators, 3)
+    osc_r: np.ndarray  # (oscillators, 3)
+    osc_d: np.ndarray  # (oscillators, 3)
     osc_m: np.ndarray
     osc_k: np.ndarray
     osc_c: np.ndarray
-    base_free: np.ndarray    # (6,) 1 for a coordinate of the chassis that moves on its own, 0: with the floor; or (0,)
-    base_r: np.ndarray       # (4, 3) mounts on the chassis, from its centre of mass
+    base_free: np.ndarray  # (6,) 1 for a coordinate of the chassis that moves on its own, 0: with the floor; or (0,)
+    base_r: np.ndarray  # (4, 3) mounts on the chassis, from its centre of mass
     base_motor_r: np.ndarray  # (8, 3) motors on the chassis
-    base_Mi: np.ndarray      # (6,) 1/kg, 1/(kg m^2)
-    base_K: np.ndarray       # (6, 6)
-    base_C: np.ndarray       # (6, 6)
-    max_k: np.ndarray        # (branches, 4) Maxwell branches, vertical, N/m
-    max_c: np.ndarray        # (branches, 4) N s/m
-    max_q: np.ndarray        # (branches, 4) N s^2/m^2, orifice
-    ladder_k: np.ndarray     # (rungs, 4) stiffness of each rung over that of the mount
-    ladder_w: np.ndarray     # (rungs,) rad/s
-    surge_m: np.ndarray      # (4,) kg or (0,)
-    surge_c: np.ndarray      # (4,) N s/m
+    base_Mi: np.ndarray  # (6,) 1/kg, 1/(kg m^2)
+    base_K: np.ndarray  # (6, 6)
+    base_C: np.ndarray  # (6, 6)
+    max_k: np.ndarray  # (branches, 4) Maxwell branches, vertical, N/m
+    max_c: np.ndarray  # (branches, 4) N s/m
+    max_q: np.ndarray  # (branches, 4) N s^2/m^2, orifice
+    ladder_k: np.ndarray  # (rungs, 4) stiffness of each rung over that of the mount
+    ladder_w: np.ndarray  # (rungs,) rad/s
+    surge_m: np.ndarray  # (4,) kg or (0,)
+    surge_c: np.ndarray  # (4,) N s/m
     surge_share: np.ndarray  # (4,) compliance above the mass over that of the mount
-    level_w: np.ndarray      # (3,) rad/s or (0,)
-    level_tau: float         # s
-    cable_r: np.ndarray      # (cables, 3)
-    cable_d: np.ndarray      # (cables, 3)
+    level_w: np.ndarray  # (3,) rad/s or (0,)
+    level_tau: float  # s
+    cable_r: np.ndarray  # (cables, 3)
+    cable_d: np.ndarray  # (cables, 3)
     cable_k: np.ndarray
     cable_c: np.ndarray
-    fric_jenkins: int        # 1: elastic until it slips (Jenkins), 0: Dahl and LuGre
-    fric_s0: np.ndarray      # (elements, 8) N/m
-    fric_s1: float           # N s/m
-    fric_s2: float           # N s/m
-    fric_Fc: np.ndarray      # (elements, 8) N
-    fric_Fs: np.ndarray      # (elements, 8) N
-    fric_vs: float           # m/s
+    fric_jenkins: int  # 1: elastic until it slips (Jenkins), 0: Dahl and LuGre
+    fric_s0: np.ndarray  # (elements, 8) N/m
+    fric_s1: float  # N s/m
+    fric_s2: float  # N s/m
+    fric_Fc: np.ndarray  # (elements, 8) N
+    fric_Fs: np.ndarray  # (elements, 8) N
+    fric_vs: float  # m/s
 
 
 def state_size(P: Physics) -> int:
     """Number of states that the effects present in P need."""
-    return (FIRST_EFFECT_STATE + 2 * len(P.mode_w) + 2 * len(P.osc_m) + 12 * (len(P.base_free) > 0)
-            + 4 * len(P.max_k) + 12 * len(P.ladder_k) + 2 * len(P.surge_m) + 2 * len(P.level_w) + 8 * len(P.fric_s0))
+    return (
+        FIRST_EFFECT_STATE
+        + 2 * len(P.mode_w)
+        + 2 * len(P.osc_m)
+        + 12 * (len(P.base_free) > 0)
+        + 4 * len(P.max_k)
+        + 12 * len(P.ladder_k)
+        + 2 * len(P.surge_m)
+        + 2 * len(P.level_w)
+        + 8 * len(P.fric_s0)
+    )
 
 
 @njit(cache=True, fastmath=False, inline="never")
@@ -98,9 +107,9 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
 
     W : (40, 3) workspace.
     """
-    R, F, G = W[0:3], W[3:7], W[7:11]       # rotation; forces on payload and chassis at the mounts, earth axes
-    E, Ed = W[11:15], W[15:19]              # relative displacement and velocity over the mounts, earth axes
-    B = W[19:23]                            # forces at the mounts, body axes
+    R, F, G = W[0:3], W[3:7], W[7:11]  # rotation; forces on payload and chassis at the mounts, earth axes
+    E, Ed = W[11:15], W[15:19]  # relative displacement and velocity over the mounts, earth axes
+    B = W[19:23]  # forces at the mounts, body axes
     q0, q1, q2, q3 = x[3], x[4], x[5], x[6]
     s = 1.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     R[0, 0] = 1 - 2 * s * (q2 * q2 + q3 * q3)
@@ -130,7 +139,7 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
     o_lev = o_sur + 2 * P.surge_m.size
     o_fri = o_lev + 2 * P.level_w.size
 
-    b, bd = W[33:35], W[35:37]      # chassis: displacement and rotation of its centre of mass, and their rates
+    b, bd = W[33:35], W[35:37]  # chassis: displacement and rotation of its centre of mass, and their rates
     for a in range(3):
         b[0, a], bd[0, a], b[1, a], bd[1, a] = fd[a], fv[a], 0.0, 0.0
     if chassis:
@@ -211,8 +220,8 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
             dx[o] = x[o + 1]
             dx[o + 1] = (upper - lower) / P.surge_m[i]
 
-    fx, fy, fz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # earth force, body torque
-    bx, by, bz, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0     # reaction on the chassis
+    fx, fy, fz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # earth force, body torque
+    bx, by, bz, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # reaction on the chassis
     for i in range(4):
         fx += F[i, 0]
         fy += F[i, 1]
@@ -234,7 +243,7 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
     elements = P.fric_s0.shape[0]
     for j in range(8):
         force = P.motor[j] * u[j]
-        if elements > 0 or P.motor_b1[j] != 0 or P.motor_b2[j] != 0:    # motion across the gap, along the motor
+        if elements > 0 or P.motor_b1[j] != 0 or P.motor_b2[j] != 0:  # motion across the gap, along the motor
             i, p0, p1, p2 = P.motor_at[j], P.motor_r[j, 0], P.motor_r[j, 1], P.motor_r[j, 2]
             d0, d1, d2 = P.motor_d[j, 0], P.motor_d[j, 1], P.motor_d[j, 2]
             va, vb, vc = w1 * p2 - w2 * p1, w2 * p0 - w0 * p2, w0 * p1 - w1 * p0
@@ -249,8 +258,9 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
                 vc += P.mode_shape[h, i, 2] * yd
             e, v = 0.0, 0.0
             for a in range(3):
-                e += P.motor_d[j, a] * (x[a] - b[0, a] + R[a, 0] * (p0 + da) + R[a, 1] * (p1 + db)
-                                        + R[a, 2] * (p2 + dc))
+                e += P.motor_d[j, a] * (
+                    x[a] - b[0, a] + R[a, 0] * (p0 + da) + R[a, 1] * (p1 + db) + R[a, 2] * (p2 + dc)
+                )
                 v += P.motor_d[j, a] * (x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - bd[0, a])
             e -= d0 * p0 + d1 * p1 + d2 * p2
             if chassis:
@@ -267,7 +277,7 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
                     zd = 1e3 * (np.sign(z) * level / s0 - z) if abs(s0 * z) >= level and z * v > 0 else v
                     force -= min(max(s0 * z, -level), level)
                 else:
-                    level += (P.fric_Fs[h, j] - level) * np.exp(-(v / P.fric_vs) ** 2)
+                    level += (P.fric_Fs[h, j] - level) * np.exp(-((v / P.fric_vs) ** 2))
                     zd = v - s0 * abs(v) * z / level
                     force -= s0 * z + P.fric_s1 * zd + P.fric_s2 * v
                 dx[o] = zd
@@ -300,8 +310,7 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
         va, vb, vc = w1 * p[2] - w2 * p[1], w2 * p[0] - w0 * p[2], w0 * p[1] - w1 * p[0]
         e, v = 0.0, 0.0
         for a in range(3):
-            e += d[a] * (x[a] + R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2] - p[a]
-                         - b[0, a])
+            e += d[a] * (x[a] + R[a, 0] * p[0] + R[a, 1] * p[1] + R[a, 2] * p[2] - p[a] - b[0, a])
             v += d[a] * (x[7 + a] + R[a, 0] * va + R[a, 1] * vb + R[a, 2] * vc - bd[0, a])
         force = -P.cable_k[j] * e - P.cable_c[j] * v
         fx += force * d[0]
@@ -362,8 +371,11 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
     for j in range(n_osc):
         p, d = P.osc_r[j], P.osc_d[j]
         o = o_osc + 2 * j
-        along = (d[0] * (a0 + g1 * p[2] - g2 * p[1]) + d[1] * (a1 + g2 * p[0] - g0 * p[2])
-                 + d[2] * (a2 + g0 * p[1] - g1 * p[0]))
+        along = (
+            d[0] * (a0 + g1 * p[2] - g2 * p[1])
+            + d[1] * (a1 + g2 * p[0] - g0 * p[2])
+            + d[2] * (a2 + g0 * p[1] - g1 * p[0])
+        )
         dx[o] = x[o + 1]
         dx[o + 1] = -(P.osc_k[j] * x[o] + P.osc_c[j] * x[o + 1]) / P.osc_m[j] - along
 
@@ -385,19 +397,23 @@ def rhs(P, x, u, fd, fv, ks, dx, W):
         p0, p1, p2 = P.sensor_r[j, 0], P.sensor_r[j, 1], P.sensor_r[j, 2]
         n0, n1, n2 = P.sensor_n[j, 0], P.sensor_n[j, 1], P.sensor_n[j, 2]
         v0, v1, v2 = w1 * p2 - w2 * p1, w2 * p0 - w0 * p2, w0 * p1 - w1 * p0
-        a = (n0 * (a0 + g1 * p2 - g2 * p1 + w1 * v2 - w2 * v1) + n1 * (a1 + g2 * p0 - g0 * p2 + w2 * v0 - w0 * v2)
-             + n2 * (a2 + g0 * p1 - g1 * p0 + w0 * v1 - w1 * v0))
+        a = (
+            n0 * (a0 + g1 * p2 - g2 * p1 + w1 * v2 - w2 * v1)
+            + n1 * (a1 + g2 * p0 - g0 * p2 + w2 * v0 - w0 * v2)
+            + n2 * (a2 + g0 * p1 - g1 * p0 + w0 * v1 - w1 * v0)
+        )
         for h in range(n_mode):
             i = P.sensor_at[j]
-            a += dx[o_mode + 2 * h + 1] * (n0 * P.mode_shape[h, i, 0] + n1 * P.mode_shape[h, i, 1]
-                                           + n2 * P.mode_shape[h, i, 2])
-        if P.g > 0:             # specific force; the part at rest hangs in the suspension spring
+            a += dx[o_mode + 2 * h + 1] * (
+                n0 * P.mode_shape[h, i, 0] + n1 * P.mode_shape[h, i, 1] + n2 * P.mode_shape[h, i, 2]
+            )
+        if P.g > 0:  # specific force; the part at rest hangs in the suspension spring
             a += P.g * (n0 * R[2, 0] + n1 * R[2, 1] + n2 * (R[2, 2] - 1.0))
         o = SENSOR_STATES + 4 * j
         dx[o] = x[o + 1]
         dx[o + 1] = a - 2 * P.zn[j] * P.wn[j] * x[o + 1] - P.wn[j] ** 2 * x[o]
         dx[o + 2] = x[o + 3]
-        dx[o + 3] = P.S[j] * x[o + 1] - 2 * P.zc * P.wc * x[o + 3] - P.wc ** 2 * x[o + 2]
+        dx[o + 3] = P.S[j] * x[o + 1] - 2 * P.zc * P.wc * x[o + 3] - P.wc**2 * x[o + 2]
 
 
 @njit(cache=True)
@@ -432,7 +448,7 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
             row = first[k] + (1 if t0 >= sw - 1e-9 else 0)
             for j in range(8):
                 held = u[row, j] if 0 <= row < u.shape[0] else 0.0
-                if P.lag.size > 0 and P.lag[j] > 0:     # first- or second-order lag under a held voltage, exactly
+                if P.lag.size > 0 and P.lag[j] > 0:  # first- or second-order lag under a held voltage, exactly
                     w, v = P.lag[j], (P.lag2[j] if P.lag2.size > 0 else 0.0)
                     first_off = lagged[0, j] - held
                     through = first_off * v / (v - w) if v > 0 else first_off
@@ -448,14 +464,18 @@ def integrate(P, x, u, first, switch, floor, ks, dt, y, trace):
                     lagged[1, j] = drive[2, j]
                 else:
                     drive[0, j] = drive[1, j] = drive[2, j] = held
-            for stage in range(3):      # cubic Hermite interpolation of the floor: 60 Hz at 1 kHz to 5e-5
+            for stage in range(3):  # cubic Hermite interpolation of the floor: 60 Hz at 1 kHz to 5e-5
                 t = t0 + 0.5 * stage * (t1 - t0)
                 a, b = 2 * t**3 - 3 * t * t + 1, (t**3 - 2 * t * t + t) * dt
                 c, d = 1 - a, (t**3 - t * t) * dt
                 for i in range(3):
                     for o in range(2):
-                        f[stage, o, i] = (a * floor[k, 3 * o + i] + b * floor[k, 3 * o + 3 + i]
-                                          + c * floor[k + 1, 3 * o + i] + d * floor[k + 1, 3 * o + 3 + i])
+                        f[stage, o, i] = (
+                            a * floor[k, 3 * o + i]
+                            + b * floor[k, 3 * o + 3 + i]
+                            + c * floor[k + 1, 3 * o + i]
+                            + d * floor[k + 1, 3 * o + 3 + i]
+                        )
             rhs(P, x, drive[0], f[0, 0], f[0, 1], ks[k], k1, W)
             for i in range(n):
                 xs[i] = x[i] + 0.5 * h * k1[i]

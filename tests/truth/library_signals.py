@@ -15,7 +15,7 @@ Drawn = tuple[str, dict[str, float], dict[str, Any]]
 def _geophone_corner(d: Draw) -> Drawn:
     nominal = d.plant.rig.geophones
     corner = nominal.suspension_Hz * (1 + d.sign() * d.size(0.001, 0.25, d.beyond("sensor_corner_percent")))
-    constant_damper = d.rng.random() < 0.5      # otherwise the damping ratio stays
+    constant_damper = d.rng.random() < 0.5  # otherwise the damping ratio stays
     zeta = nominal.suspension_damping * (nominal.suspension_Hz / corner if constant_damper else 1.0)
     return d.one(d.plant.sensors), {"corner_Hz": corner}, {"damping_ratio": zeta}
 
@@ -27,22 +27,23 @@ def _apply_geophone_corner(plant: Plant, h: Hidden) -> None:
 
 def _drifting(j: int, h: Hidden) -> Signal:
     """Channel j with a gain that drifts over the campaign, about its mean."""
+
     def change(x: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         out = x.copy()
         out[:, j] *= 1 + h.details["drift"] * (t / h.details["span_s"] - 0.5)
         return out
+
     return change
 
 
 def _sensor_gain(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {
-        "gain": 1 + d.sign() * d.size(0.0007, 0.10, d.beyond("sensor_gain_percent"))}, {}
+    return d.one(d.plant.sensors), {"gain": 1 + d.sign() * d.size(0.0007, 0.10, d.beyond("sensor_gain_percent"))}, {}
 
 
 def _apply_sensor_gain(plant: Plant, h: Hidden) -> None:
     g, j, gain = plant.rig.geophones, plant.sensors.index(h.location), h.parameters["gain"]
     plant.S[j] = g.sensitivity_Vs_per_m[j] * g.preamplifier_gain * gain
-    if h.details.get("electric_damping"):       # the shunted coil damps with the square of its sensitivity
+    if h.details.get("electric_damping"):  # the shunted coil damps with the square of its sensitivity
         plant.zn[j] *= 1 + h.details["electric_damping"] * (gain**2 - 1)
     if h.details.get("drift"):
         plant.analogue.append(_drifting(j, h))
@@ -57,8 +58,11 @@ def _sensor_misalignment(d: Draw) -> Drawn:
     name = d.one(d.plant.sensors)
     axis = nominal_axis(d.plant, d.plant.sensors.index(name))
     away = np.cross(axis, d.direction())
-    return name, {"angle_rad": d.size(0.002, 0.15, d.beyond("direction_rad"))}, {
-        "towards": (away / np.linalg.norm(away)).tolist()}
+    return (
+        name,
+        {"angle_rad": d.size(0.002, 0.15, d.beyond("direction_rad"))},
+        {"towards": (away / np.linalg.norm(away)).tolist()},
+    )
 
 
 def _apply_sensor_misalignment(plant: Plant, h: Hidden) -> None:
@@ -83,9 +87,15 @@ def _mains_hum(d: Draw) -> Drawn:
     fundamental = d.between(0.15, 1.0, 6)
     amplitude = largest * fundamental / fundamental.max()
     fall = [1.0, *(d.between(0.05, 0.6) for _ in harmonics[1:])]
-    return "geophones", {"frequency_Hz": frequency, "amplitude_V": largest}, {
-        "harmonics": harmonics, "amplitudes_V": (amplitude[:, None] * fall).tolist(),
-        "phases": d.rng.uniform(0, 2 * np.pi, (6, len(harmonics))).tolist()}
+    return (
+        "geophones",
+        {"frequency_Hz": frequency, "amplitude_V": largest},
+        {
+            "harmonics": harmonics,
+            "amplitudes_V": (amplitude[:, None] * fall).tolist(),
+            "phases": d.rng.uniform(0, 2 * np.pi, (6, len(harmonics))).tolist(),
+        },
+    )
 
 
 def _apply_mains_hum(plant: Plant, h: Hidden) -> None:
@@ -99,6 +109,7 @@ def _apply_mains_hum(plant: Plant, h: Hidden) -> None:
             for j in range(6):
                 out[:, j] += swing * h.details["amplitudes_V"][j][n] * np.sin(angle + h.details["phases"][j][n])
         return out
+
     plant.analogue.append(hum)
 
 
@@ -118,8 +129,7 @@ def _apply_sensor_quantisation(plant: Plant, h: Hidden) -> None:
 
 
 def _actuator_gain(d: Draw) -> Drawn:
-    return d.one(d.plant.motors), {
-        "gain": 1 + d.sign() * d.size(0.001, 0.15, d.beyond("actuator_gain_percent"))}, {}
+    return d.one(d.plant.motors), {"gain": 1 + d.sign() * d.size(0.001, 0.15, d.beyond("actuator_gain_percent"))}, {}
 
 
 def _apply_actuator_gain(plant: Plant, h: Hidden) -> None:
@@ -136,7 +146,7 @@ def _actuator_lag(d: Draw) -> Drawn:
 def _apply_actuator_lag(plant: Plant, h: Hidden) -> None:
     corners = 2 * np.pi * h.parameters["corner_Hz"] * np.array(h.details.get("uneven", np.ones(8)))
     plant.extra["lag"] = corners
-    if "poles" in h.details:                    # over the corner, with the same delay at low frequency
+    if "poles" in h.details:  # over the corner, with the same delay at low frequency
         plant.extra["lag"], plant.extra["lag2"] = (corners * pole for pole in h.details["poles"])
 
 
@@ -176,16 +186,19 @@ def _apply_ground_motion(plant: Plant, h: Hidden) -> None:
     plant.floor_factor = h.details["factor"] * np.array(h.details.get("uneven", np.ones(3)))
 
 
-SIGNALS = tuple(Effect(name, family, draw, apply) for name, family, draw, apply in (
-    ("geophone_corner", "sensor", _geophone_corner, _apply_geophone_corner),
-    ("sensor_gain", "sensor", _sensor_gain, _apply_sensor_gain),
-    ("sensor_misalignment", "sensor", _sensor_misalignment, _apply_sensor_misalignment),
-    ("tilt_coupling", "sensor", _tilt_coupling, _apply_tilt_coupling),
-    ("mains_hum", "disturbance", _mains_hum, _apply_mains_hum),
-    ("sensor_quantisation", "converter", _sensor_quantisation, _apply_sensor_quantisation),
-    ("actuator_gain", "actuator", _actuator_gain, _apply_actuator_gain),
-    ("actuator_lag", "loop", _actuator_lag, _apply_actuator_lag),
-    ("actuator_saturation", "drive", _actuator_saturation, _apply_actuator_saturation),
-    ("loop_delay", "loop", _loop_delay, _apply_loop_delay),
-    ("ground_motion", "floor", _ground_motion, _apply_ground_motion),
-))
+SIGNALS = tuple(
+    Effect(name, family, draw, apply)
+    for name, family, draw, apply in (
+        ("geophone_corner", "sensor", _geophone_corner, _apply_geophone_corner),
+        ("sensor_gain", "sensor", _sensor_gain, _apply_sensor_gain),
+        ("sensor_misalignment", "sensor", _sensor_misalignment, _apply_sensor_misalignment),
+        ("tilt_coupling", "sensor", _tilt_coupling, _apply_tilt_coupling),
+        ("mains_hum", "disturbance", _mains_hum, _apply_mains_hum),
+        ("sensor_quantisation", "converter", _sensor_quantisation, _apply_sensor_quantisation),
+        ("actuator_gain", "actuator", _actuator_gain, _apply_actuator_gain),
+        ("actuator_lag", "loop", _actuator_lag, _apply_actuator_lag),
+        ("actuator_saturation", "drive", _actuator_saturation, _apply_actuator_saturation),
+        ("loop_delay", "loop", _loop_delay, _apply_loop_delay),
+        ("ground_motion", "floor", _ground_motion, _apply_ground_motion),
+    )
+)

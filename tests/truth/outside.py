@@ -15,10 +15,12 @@ Drawn = tuple[str, dict[str, float], dict[str, Any]]
 
 def _on_channel(j: int, change: Any) -> Signal:
     """change(column, t, rng) -> column, on one sensor only."""
+
     def signal(y: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         out = y.copy()
         out[:, j] = change(y[:, j], t, rng)
         return out
+
     return signal
 
 
@@ -43,6 +45,7 @@ def _apply_sensor_crosstalk(plant: Plant, h: Hidden) -> None:
         out = y.copy()
         out[:, j] += h.parameters["share"] * y[:, i]
         return out
+
     plant.analogue.append(mixed)
 
 
@@ -57,8 +60,11 @@ def _apply_sensor_low_pass(plant: Plant, h: Hidden) -> None:
 
 
 def _sensor_spurious_resonance(d: Draw) -> Drawn:
-    return d.one(d.plant.sensors), {"frequency_Hz": d.between(15.0, 40.0)}, {
-        "share": d.size(0.002, 0.3), "damping_ratio": d.between(0.01, 0.05)}
+    return (
+        d.one(d.plant.sensors),
+        {"frequency_Hz": d.between(15.0, 40.0)},
+        {"share": d.size(0.002, 0.3), "damping_ratio": d.between(0.01, 0.05)},
+    )
 
 
 def _apply_sensor_spurious_resonance(plant: Plant, h: Hidden) -> None:
@@ -101,8 +107,9 @@ def _sensor_quadratic(d: Draw) -> Drawn:
 
 
 def _apply_sensor_quadratic(plant: Plant, h: Hidden) -> None:
-    plant.analogue.append(_on_channel(plant.sensors.index(h.location),
-                                      lambda y, t, rng: y * (1 + h.parameters["slope_per_V"] * y)))
+    plant.analogue.append(
+        _on_channel(plant.sensors.index(h.location), lambda y, t, rng: y * (1 + h.parameters["slope_per_V"] * y))
+    )
 
 
 def _clock_rate_error(d: Draw) -> Drawn:
@@ -120,8 +127,9 @@ def _dropped_samples(d: Draw) -> Drawn:
 def _apply_dropped_samples(plant: Plant, h: Hidden) -> None:
     def dropped(y: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         lost = rng.random(len(y)) < h.parameters["per_second"] / plant.rig.sample_rate_Hz
-        kept = y[~lost]                              # what follows a lost sample moves up; the end repeats its last
+        kept = y[~lost]  # what follows a lost sample moves up; the end repeats its last
         return np.vstack([kept, np.repeat(kept[-1:], len(y) - len(kept), axis=0)])
+
     plant.digital.append(dropped)
 
 
@@ -162,6 +170,7 @@ def _apply_dead_zone(plant: Plant, h: Hidden) -> None:
         out = u.copy()
         out[:, j] = np.sign(u[:, j]) * np.maximum(np.abs(u[:, j]) - width, 0.0)
         return out
+
     plant.drive.append(dead)
 
 
@@ -184,27 +193,31 @@ def _apply_sensor_delay(plant: Plant, h: Hidden) -> None:
         padded = np.concatenate([np.full(64, y[0]), y, np.full(64, y[-1])])
         whole, part = int(samples), samples - int(samples)
         taps = np.arange(-16, 16) - part
-        sinc = np.sinc(taps) * np.cos(np.pi * taps / 36) ** 2           # windowed interpolation
+        sinc = np.sinc(taps) * np.cos(np.pi * taps / 36) ** 2  # windowed interpolation
         sinc /= sinc.sum()
-        return np.convolve(padded, sinc)[64 - whole + 16:][:n]
+        return np.convolve(padded, sinc)[64 - whole + 16 :][:n]
+
     plant.analogue.append(_on_channel(plant.sensors.index(h.location), delayed))
 
 
-OUTSIDE = tuple(Effect(name, "outside", draw, apply) for name, draw, apply in (
-    ("air_drag", _air_drag, _apply_air_drag),
-    ("sensor_crosstalk", _sensor_crosstalk, _apply_sensor_crosstalk),
-    ("sensor_low_pass", _sensor_low_pass, _apply_sensor_low_pass),
-    ("sensor_spurious_resonance", _sensor_spurious_resonance, _apply_sensor_spurious_resonance),
-    ("one_amplifier_lag", _one_amplifier_lag, _apply_one_amplifier_lag),
-    ("force_constant_of_displacement", _force_constant_of_displacement, _apply_force_constant_of_displacement),
-    ("force_constant_of_drive", _force_constant_of_drive, _apply_force_constant_of_drive),
-    ("sensor_quadratic", _sensor_quadratic, _apply_sensor_quadratic),
-    ("clock_rate_error", _clock_rate_error, _apply_clock_rate_error),
-    ("dropped_samples", _dropped_samples, _apply_dropped_samples),
-    ("asymmetric_stiffness", _asymmetric_stiffness, _apply_asymmetric_stiffness),
-    ("actuator_gain_drift", _actuator_gain_drift, _apply_actuator_gain_drift),
-    ("gyroscope", _gyroscope, _apply_gyroscope),
-    ("dead_zone", _dead_zone, _apply_dead_zone),
-    ("noisy_sensor", _noisy_sensor, _apply_noisy_sensor),
-    ("sensor_delay", _sensor_delay, _apply_sensor_delay),
-))
+OUTSIDE = tuple(
+    Effect(name, "outside", draw, apply)
+    for name, draw, apply in (
+        ("air_drag", _air_drag, _apply_air_drag),
+        ("sensor_crosstalk", _sensor_crosstalk, _apply_sensor_crosstalk),
+        ("sensor_low_pass", _sensor_low_pass, _apply_sensor_low_pass),
+        ("sensor_spurious_resonance", _sensor_spurious_resonance, _apply_sensor_spurious_resonance),
+        ("one_amplifier_lag", _one_amplifier_lag, _apply_one_amplifier_lag),
+        ("force_constant_of_displacement", _force_constant_of_displacement, _apply_force_constant_of_displacement),
+        ("force_constant_of_drive", _force_constant_of_drive, _apply_force_constant_of_drive),
+        ("sensor_quadratic", _sensor_quadratic, _apply_sensor_quadratic),
+        ("clock_rate_error", _clock_rate_error, _apply_clock_rate_error),
+        ("dropped_samples", _dropped_samples, _apply_dropped_samples),
+        ("asymmetric_stiffness", _asymmetric_stiffness, _apply_asymmetric_stiffness),
+        ("actuator_gain_drift", _actuator_gain_drift, _apply_actuator_gain_drift),
+        ("gyroscope", _gyroscope, _apply_gyroscope),
+        ("dead_zone", _dead_zone, _apply_dead_zone),
+        ("noisy_sensor", _noisy_sensor, _apply_noisy_sensor),
+        ("sensor_delay", _sensor_delay, _apply_sensor_delay),
+    )
+)

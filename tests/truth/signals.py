@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 
-def multisine(rng: np.random.Generator, samples: int, channels: int, period: int, band_Hz: tuple[float, float],
-              rate_Hz: float, level: float) -> np.ndarray:
+def multisine(
+    rng: np.random.Generator,
+    samples: int,
+    channels: int,
+    period: int,
+    band_Hz: tuple[float, float],
+    rate_Hz: float,
+    level: float,
+) -> np.ndarray:
     """(samples, channels) random-phase multisine, flat, period in samples, each channel of r.m.s. level."""
     f = np.fft.rfftfreq(period, 1 / rate_Hz)
     spectrum = np.zeros((len(f), channels), complex)
@@ -17,8 +24,9 @@ def multisine(rng: np.random.Generator, samples: int, channels: int, period: int
     return one[np.arange(samples) % period]
 
 
-def noise(rng: np.random.Generator, samples: int, channels: int, band_Hz: tuple[float, float], rate_Hz: float,
-          level: float) -> np.ndarray:
+def noise(
+    rng: np.random.Generator, samples: int, channels: int, band_Hz: tuple[float, float], rate_Hz: float, level: float
+) -> np.ndarray:
     """(samples, channels) band-limited Gaussian noise: a stretch of a longer periodic draw, so not periodic itself."""
     length = 1 << (samples + samples // 4).bit_length()
     f = np.fft.rfftfreq(length, 1 / rate_Hz)

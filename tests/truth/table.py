@@ -84,30 +84,88 @@ class Plant:
     def physics(self) -> Physics:
         """The numbers that the integrator takes."""
         g = self.rig.geophones
-        wn, zn, wc, zc = (2 * np.pi * g.suspension_Hz, g.suspension_damping, 2 * np.pi * g.compensated_Hz,
-                          g.compensated_damping)
+        wn, zn, wc, zc = (
+            2 * np.pi * g.suspension_Hz,
+            g.suspension_damping,
+            2 * np.pi * g.compensated_Hz,
+            g.compensated_damping,
+        )
         none, none3, none4, none8 = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 8))
         values: dict[str, Any] = dict(
-            m=float(self.m), J=self.J, Ji=np.linalg.inv(self.J), rotor=np.zeros(3), drag=0.0, r=self.points - self.com,
-            k=self.k, c=self.c, k2=np.zeros(4), k3=np.zeros(4), k5=np.zeros(4), motor_r=self.motor_p - self.com,
-            motor_d=self.motor_d, motor_at=self.motor_at, motor=self.motor, motor_b1=np.zeros(8), motor_b2=np.zeros(8),
-            sensor_r=self.sensor_p - self.com, sensor_at=self.sensor_at, sensor_n=self.sensor_n,
-            S=self.S, wn=self.wn, zn=self.zn, b1=np.full(6, 2 * zn * wn - 2 * zc * wc),
-            b0=np.full(6, wn**2 - wc**2), wc=wc, zc=zc, g=0.0, lag=none, lag2=none,
-            mode_shape=np.zeros((0, 4, 3)), mode_w=none, mode_z=none, osc_r=none3, osc_d=none3,
-            osc_m=none, osc_k=none, osc_c=none,
-            base_free=np.zeros(0, int), base_r=np.zeros((4, 3)), base_motor_r=np.zeros((8, 3)), base_Mi=np.zeros(6),
-            base_K=np.zeros((6, 6)), base_C=np.zeros((6, 6)), max_k=none4, max_c=none4, max_q=none4, ladder_k=none4,
-            ladder_w=none, surge_m=none, surge_c=none, surge_share=none, level_w=none, level_tau=0.0, cable_r=none3,
-            cable_d=none3, cable_k=none, cable_c=none, fric_jenkins=0, fric_s0=none8, fric_s1=0.0, fric_s2=0.0,
-            fric_Fc=none8, fric_Fs=none8, fric_vs=1.0)
+            m=float(self.m),
+            J=self.J,
+            Ji=np.linalg.inv(self.J),
+            rotor=np.zeros(3),
+            drag=0.0,
+            r=self.points - self.com,
+            k=self.k,
+            c=self.c,
+            k2=np.zeros(4),
+            k3=np.zeros(4),
+            k5=np.zeros(4),
+            motor_r=self.motor_p - self.com,
+            motor_d=self.motor_d,
+            motor_at=self.motor_at,
+            motor=self.motor,
+            motor_b1=np.zeros(8),
+            motor_b2=np.zeros(8),
+            sensor_r=self.sensor_p - self.com,
+            sensor_at=self.sensor_at,
+            sensor_n=self.sensor_n,
+            S=self.S,
+            wn=self.wn,
+            zn=self.zn,
+            b1=np.full(6, 2 * zn * wn - 2 * zc * wc),
+            b0=np.full(6, wn**2 - wc**2),
+            wc=wc,
+            zc=zc,
+            g=0.0,
+            lag=none,
+            lag2=none,
+            mode_shape=np.zeros((0, 4, 3)),
+            mode_w=none,
+            mode_z=none,
+            osc_r=none3,
+            osc_d=none3,
+            osc_m=none,
+            osc_k=none,
+            osc_c=none,
+            base_free=np.zeros(0, int),
+            base_r=np.zeros((4, 3)),
+            base_motor_r=np.zeros((8, 3)),
+            base_Mi=np.zeros(6),
+            base_K=np.zeros((6, 6)),
+            base_C=np.zeros((6, 6)),
+            max_k=none4,
+            max_c=none4,
+            max_q=none4,
+            ladder_k=none4,
+            ladder_w=none,
+            surge_m=none,
+            surge_c=none,
+            surge_share=none,
+            level_w=none,
+            level_tau=0.0,
+            cable_r=none3,
+            cable_d=none3,
+            cable_k=none,
+            cable_c=none,
+            fric_jenkins=0,
+            fric_s0=none8,
+            fric_s1=0.0,
+            fric_s2=0.0,
+            fric_Fc=none8,
+            fric_Fs=none8,
+            fric_vs=1.0,
+        )
         values |= self.extra
         for name in ("osc_r", "cable_r"):
             values[name] = values[name] - self.com
         for name, value in values.items():
             if isinstance(value, np.ndarray):
-                values[name] = np.ascontiguousarray(value, np.int64 if name in ("motor_at", "sensor_at", "base_free")
-                                                    else np.float64)
+                values[name] = np.ascontiguousarray(
+                    value, np.int64 if name in ("motor_at", "sensor_at", "base_free") else np.float64
+                )
         return Physics(**values)
 
 
@@ -116,9 +174,11 @@ def draw_plant(rig: AvisTable, rng: np.random.Generator, spread: float = 1.0) ->
 
     spread : 0 gives the rig's own numbers.
     """
+
     def near(value: object, relative: float) -> np.ndarray:
         value = np.asarray(value, float)
         return value * (1 + spread * relative * rng.uniform(-1, 1, value.shape))
+
     k = near([isolator.stiffness for isolator in rig.isolators], 0.05)
     c = near([isolator.damping for isolator in rig.isolators], 0.20)
     return Plant(rig, float(near(rig.mass, 0.05)), np.diag(near(np.diag(rig.inertia_matrix()), 0.05)), k, c)
@@ -152,8 +212,9 @@ def matrices(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     M[:3, :3], M[3:, 3:] = plant.m * np.eye(3), plant.J
     K = sum(g.T @ np.diag(k) @ g for g, k in zip(G, plant.k, strict=True))
     C = sum(g.T @ np.diag(c) @ g for g, c in zip(G, plant.c, strict=True))
-    T = np.array([d @ carry(p) * tau for p, d, tau in
-                  zip(plant.motor_p - plant.com, plant.motor_d, plant.motor, strict=True)]).T
+    T = np.array(
+        [d @ carry(p) * tau for p, d, tau in zip(plant.motor_p - plant.com, plant.motor_d, plant.motor, strict=True)]
+    ).T
     return M, C, K, T
 
 

@@ -67,8 +67,9 @@ def of_variant(effect: str, variant: str, strength: str = "gross", seed: int = 5
 def test_without_tolerances_and_traces_the_table_is_the_clean_one(monkeypatch, effect):
     monkeypatch.setattr(cases, "tolerances", lambda rig: dict.fromkeys(DEFAULTS, 0.0))
     case = draw_case(7, kind=None if effect else "none", effect=effect, duration_s=2.0)
-    for clean, cluttered in zip(simulate_case(case).records, simulate_case(replace(case, clutter=True)).records,
-                                strict=True):
+    for clean, cluttered in zip(
+        simulate_case(case).records, simulate_case(replace(case, clutter=True)).records, strict=True
+    ):
         np.testing.assert_array_equal(cluttered.y, clean.y)
 
 
@@ -91,13 +92,24 @@ def test_the_closed_form_tells_each_kind_of_place(places):
 
 def test_matrices_of_a_cluttered_table_are_those_of_the_package():
     plant, table = loose(), rig()
-    isolators = tuple(replace(one, position=tuple(p), stiffness=tuple(k), damping=tuple(c)) for one, p, k, c in
-                      zip(table.isolators, plant.points, plant.k, plant.c, strict=True))
-    drives = tuple(replace(one, position=tuple(p), direction=tuple(d), constant_N_per_V=float(tau)) for one, p, d, tau
-                   in zip(table.all_drives, plant.motor_p, plant.motor_d, plant.motor, strict=True))
+    isolators = tuple(
+        replace(one, position=tuple(p), stiffness=tuple(k), damping=tuple(c))
+        for one, p, k, c in zip(table.isolators, plant.points, plant.k, plant.c, strict=True)
+    )
+    drives = tuple(
+        replace(one, position=tuple(p), direction=tuple(d), constant_N_per_V=float(tau))
+        for one, p, d, tau in zip(table.all_drives, plant.motor_p, plant.motor_d, plant.motor, strict=True)
+    )
     J = plant.J
-    same: AvisTable = replace(table, mass=plant.m, inertia=(*np.diag(J), J[0, 1], J[0, 2], J[1, 2]), motors=(),
-                              centre_of_mass=tuple(plant.com), isolators=isolators, drives=drives)
+    same: AvisTable = replace(
+        table,
+        mass=plant.m,
+        inertia=(*np.diag(J), J[0, 1], J[0, 2], J[1, 2]),
+        motors=(),
+        centre_of_mass=tuple(plant.com),
+        isolators=isolators,
+        drives=drives,
+    )
     motion = same.equations_of_motion()
     # The package's coordinates may sit elsewhere than in the centre of mass: compare what does not depend on it.
     M, C, K, T = matrices(plant)
@@ -118,7 +130,7 @@ def test_tolerances_have_the_spread_that_the_contract_says():
         for axes in ("motor_d", "sensor_n"):
             now, before = getattr(plant, axes), getattr(bare, axes)
             np.testing.assert_allclose(np.linalg.norm(now, axis=1), 1.0)
-            drawn["direction_rad"].append(now[before == 0])         # the two small components of each
+            drawn["direction_rad"].append(now[before == 0])  # the two small components of each
         drawn["actuator_gain_percent"].append(plant.motor / bare.motor - 1)
         drawn["sensor_gain_percent"].append(plant.S / bare.S - 1)
         drawn["sensor_corner_percent"].append(plant.wn / bare.wn - 1)
@@ -137,8 +149,10 @@ def test_contract_and_rig_file_state_the_tolerances(shared):
     for name, value in DEFAULTS.items():
         assert f"\n{name} = {value:g}" in text.replace(f"{name} = {value:.1f}", f"{name} = {value:g}")
     file = replace(rig(), tolerances=type("Stated", (), {"place_m": 0.004, "sensor_gain_percent": 2.5})())
-    assert tolerances(file) == {name: value / (100 if "percent" in name else 1) for name, value in
-                                (DEFAULTS | {"place_m": 0.004, "sensor_gain_percent": 2.5}).items()}
+    assert tolerances(file) == {
+        name: value / (100 if "percent" in name else 1)
+        for name, value in (DEFAULTS | {"place_m": 0.004, "sensor_gain_percent": 2.5}).items()
+    }
 
 
 def departure(plant: Plant, h: cases.Hidden) -> tuple[float, float, str]:
@@ -161,8 +175,10 @@ def departure(plant: Plant, h: cases.Hidden) -> tuple[float, float, str]:
     return 1 + plant.J[a, b], 1 + p["product_kgm2"], "product_of_inertia_kgm2"
 
 
-@pytest.mark.parametrize("effect", ["sensor_gain", "actuator_gain", "geophone_corner", "sensor_misalignment",
-                                    "com_offset", "product_of_inertia"])
+@pytest.mark.parametrize(
+    "effect",
+    ["sensor_gain", "actuator_gain", "geophone_corner", "sensor_misalignment", "com_offset", "product_of_inertia"],
+)
 def test_a_hidden_departure_lies_beyond_its_tolerance_and_is_told_in_all(no_traces, effect):
     for seed in range(6):
         case = draw_case(seed, effect=effect, strength="faint", clutter=True)
@@ -188,6 +204,7 @@ def test_each_trace_changes_the_response_by_what_it_says(traced):
     def responses(*traces) -> np.ndarray:
         plant = build_plant(replace(traced, traces=traces))
         return np.array([response_to(plant, level * u)[0] for level in levels])
+
     y = responses()
     said = {one.name: one.details["unexplained"] for one in traced.traces}
     assert set(said) == set(TRACES)
@@ -240,7 +257,7 @@ def test_cluttered_cases_repeat(monkeypatch):
 def test_best_prediction_leaves_noise_and_traces(traced):
     floor = next(seed for seed in range(20) if draw_case(seed, kind="none").floor_recorded)
     clean = draw_case(floor, kind="none", duration_s=4.0)
-    step = 20 / 2**14       # both are rounded
+    step = 20 / 2**14  # both are rounded
     measured = simulate_case(clean, unseen=True).records
     for record, best in zip(measured, best_prediction(clean, unseen=True), strict=True):
         np.testing.assert_allclose((record.y - best).std(axis=0), np.sqrt(1e-6 + 2 * step**2 / 12), rtol=0.05)
@@ -254,15 +271,31 @@ def test_best_prediction_leaves_noise_and_traces(traced):
 # --- laws
 
 
-LINEAR_LAWS = ("geophone_corner", "sensor_gain", "sensor_misalignment", "tilt_coupling", "actuator_gain",
-               "actuator_lag", "com_offset", "product_of_inertia", "payload_flexible_mode", "attached_oscillator",
-               "base_compliance", "mount_relaxation", "structural_damping", "mount_surge", "leveling_loop",
-               "cable_stiffness")
+LINEAR_LAWS = (
+    "geophone_corner",
+    "sensor_gain",
+    "sensor_misalignment",
+    "tilt_coupling",
+    "actuator_gain",
+    "actuator_lag",
+    "com_offset",
+    "product_of_inertia",
+    "payload_flexible_mode",
+    "attached_oscillator",
+    "base_compliance",
+    "mount_relaxation",
+    "structural_damping",
+    "mount_surge",
+    "leveling_loop",
+    "cable_stiffness",
+)
 NOT_LINEAR = ("orifice", "drifting")
 
 
-@pytest.mark.parametrize(("effect", "variant"), [(effect, law.__name__) for effect in LINEAR_LAWS
-                                                 for law in VARIANTS[effect] if law.__name__ not in NOT_LINEAR])
+@pytest.mark.parametrize(
+    ("effect", "variant"),
+    [(effect, law.__name__) for effect in LINEAR_LAWS for law in VARIANTS[effect] if law.__name__ not in NOT_LINEAR],
+)
 def test_linear_laws_in_closed_form(no_traces, effect, variant):
     plant, _ = of_variant(effect, variant, strength="clear", damping=5.0)
     assert misfit(plant, plant).max() < 1.5e-4
@@ -291,8 +324,11 @@ def test_drifting_gains_have_their_mean(no_traces):
         n = 6 if effect == "sensor_gain" else 8
         factor = getattr(plant, hooks)[0](np.ones((1001, n)), t * h.details["span_s"], None)
         j = (plant.sensors if n == 6 else plant.motors).index(h.location)
-        assert factor[:, j].mean() == pytest.approx(1.0) and np.ptp(factor[:, j]) == pytest.approx(
-            abs(h.details["drift"])) and np.ptp(np.delete(factor, j, axis=1)) == 0
+        assert (
+            factor[:, j].mean() == pytest.approx(1.0)
+            and np.ptp(factor[:, j]) == pytest.approx(abs(h.details["drift"]))
+            and np.ptp(np.delete(factor, j, axis=1)) == 0
+        )
 
 
 def test_lags_have_the_mean_delay_of_the_effective_corner(no_traces):
@@ -334,7 +370,7 @@ def test_hum_swings_or_wanders_as_it_says(no_traces):
         plant, h = of_variant("mains_hum", variant)
         y = plant.analogue[0](np.zeros((len(t), 6)), t, None)[:, 0]
         carrier = y * np.exp(-2j * np.pi * h.parameters["frequency_Hz"] * t)
-        slow = np.convolve(carrier, np.hanning(401) / np.hanning(401).sum(), "same")[1000:-1000]   # the fundamental
+        slow = np.convolve(carrier, np.hanning(401) / np.hanning(401).sum(), "same")[1000:-1000]  # the fundamental
         size, f = np.abs(slow), np.diff(np.unwrap(np.angle(slow))) * RATE / (2 * np.pi)
         if variant == "side_bands":
             assert np.ptp(size) / (size.max() + size.min()) == pytest.approx(h.details["swing"], rel=0.25)
@@ -363,8 +399,10 @@ def test_jenkins_elements_are_a_spring_at_first_and_slip_one_by_one(no_traces):
     plant, h = of_variant("contact_friction", "jenkins")
     plant.c = plant.c * 12
     P = plant.physics()
-    np.testing.assert_allclose([P.fric_s0.sum(axis=0).mean(), P.fric_Fc.sum(axis=0).mean()],
-                               [h.parameters["stiffness_N_per_m"], h.parameters["coulomb_N"]])
+    np.testing.assert_allclose(
+        [P.fric_s0.sum(axis=0).mean(), P.fric_Fc.sum(axis=0).mean()],
+        [h.parameters["stiffness_N_per_m"], h.parameters["coulomb_N"]],
+    )
     _, _, K, T = matrices(plant)
     D, small = T.T / plant.motor[:, None], 1e-3 * P.fric_Fc.min() * np.ones(8)
     q = np.linalg.solve(K + D.T @ np.diag(P.fric_s0.sum(axis=0)) @ D, T @ small)
@@ -373,7 +411,7 @@ def test_jenkins_elements_are_a_spring_at_first_and_slip_one_by_one(no_traces):
     u = multisine(np.random.default_rng(1), 4000, 8, 4000, (0.5, 10.0), RATE, 0.5)
     _, trace = response_to(plant, u, states=True)
     signed = trace[:, FIRST_EFFECT_STATE:].reshape(-1, 3, 8) * P.fric_s0 / P.fric_Fc
-    assert np.abs(signed).max() < 1 + np.abs(np.diff(signed, axis=0)).max()         # the motion within one step
+    assert np.abs(signed).max() < 1 + np.abs(np.diff(signed, axis=0)).max()  # the motion within one step
     slipping = (np.abs(signed) > 0.99).sum(axis=1)
     assert {0, 1, 2, 3} <= set(np.unique(slipping))
 
@@ -401,11 +439,15 @@ def test_oscillators_have_their_mean_frequency(no_traces):
 def test_every_chassis_follows_a_slow_floor(no_traces, variant):
     plant, h = of_variant("base_compliance", variant, damping=5.0)
     t, w = np.arange(20001) / RATE, 2 * np.pi * 0.1
-    floor = np.hstack([one[:, None] * np.array([1e-3, -2e-3, 1.5e-3]) for one in
-                       (np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t))])
+    floor = np.hstack(
+        [
+            one[:, None] * np.array([1e-3, -2e-3, 1.5e-3])
+            for one in (np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t))
+        ]
+    )
     _, trace = run(plant, np.zeros((20000, 8)), floor, 0, 0.0, np.random.default_rng(0), states=True)
     assert np.abs(trace[15000:, 0:3] - floor[15000:20000, 0:3]).max() < 2 * (0.1 / 1.9) ** 2 * 2e-3
-    free = np.ptp(trace[15000:, FIRST_EFFECT_STATE:FIRST_EFFECT_STATE + 6], axis=0) > 0
+    free = np.ptp(trace[15000:, FIRST_EFFECT_STATE : FIRST_EFFECT_STATE + 6], axis=0) > 0
     np.testing.assert_array_equal(free, np.array(h.details["free"]) > 0)
 
 
@@ -424,6 +466,7 @@ def test_loss_goes_with_its_power_and_mounts_differ(no_traces):
         P, s = plant.physics(), 1j * f
         k = 1 + np.sum(P.ladder_k * s / (s + LADDER_HZ[:, None]), axis=0)
         return k.imag / (1 + np.sum(P.ladder_k * 9 / (9 + LADDER_HZ[:, None] ** 2), axis=0))
+
     plant, h = of_variant("structural_damping", "falling_or_rising", strength="clear")
     np.testing.assert_allclose(loss(plant, 3.0), h.parameters["loss_factor"], rtol=0.08)
     np.testing.assert_allclose(loss(plant, 9.0) / loss(plant, 1.0), 9.0 ** h.details["exponent"], rtol=0.08)
@@ -445,8 +488,9 @@ def test_cubic_laws_stiffen_alike_at_the_highest_level(no_traces):
     """The mean stiffness of a Gaussian stretch, by quadrature."""
     z, weight = np.polynomial.hermite_e.hermegauss(20)
     case = draw_case(5, effect="cubic_stiffness", clutter=True)
-    stretch = float(np.mean(cases.pilot(build_plant(replace(case, effects=())), case.band_Hz, max(case.levels_V))
-                            .stretch[:, 2]))
+    stretch = float(
+        np.mean(cases.pilot(build_plant(replace(case, effects=())), case.band_Hz, max(case.levels_V)).stretch[:, 2])
+    )
     for law in VARIANTS["cubic_stiffness"]:
         plant, h = of_variant("cubic_stiffness", law.__name__)
         P, x = plant.physics(), stretch * z[:, None]

@@ -21,24 +21,64 @@ from . import clutter
 from .cases import draw_case
 
 SETTINGS = {"duration_s": 60.0, "jobs": 1, "unseen": True, "cluttered": 0.5}
-TRACES = [{"name": name, "location": "anywhere", "parameters": {}, "unexplained": 0.002}
-          for name in ("mains_hum", "contact_friction", "cubic_stiffness", "structural_damping")]
+TRACES = [
+    {"name": name, "location": "anywhere", "parameters": {}, "unexplained": 0.002}
+    for name in ("mains_hum", "contact_friction", "cubic_stiffness", "structural_damping")
+]
 
 
-def line(seed: int, kind: str, named: tuple[str, ...], hidden: tuple[str, ...] = (), cluttered: bool = True,
-         unseen: tuple[float, float, float] | None = None, probability: float = 0.95,
-         verdict: str = "explained") -> Line:
-    effects = [{"name": name, "location": "payload", "parameters": {}, "probability": probability,
-                "indistinguishable_from": []} for name in named]
-    answer = {"format": "avis-gap", "version": 1, "verdict": verdict, "effects": effects, "gap": [], "where": [],
-              "next_experiment": None, "seconds": 1.0, "traces": [{"name": "loop_delay"}]}
-    return Line.model_validate({
-        "seed": seed, "kind": kind, "excitation": "noise", "floor_recorded": True, "relative_change": 1.0,
-        "hidden": [{"name": name, "location": "payload", "parameters": {}, "strength": "clear"} for name in hidden],
-        "answer": answer, "crash": None, "seconds": 1.0, "cpu_seconds": 10.0 + seed, "memory_MB": 1.0,
-        "simulation_seconds": 1.0, "unseen_error": None, "settings": SETTINGS, "cluttered": cluttered,
-        "unseen": dict(zip(("baseline", "updated", "best"), unseen, strict=True)) if unseen else None,
-        "traces": TRACES if cluttered else []})
+def line(
+    seed: int,
+    kind: str,
+    named: tuple[str, ...],
+    hidden: tuple[str, ...] = (),
+    cluttered: bool = True,
+    unseen: tuple[float, float, float] | None = None,
+    probability: float = 0.95,
+    verdict: str = "explained",
+) -> Line:
+    effects = [
+        {
+            "name": name,
+            "location": "payload",
+            "parameters": {},
+            "probability": probability,
+            "indistinguishable_from": [],
+        }
+        for name in named
+    ]
+    answer = {
+        "format": "avis-gap",
+        "version": 1,
+        "verdict": verdict,
+        "effects": effects,
+        "gap": [],
+        "where": [],
+        "next_experiment": None,
+        "seconds": 1.0,
+        "traces": [{"name": "loop_delay"}],
+    }
+    return Line.model_validate(
+        {
+            "seed": seed,
+            "kind": kind,
+            "excitation": "noise",
+            "floor_recorded": True,
+            "relative_change": 1.0,
+            "hidden": [{"name": name, "location": "payload", "parameters": {}, "strength": "clear"} for name in hidden],
+            "answer": answer,
+            "crash": None,
+            "seconds": 1.0,
+            "cpu_seconds": 10.0 + seed,
+            "memory_MB": 1.0,
+            "simulation_seconds": 1.0,
+            "unseen_error": None,
+            "settings": SETTINGS,
+            "cluttered": cluttered,
+            "unseen": dict(zip(("baseline", "updated", "best"), unseen, strict=True)) if unseen else None,
+            "traces": TRACES if cluttered else [],
+        }
+    )
 
 
 def cell(table, row: str, column: str) -> str:
@@ -61,7 +101,8 @@ def test_a_trace_is_no_false_name_but_no_hidden_effect_either():
 
 def test_clean_and_cluttered_stand_apart():
     lines = [
-        line(0, "none", (), verdict="none", cluttered=False), line(1, "none", ("com_offset",)),
+        line(0, "none", (), verdict="none", cluttered=False),
+        line(1, "none", ("com_offset",)),
         line(2, "one", ("com_offset",), ("com_offset",), cluttered=False, unseen=(0.1, 0.02, 0.01)),
         line(3, "one", ("mains_hum", "com_offset"), ("com_offset",), unseen=(0.1, 0.05, 0.01)),
         line(4, "two", ("com_offset", "loop_delay"), ("loop_delay", "com_offset")),
@@ -71,15 +112,20 @@ def test_clean_and_cluttered_stand_apart():
     table = next(one for one in result.tables if one.title == "Clean and cluttered tables")
     assert table.head[1:] == ("clean", "cluttered")
     for row, clean, cluttered in (
-            ("cases", "2", "4"), ("no effect", "0.0 % (0/1", "100.0 % (1/1"), ("one effect", "100.0 %", "0.0 % (0/1"),
-            ("two effects", "no case", "100.0 % (1/1"), ("outside", "no case", "100.0 % (1/1"),
-            ("unseen record: error of updated over re", "median 0.2", "median 0.5"),
-            ("unseen record: error of updated over best", "median 2", "median 5"),
-            ("probability above 0.9", "100.0 % (1/1", "66.7 % (4/6"), ("processor", "median 11", "median 13.5")):
+        ("cases", "2", "4"),
+        ("no effect", "0.0 % (0/1", "100.0 % (1/1"),
+        ("one effect", "100.0 %", "0.0 % (0/1"),
+        ("two effects", "no case", "100.0 % (1/1"),
+        ("outside", "no case", "100.0 % (1/1"),
+        ("unseen record: error of updated over re", "median 0.2", "median 0.5"),
+        ("unseen record: error of updated over best", "median 2", "median 5"),
+        ("probability above 0.9", "100.0 % (1/1", "66.7 % (4/6"),
+        ("processor", "median 11", "median 13.5"),
+    ):
         assert cell(table, row, "clean").startswith(clean), row
         assert cell(table, row, "cluttered").startswith(cluttered), row
     asked = {one.what: one.measured for one in result.asked}
-    assert asked["no effect: false alarms"].startswith("0.0 % (0/1")        # the clean one only
+    assert asked["no effect: false alarms"].startswith("0.0 % (0/1")  # the clean one only
     assert clutter_table([judge(one) for one in lines if one.cluttered]).head == ("", "cluttered")
 
 

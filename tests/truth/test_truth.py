@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from .cases import (
-    LIBRARY,
-    OUTSIDE_LIBRARY,
-    build_plant,
-    convert,
-    draw_case,
-    held_voltage,
-    rig,
-    run,
-    simulate_case,
-)
+from .cases import LIBRARY, OUTSIDE_LIBRARY, build_plant, convert, draw_case, held_voltage, rig, run, simulate_case
 from .closed_form import carry, sampled_response
 from .kernel import FIRST_EFFECT_STATE
 from .signals import floor_motion, multisine
@@ -59,12 +49,23 @@ def stretches(plant: Plant, trace: np.ndarray) -> np.ndarray:
 def integrate_freely(plant: Plant, position: list[float], spin: list[float], samples: int) -> np.ndarray:
     """States of the table let go from a position and spin, by marching from a given state."""
     from .kernel import integrate, state_size
+
     P = plant.physics()
     x = np.zeros(state_size(P))
     x[0:3], x[3], x[10:13] = position, 1.0, spin
     trace, y = np.empty((samples, len(x))), np.empty((samples, 6))
-    integrate(P, x, np.zeros((1, 8)), np.full(samples, -2), np.zeros(samples), still(samples), np.ones(samples), 1e-3,
-              y, trace)
+    integrate(
+        P,
+        x,
+        np.zeros((1, 8)),
+        np.full(samples, -2),
+        np.zeros(samples),
+        still(samples),
+        np.ones(samples),
+        1e-3,
+        y,
+        trace,
+    )
     return trace
 
 
@@ -78,7 +79,7 @@ def test_energy_is_conserved_without_damping(rng, k2, k3):
     plant = draw_plant(rig(), rng)
     plant.c, plant.J = np.zeros((4, 3)), plant.J + np.array([[0, 2, -1], [2, 0, 3], [-1, 3, 0]])
     plant.extra.update(k2=np.full(4, k2), k3=np.full(4, k3))
-    trace = integrate_freely(plant, [0.01, -0.02, 0.015], [0.8, -1.1, 0.9], 4000)   # rotations of several degrees
+    trace = integrate_freely(plant, [0.01, -0.02, 0.015], [0.8, -1.1, 0.9], 4000)  # rotations of several degrees
     e = stretches(plant, trace)
     potential = 0.5 * (plant.k * e**2).sum(axis=(1, 2)) + (k2 * e[:, :, 2] ** 3 / 3 + k3 * e[:, :, 2] ** 4 / 4).sum(1)
     energy = kinetic(plant, trace) + potential
@@ -94,7 +95,7 @@ def test_free_spinning_body_keeps_its_angular_momentum(rng):
     trace = integrate_freely(plant, [0, 0, 0], [2.0, 1.5, -1.0], 5000)
     R = Rotation.from_quat(trace[:, [4, 5, 6, 3]]).as_matrix()
     L = np.einsum("tab,tb->ta", R, trace[:, 10:13] @ plant.J + plant.extra["rotor"])
-    assert np.ptp(trace[:, 10]) > 1.0                  # it tumbles
+    assert np.ptp(trace[:, 10]) > 1.0  # it tumbles
     assert np.abs(L - L[0]).max() < 1e-8 * np.linalg.norm(L[0])
 
 
@@ -117,10 +118,27 @@ def test_matrices_are_those_of_the_package():
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9)
 
 
-LINEAR = ("none", "geophone_corner", "sensor_gain", "sensor_misalignment", "tilt_coupling", "actuator_gain",
-          "actuator_lag", "loop_delay", "com_offset", "product_of_inertia", "payload_flexible_mode",
-          "attached_oscillator", "base_compliance", "structural_damping", "mount_surge", "leveling_loop",
-          "cable_stiffness", "gyroscope", "one_amplifier_lag")
+LINEAR = (
+    "none",
+    "geophone_corner",
+    "sensor_gain",
+    "sensor_misalignment",
+    "tilt_coupling",
+    "actuator_gain",
+    "actuator_lag",
+    "loop_delay",
+    "com_offset",
+    "product_of_inertia",
+    "payload_flexible_mode",
+    "attached_oscillator",
+    "base_compliance",
+    "structural_damping",
+    "mount_surge",
+    "leveling_loop",
+    "cable_stiffness",
+    "gyroscope",
+    "one_amplifier_lag",
+)
 
 
 def steady_lines(plant: Plant, level: float, period: int = 4000, periods: int = 7) -> tuple[np.ndarray, ...]:
@@ -135,7 +153,7 @@ def steady_lines(plant: Plant, level: float, period: int = 4000, periods: int = 
 
 def misfit(simulated: Plant, formula: Plant) -> np.ndarray:
     """(6,) largest distance of simulated lines from the closed form, over the channel's r.m.s. line."""
-    f, U, Y = steady_lines(simulated, 0.01)         # small, so that rotations stay linear to 1e-5
+    f, U, Y = steady_lines(simulated, 0.01)  # small, so that rotations stay linear to 1e-5
     P = formula.physics()
     expected = np.array([sampled_response(P, one, RATE, formula.delay_s) @ row for one, row in zip(f, U, strict=True)])
     return np.abs(Y - expected).max(axis=0) / np.sqrt(np.mean(np.abs(Y) ** 2, axis=0))
@@ -143,7 +161,7 @@ def misfit(simulated: Plant, formula: Plant) -> np.ndarray:
 
 @pytest.mark.parametrize("effect", LINEAR)
 def test_frequency_response_in_closed_form(effect):
-    plant = plant_with(None if effect == "none" else effect, damping=5.0)       # so that transients die within 24 s
+    plant = plant_with(None if effect == "none" else effect, damping=5.0)  # so that transients die within 24 s
     assert misfit(plant, plant).max() < 1.5e-4
 
 
@@ -168,12 +186,14 @@ def test_maxwell_branch_in_closed_form():
 
 
 def test_orifice_obeys_its_law():
-    plant = plant_with("mount_relaxation", seed=next(
-        s for s in range(50) if draw_case(s, effect="mount_relaxation").effects[0].details["orifice"] > 0.1))
+    plant = plant_with(
+        "mount_relaxation",
+        seed=next(s for s in range(50) if draw_case(s, effect="mount_relaxation").effects[0].details["orifice"] > 0.1),
+    )
     u = multisine(np.random.default_rng(1), 8000, 8, 4000, (0.5, 20.0), RATE, 0.5)
     _, trace = response_to(plant, u, states=True)
     P, z = plant.physics(), stretches(plant, trace)[:, :, 2]
-    s = trace[:, FIRST_EFFECT_STATE:FIRST_EFFECT_STATE + 4]
+    s = trace[:, FIRST_EFFECT_STATE : FIRST_EFFECT_STATE + 4]
     v = (s[2:] - s[:-2]) * RATE / 2
     force = P.max_k * (z - s)[1:-1]
     law = P.max_c * v + P.max_q * v * np.abs(v)
@@ -253,8 +273,17 @@ def test_drift_moves_the_stiffness_with_the_clock():
     assert np.abs(late - scaled).max() < 0.03 * np.abs(late - early).max()
 
 
-NONLINEAR = {"contact_friction", "cubic_stiffness", "actuator_saturation", "air_drag", "dead_zone",
-             "asymmetric_stiffness", "force_constant_of_displacement", "force_constant_of_drive", "sensor_quadratic"}
+NONLINEAR = {
+    "contact_friction",
+    "cubic_stiffness",
+    "actuator_saturation",
+    "air_drag",
+    "dead_zone",
+    "asymmetric_stiffness",
+    "force_constant_of_displacement",
+    "force_constant_of_drive",
+    "sensor_quadratic",
+}
 CONVERTER = {"mains_hum", "sensor_quantisation", "ground_motion", "noisy_sensor", "dropped_samples"}
 
 
@@ -276,8 +305,9 @@ def test_hum_has_its_frequency_and_amplitude():
     plant, h = build_plant(case), case.effects[0]
     y, _ = response_to(plant, np.zeros((40000, 8)))
     t = np.arange(40000) / RATE
-    basis = np.array([g(2 * np.pi * n * h.parameters["frequency_Hz"] * t)
-                      for n in h.details["harmonics"] for g in (np.sin, np.cos)]).T
+    basis = np.array(
+        [g(2 * np.pi * n * h.parameters["frequency_Hz"] * t) for n in h.details["harmonics"] for g in (np.sin, np.cos)]
+    ).T
     fit, rest = np.linalg.lstsq(basis, y, rcond=None)[:2]
     assert rest.max() < 1e-16 * 40000
     assert np.hypot(fit[0], fit[1]).max() == pytest.approx(h.parameters["amplitude_V"])
@@ -312,10 +342,11 @@ def test_floor_has_the_rms_and_band_that_it_says(rng):
         power = np.abs(np.fft.rfft(floor[:, 3:6] * np.hanning(60000)[:, None], axis=0)) ** 2
         np.testing.assert_allclose(floor[:, 3:6].std(axis=0), 2e-6, rtol=0.15)
         assert power[(f > 61) | (f < 0.4)].sum() < 1e-3 * power.sum()
-        for order in (0, 3):        # velocity and acceleration are derivatives of what stands before
-            slope_of = (floor[2:, order:order + 3] - floor[:-2, order:order + 3]) * RATE / 2
-            np.testing.assert_allclose(slope_of, floor[1:-1, order + 3:order + 6],
-                                       atol=0.05 * np.abs(floor[:, order + 3:order + 6]).max())
+        for order in (0, 3):  # velocity and acceleration are derivatives of what stands before
+            slope_of = (floor[2:, order : order + 3] - floor[:-2, order : order + 3]) * RATE / 2
+            np.testing.assert_allclose(
+                slope_of, floor[1:-1, order + 3 : order + 6], atol=0.05 * np.abs(floor[:, order + 3 : order + 6]).max()
+            )
 
 
 def test_chassis_follows_the_floor_statically():
@@ -324,11 +355,13 @@ def test_chassis_follows_the_floor_statically():
     t = np.arange(20001) / RATE
     w = 2 * np.pi * 0.1
     floor = np.zeros((20001, 9))
-    floor[:, 0:3], floor[:, 3:6], floor[:, 6:9] = (column[:, None] * np.array([1e-3, -2e-3, 1.5e-3]) for column in
-                                                   (np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)))
+    floor[:, 0:3], floor[:, 3:6], floor[:, 6:9] = (
+        column[:, None] * np.array([1e-3, -2e-3, 1.5e-3])
+        for column in (np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t))
+    )
     _, trace = run(plant, np.zeros((20000, 8)), floor, 0, 0.0, np.random.default_rng(0), states=True)
     motion = trace[15000:, 0:3] - floor[15000:20000, 0:3]
-    assert np.abs(motion).max() < 1.5 * (0.1 / 1.9) ** 2 * 2e-3     # (f/f0)^2 of the softest mode, and some ringing
+    assert np.abs(motion).max() < 1.5 * (0.1 / 1.9) ** 2 * 2e-3  # (f/f0)^2 of the softest mode, and some ringing
 
 
 def test_held_voltage_by_brute_force():
@@ -363,7 +396,7 @@ def test_ambient_motion_has_settled_and_the_converter_does_not_clip():
         assert np.mean(np.abs(record.y) > 9.9) < 1e-3
     plant = build_plant(case)
     floor = floor_motion(np.random.default_rng(0), 36001, RATE, 2e-6, 0.5)
-    short = run(plant, np.zeros((4000, 8)), floor[32000 - 12000:], 12000, 0.0, np.random.default_rng(0))[0]
+    short = run(plant, np.zeros((4000, 8)), floor[32000 - 12000 :], 12000, 0.0, np.random.default_rng(0))[0]
     long = run(plant, np.zeros((4000, 8)), floor, 32000, 0.0, np.random.default_rng(0))[0]
     assert np.std(short - long) < 0.05 * np.std(long)
 

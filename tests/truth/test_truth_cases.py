@@ -60,8 +60,9 @@ def test_names_and_places_are_those_of_the_contract(shared):
 
 def test_relative_change_grows_with_strength():
     for effect in ("mount_relaxation", "mains_hum"):
-        faint, gross = (relative_change(draw_case(8, effect=effect, strength=s, duration_s=2.0))
-                        for s in ("faint", "gross"))
+        faint, gross = (
+            relative_change(draw_case(8, effect=effect, strength=s, duration_s=2.0)) for s in ("faint", "gross")
+        )
         assert 0 < faint < 0.2 * gross
     case = draw_case(8, effect="sensor_gain", strength="gross", duration_s=3.0)
     change, h = channel_change(case), case.effects[0]

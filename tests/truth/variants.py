@@ -91,7 +91,7 @@ def each_its_own_corner(d: Draw, p: Parameters, x: Details) -> None:
 
 def second_order(d: Draw, p: Parameters, x: Details) -> None:
     """Two poles; the effective corner is that of a single pole of the same delay at low frequency."""
-    share = float(d.rng.uniform(0.55, 0.85))            # of the delay, in the slower pole
+    share = float(d.rng.uniform(0.55, 0.85))  # of the delay, in the slower pole
     x["poles"] = [1 / share, 1 / (1 - share)]
 
 
@@ -104,8 +104,13 @@ def soft_knee(d: Draw, p: Parameters, x: Details) -> None:
     limit, knee = p["limit_V"], float(d.rng.uniform(5.0, 12.0))
     u = d.high.level * norm.ppf((np.arange(4000) + 0.5) / 4000)
     soft = soft_limit(u, limit, knee)
-    p["limit_V"] = float(minimize_scalar(lambda hard: float(np.mean((np.clip(u, -hard, hard) - soft) ** 2)),
-                                         bounds=(0.5 * limit, 1.1 * limit), method="bounded").x)
+    p["limit_V"] = float(
+        minimize_scalar(
+            lambda hard: float(np.mean((np.clip(u, -hard, hard) - soft) ** 2)),
+            bounds=(0.5 * limit, 1.1 * limit),
+            method="bounded",
+        ).x
+    )
     x.update(asymptote_V=limit, knee=knee)
 
 
@@ -140,11 +145,15 @@ def _modes(d: Draw, p: Parameters, x: Details, ratios: list[float]) -> None:
     shapes, zeta = [first], [p["damping_ratio"]]
     for _ in ratios[1:]:
         other = first * d.rng.permutation([1, 1, -1, -1])[:, None] + 0.2 * np.abs(first).max() * d.rng.standard_normal(
-            (4, 3))
+            (4, 3)
+        )
         shapes.append(other * d.rng.uniform(0.3, 0.7) * np.linalg.norm(first) / np.linalg.norm(other))
         zeta.append(d.between(0.003, 0.03))
-    x.update(frequencies_Hz=[p["frequency_Hz"] * ratio for ratio in ratios], damping_ratios=zeta,
-             shapes=[shape.tolist() for shape in shapes])
+    x.update(
+        frequencies_Hz=[p["frequency_Hz"] * ratio for ratio in ratios],
+        damping_ratios=zeta,
+        shapes=[shape.tolist() for shape in shapes],
+    )
 
 
 def one_mode(d: Draw, p: Parameters, x: Details) -> None:
@@ -209,8 +218,10 @@ def two_branches(d: Draw, p: Parameters, x: Details) -> None:
     x["orifice"] = 0.0
     share, apart = d.rng.uniform(0.3, 0.7, 4), d.between(2.0, 8.0)
     size, corner = np.array(uneven(d, 0.25, 4)), np.array(uneven(d, 0.25, 4))
-    x.update(shares=[(size * share).tolist(), (size * (1 - share)).tolist()],
-             corners=[(corner * apart ** -(1 - share)).tolist(), (corner * apart ** share).tolist()])
+    x.update(
+        shares=[(size * share).tolist(), (size * (1 - share)).tolist()],
+        corners=[(corner * apart ** -(1 - share)).tolist(), (corner * apart**share).tolist()],
+    )
 
 
 def viscous_left(d: Draw, p: Parameters, x: Details) -> None:
@@ -259,8 +270,9 @@ def with_a_quintic(d: Draw, p: Parameters, x: Details) -> None:
 
 def a_little_asymmetric(d: Draw, p: Parameters, x: Details) -> None:
     """The quadratic force is 10 to 40 % of the cubic one at the highest level."""
-    x["quadratic_N_per_m2"] = (d.sign() * float(d.rng.uniform(0.1, 0.4)) * p["cubic_N_per_m3"]
-                               * float(np.mean(d.high.stretch[:, 2])))
+    x["quadratic_N_per_m2"] = (
+        d.sign() * float(d.rng.uniform(0.1, 0.4)) * p["cubic_N_per_m3"] * float(np.mean(d.high.stretch[:, 2]))
+    )
 
 
 def in_proportion_to_the_mounts(d: Draw, p: Parameters, x: Details) -> None:
@@ -295,8 +307,11 @@ def two_cables(d: Draw, p: Parameters, x: Details) -> None:
     """Parallel, 5 to 20 cm apart; reported is the stiffness of both."""
     line, share = d.direction(), float(d.rng.uniform(0.3, 0.7))
     point = np.array(x["point_m"])
-    x.update(axes=[line.tolist()] * 2, each=[p["stiffness_N_per_m"] * part for part in (share, 1 - share)],
-             points_m=[point.tolist(), (point + d.direction() * d.rng.uniform(0.05, 0.2)).tolist()])
+    x.update(
+        axes=[line.tolist()] * 2,
+        each=[p["stiffness_N_per_m"] * part for part in (share, 1 - share)],
+        points_m=[point.tolist(), (point + d.direction() * d.rng.uniform(0.05, 0.2)).tolist()],
+    )
 
 
 # --- floor and drift

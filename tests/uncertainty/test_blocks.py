@@ -13,13 +13,16 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure, ComplexFull, ComplexScalar, RealScalar
 
 sizes = st.integers(1, 4)
-blocks = st.one_of(st.builds(RealScalar, sizes, st.text(max_size=5)), st.builds(ComplexScalar, sizes),
-                   st.builds(ComplexFull, sizes, sizes, st.text(max_size=5)))
+blocks = st.one_of(
+    st.builds(RealScalar, sizes, st.text(max_size=5)),
+    st.builds(ComplexScalar, sizes),
+    st.builds(ComplexFull, sizes, sizes, st.text(max_size=5)),
+)
 structures = st.lists(blocks, max_size=5).map(BlockStructure.of)
 
 
 @settings(max_examples=60, deadline=None)
-@given(structure=structures, seed=st.integers(0, 2 ** 32 - 1))
+@given(structure=structures, seed=st.integers(0, 2**32 - 1))
 def test_random_assemble_values_contains(structure, seed):
     delta = structure.random(np.random.default_rng(seed), norm=2.0)
     assert delta.shape == (structure.n_w, structure.n_z)
@@ -48,8 +51,11 @@ def test_kinds_survive_equality():
 def test_places_of_blocks_that_are_not_square():
     structure = BlockStructure.of([RealScalar(2), ComplexFull(1, 3), ComplexScalar(1)])
     assert (structure.n_w, structure.n_z) == (4, 6)
-    assert [(w, z) for _, w, z in structure.slices()] == [(slice(0, 2), slice(0, 2)), (slice(2, 3), slice(2, 5)),
-                                                          (slice(3, 4), slice(5, 6))]
+    assert [(w, z) for _, w, z in structure.slices()] == [
+        (slice(0, 2), slice(0, 2)),
+        (slice(2, 3), slice(2, 5)),
+        (slice(3, 4), slice(5, 6)),
+    ]
     delta = structure.assemble([0.5, np.array([[1.0, 2.0j, 3.0]]), 1j])
     expected = np.zeros((4, 6), complex)
     expected[[0, 1], [0, 1]], expected[2, 2:5], expected[3, 5] = 0.5, [1.0, 2.0j, 3.0], 1j
@@ -87,17 +93,27 @@ def test_without_phases_on_demand(rng):
     assert np.all(BlockStructure.of([ComplexFull(2, 3), ComplexScalar(2)]).random(rng, real=True).imag == 0)
 
 
-@pytest.mark.parametrize("make", [lambda: RealScalar(0), lambda: ComplexScalar(-1), lambda: ComplexFull(1, 0),
-                                  lambda: RealScalar(1.5)])
+@pytest.mark.parametrize(
+    "make", [lambda: RealScalar(0), lambda: ComplexScalar(-1), lambda: ComplexFull(1, 0), lambda: RealScalar(1.5)]
+)
 def test_sizes_are_whole_and_positive(make):
     with pytest.raises(InputError, match="at least 1"):
         make()
 
 
-@pytest.mark.parametrize("items", [
-    [{"kind": "reel", "rows": 1, "cols": 1}], [{"kind": "real", "rows": 2, "cols": 1}], [{"rows": 1, "cols": 1}],
-    [{"kind": "full", "rows": 1}], [{"kind": "real", "rows": "1", "cols": "1"}],
-    [{"kind": "full", "rows": [], "cols": 1}], ["real"], [None]])
+@pytest.mark.parametrize(
+    "items",
+    [
+        [{"kind": "reel", "rows": 1, "cols": 1}],
+        [{"kind": "real", "rows": 2, "cols": 1}],
+        [{"rows": 1, "cols": 1}],
+        [{"kind": "full", "rows": 1}],
+        [{"kind": "real", "rows": "1", "cols": "1"}],
+        [{"kind": "full", "rows": [], "cols": 1}],
+        ["real"],
+        [None],
+    ],
+)
 def test_json_that_is_no_block_is_refused(items):
     with pytest.raises(InputError):
         BlockStructure.from_dicts(items)
@@ -114,5 +130,9 @@ def test_one_block_is_a_structure():
 
 def test_only_repeated_scalars_have_matrix_scalings():
     assert [b.repeated for b in (RealScalar(1), RealScalar(2), ComplexScalar(2), ComplexFull(2, 2))] == [
-        False, True, True, False]
+        False,
+        True,
+        True,
+        False,
+    ]
     assert issubclass(RealScalar, Block)

@@ -47,12 +47,17 @@ def test_connection_table_names_source_readers_and_meaning():
     assert table["d"].source == "external input"
     assert table["force"].role == "internal"
     assert {name: table[name].role for name in ("w:k", "z:k", "u", "y", "e")} == {
-        "w:k": "w_delta", "z:k": "z_delta", "u": "u", "y": "y", "e": "z"}
+        "w:k": "w_delta",
+        "z:k": "z_delta",
+        "u": "u",
+        "y": "y",
+        "e": "z",
+    }
 
 
 def test_response_is_the_algebra_on_paper():
     s = 1j * OMEGA
-    body = 1 / (s ** 2 + 0.2 * s + 1)
+    body = 1 / (s**2 + 0.2 * s + 1)
     response = plant().P.frequency_response(OMEGA)
     np.testing.assert_allclose(response[:, 3, 1], body, rtol=1e-10)
     np.testing.assert_allclose(response[:, 0, 0], -0.3 * body, rtol=1e-10)
@@ -61,16 +66,31 @@ def test_response_is_the_algebra_on_paper():
     np.testing.assert_allclose(response[:, 4, 2], 1.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("spoil", "signals", "words"), [
-    (lambda d: d.add("odd", gain([[1.0]], ["nowhere"], ["e2"])), ["e", "effort", "position", "e2"],
-     ["nowhere", "odd"]),
-    (lambda d: d.add("second", gain([[1.0]], ["u"], ["e"])), ["e", "effort", "position"], ["e", "W", "second"]),
-    (lambda d: d.add("driver", gain([[1.0]], ["u"], ["d"])), ["e", "effort", "position"],
-     ["d", "external input", "driver"]),
-    (lambda d: d.add("deaf", gain([[1.0]], ["u"], ["lost"])), ["e", "effort", "position"], ["lost", "deaf"]),
-    (lambda d: None, ["e", "effort", "position", "absent"], ["absent"]),
-], ids=["read but not driven", "driven by two parts", "driven by a part and from outside", "made but not read",
-        "asked for but absent"])
+@pytest.mark.parametrize(
+    ("spoil", "signals", "words"),
+    [
+        (
+            lambda d: d.add("odd", gain([[1.0]], ["nowhere"], ["e2"])),
+            ["e", "effort", "position", "e2"],
+            ["nowhere", "odd"],
+        ),
+        (lambda d: d.add("second", gain([[1.0]], ["u"], ["e"])), ["e", "effort", "position"], ["e", "W", "second"]),
+        (
+            lambda d: d.add("driver", gain([[1.0]], ["u"], ["d"])),
+            ["e", "effort", "position"],
+            ["d", "external input", "driver"],
+        ),
+        (lambda d: d.add("deaf", gain([[1.0]], ["u"], ["lost"])), ["e", "effort", "position"], ["lost", "deaf"]),
+        (lambda d: None, ["e", "effort", "position", "absent"], ["absent"]),
+    ],
+    ids=[
+        "read but not driven",
+        "driven by two parts",
+        "driven by a part and from outside",
+        "made but not read",
+        "asked for but absent",
+    ],
+)
 def test_wrong_connections_name_signal_and_parts(spoil, signals, words):
     diagram = mass_on_a_spring()
     spoil(diagram)
@@ -130,7 +150,7 @@ def test_a_sample_is_the_stiffer_spring():
     made = plant()
     s = 1j * OMEGA
     sampled = sample_lft(made.P, made.blocks, np.array([[0.7]])).select("position", "d").frequency_response(OMEGA)
-    np.testing.assert_allclose(sampled[:, 0, 0], 1 / (s ** 2 + 0.2 * s + 1 + 0.3 * 0.7), rtol=1e-9)
+    np.testing.assert_allclose(sampled[:, 0, 0], 1 / (s**2 + 0.2 * s + 1 + 0.3 * 0.7), rtol=1e-9)
 
 
 def test_samples_have_the_structure_and_are_real():
@@ -155,7 +175,7 @@ def test_closed_is_positive_feedback():
     K = gain([[-2.0]])
     s = 1j * OMEGA
     closed = made.closed(K).select("position", "d").frequency_response(OMEGA)[:, 0, 0]
-    np.testing.assert_allclose(closed, 1 / (s ** 2 + 0.2 * s + 3), rtol=1e-9)
+    np.testing.assert_allclose(closed, 1 / (s**2 + 0.2 * s + 3), rtol=1e-9)
     np.testing.assert_array_equal(made.closed(K).A, lft_lower(made.P, K).A)
 
 
@@ -165,7 +185,8 @@ def test_json_holds_the_whole_plant():
     assert (stored["format"], stored["version"], stored["dt"]) == ("avis-plant", 1, 0.0)
     assert (stored["nmeas"], stored["ncon"]) == (1, 1)
     assert stored["performance"] == {"rows": 2, "cols": 3}
-    again = StateSpace(stored["A"], stored["B"], stored["C"], stored["D"], stored["dt"], stored["inputs"],
-                       stored["outputs"])
+    again = StateSpace(
+        stored["A"], stored["B"], stored["C"], stored["D"], stored["dt"], stored["inputs"], stored["outputs"]
+    )
     np.testing.assert_array_equal(again.frequency_response(OMEGA), made.P.frequency_response(OMEGA))
     assert BlockStructure.from_dicts(stored["blocks"]) == made.blocks

@@ -18,8 +18,12 @@ OMEGA = 2 * np.pi * np.geomspace(0.5, 60.0, 90)
 def bumpy(seed: int) -> np.ndarray:
     """A spread such as measured ones: a slope, a bump at a resonance, and noise."""
     rng, f = np.random.default_rng(seed), OMEGA / (2 * np.pi)
-    return 1e-3 * (f / 5) ** rng.uniform(-0.5, 1) * (1 + 30 / (1 + 40 * np.log(f / 2.2) ** 2)) * np.exp(
-        0.3 * rng.standard_normal(OMEGA.size))
+    return (
+        1e-3
+        * (f / 5) ** rng.uniform(-0.5, 1)
+        * (1 + 30 / (1 + 40 * np.log(f / 2.2) ** 2))
+        * np.exp(0.3 * rng.standard_normal(OMEGA.size))
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -71,10 +75,17 @@ def test_the_fit_reaches_a_decade_beyond_the_data_or_a_declared_crossover():
         assert grid[[0, -1]] / (2 * np.pi) == pytest.approx([0.05, high_Hz])
 
 
-@pytest.mark.parametrize(("changes", "field"), [
-    ({"data": np.zeros(OMEGA.size)}, "data"), ({"data": np.full(OMEGA.size, np.nan)}, "data"),
-    ({"data": np.ones(3)}, "data"), ({"omega": OMEGA[::-1]}, "omega"), ({"factor": 0.0}, "factor"),
-    ({"slope": -1.0}, "slope")])
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"data": np.zeros(OMEGA.size)}, "data"),
+        ({"data": np.full(OMEGA.size, np.nan)}, "data"),
+        ({"data": np.ones(3)}, "data"),
+        ({"omega": OMEGA[::-1]}, "omega"),
+        ({"factor": 0.0}, "factor"),
+        ({"slope": -1.0}, "slope"),
+    ],
+)
 def test_what_is_refused(changes, field):
     with pytest.raises(InputError, match=field):
         IdentifiedSpread(**{"omega": OMEGA, "data": bumpy(0), **changes})

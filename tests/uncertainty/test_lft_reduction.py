@@ -26,8 +26,9 @@ def assembled(rng: np.random.Generator, sizes: list[int], outputs: int = 3, inpu
     return M
 
 
-def with_hidden_copies(rng: np.random.Generator, M: np.ndarray, sizes: list[int],
-                       extra: list[tuple[int, int]]) -> tuple[np.ndarray, list[int]]:
+def with_hidden_copies(
+    rng: np.random.Generator, M: np.ndarray, sizes: list[int], extra: list[tuple[int, int]]
+) -> tuple[np.ndarray, list[int]]:
     """Adds to each block copies that nothing reaches and copies that nothing sees, then mixes the block's states."""
     n, more = sum(sizes), [a + b for a, b in extra]
     total = n + sum(more)
@@ -55,8 +56,10 @@ def with_hidden_copies(rng: np.random.Generator, M: np.ndarray, sizes: list[int]
 
 
 @settings(max_examples=50, deadline=None)
-@given(seed=st.integers(0, 2 ** 32 - 1),
-       blocks=st.lists(st.tuples(st.integers(1, 3), st.integers(0, 2), st.integers(0, 2)), min_size=1, max_size=3))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    blocks=st.lists(st.tuples(st.integers(1, 3), st.integers(0, 2), st.integers(0, 2)), min_size=1, max_size=3),
+)
 def test_hidden_copies_go_and_the_lft_stays(seed, blocks):
     rng = np.random.default_rng(seed)
     sizes = [size for size, _, _ in blocks]

@@ -21,7 +21,7 @@ def exponents(n: int) -> list[tuple[int, ...]]:
 @st.composite
 def polynomials(draw) -> dict[tuple[int, ...], np.ndarray]:
     n = draw(st.integers(1, 3))
-    rng = np.random.default_rng(draw(st.integers(0, 2 ** 32 - 1)))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     chosen = draw(st.lists(st.sampled_from(exponents(n)), unique=True, max_size=6))
     # Every product comes with its parameters alone, as in a rig: nothing is uncertain only where another is.
     terms = {(0,) * n: rng.standard_normal((2, 3))}
@@ -66,13 +66,17 @@ def test_a_parameter_that_does_nothing_has_no_term():
     assert set(polynomial_coefficients(lambda d: np.array([[2.0 + d[0]]]), 2)) == {(0, 0), (1, 0)}
 
 
-@pytest.mark.parametrize("function", [
-    lambda d: np.array([[np.sin(d[0])]]),
-    lambda d: np.array([[1 / (3.0 + d[0])]]),
-    lambda d: np.array([[1.0 + d[0] ** 3]]),
-    lambda d: np.array([[np.abs(d[0])]]),
-    lambda d: np.array([[d[0] ** 2 * d[1] ** 2 + d[0] + d[1]]]),
-], ids=["sine", "division", "cube", "absolute value", "degree four"])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda d: np.array([[np.sin(d[0])]]),
+        lambda d: np.array([[1 / (3.0 + d[0])]]),
+        lambda d: np.array([[1.0 + d[0] ** 3]]),
+        lambda d: np.array([[np.abs(d[0])]]),
+        lambda d: np.array([[d[0] ** 2 * d[1] ** 2 + d[0] + d[1]]]),
+    ],
+    ids=["sine", "division", "cube", "absolute value", "degree four"],
+)
 def test_what_is_no_such_polynomial_is_refused_with_its_error(function):
     with pytest.raises(ComputationError, match=r"relative error \d") as refused:
         polynomial_coefficients(function, 2)

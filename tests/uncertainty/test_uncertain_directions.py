@@ -12,17 +12,27 @@ from avis_ctrl.uncertainty.generalized_plant import sample_lft
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainParameter, UncertainRig, uncertain_rig
 
 OMEGA = 2 * np.pi * np.geomspace(0.05, 300.0, 25)
-NAMES = {"avis": ["mass", "J1", "J2", *(f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc"
-                                       for axis in "yz")],
-         "halcyonics_loaded": ["load.mass", "load.L8", "load.Ixx", "k_s1", "k_s3", "d3", "d4"]}
+NAMES = {
+    "avis": [
+        "mass",
+        "J1",
+        "J2",
+        *(f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "yz"),
+    ],
+    "halcyonics_loaded": ["load.mass", "load.L8", "load.Ixx", "k_s1", "k_s3", "d3", "d4"],
+}
 
 
 def directions(name: str, count: int, size: float, seed: int = 0) -> list[UncertainDirection]:
     """Random directions of the rig's parameters, changes of about `size` relative."""
     rng, known = np.random.default_rng(seed), load_rig(name).parameters()
-    return [UncertainDirection(f"direction {k}", tuple(
-        (one, size * (abs(known[one].value) or 0.1) * rng.uniform(-1, 1)) for one in NAMES[name]))
-        for k in range(1, count + 1)]
+    return [
+        UncertainDirection(
+            f"direction {k}",
+            tuple((one, size * (abs(known[one].value) or 0.1) * rng.uniform(-1, 1)) for one in NAMES[name]),
+        )
+        for k in range(1, count + 1)
+    ]
 
 
 def response(rig, keep) -> np.ndarray:
@@ -46,7 +56,8 @@ def mismatch(uncertain: UncertainRig, name: str, keep, deltas) -> float:
     axes, actuators = uncertain.coordinates, rig.equations_of_motion().actuators
     plant = sample_lft(uncertain.system, uncertain.blocks, uncertain.blocks.assemble(list(deltas))).select(
         [*(f"{a}_rel" for a in axes), *(f"{a}_dot" for a in axes)],
-        [*actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)])
+        [*actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)],
+    )
     sampled = np.array([plant(1j * omega) for omega in OMEGA])
     rebuilt = response(rig.with_parameters(uncertain.values(deltas)), keep)
     m, worst = len(actuators), 0.0
@@ -57,9 +68,16 @@ def mismatch(uncertain: UncertainRig, name: str, keep, deltas) -> float:
     return worst
 
 
-@pytest.mark.parametrize(("name", "keep", "count", "size"), [
-    ("avis", ("z", "phi_x"), 3, 0.1), ("avis", ("z", "phi_x"), 6, 1e-5), ("avis", COORDINATES, 2, 1e-3),
-    ("halcyonics_loaded", ("z", "phi_x"), 2, 0.02), ("halcyonics_loaded", ("z", "phi_x"), 3, 1e-4)])
+@pytest.mark.parametrize(
+    ("name", "keep", "count", "size"),
+    [
+        ("avis", ("z", "phi_x"), 3, 0.1),
+        ("avis", ("z", "phi_x"), 6, 1e-5),
+        ("avis", COORDINATES, 2, 1e-3),
+        ("halcyonics_loaded", ("z", "phi_x"), 2, 0.02),
+        ("halcyonics_loaded", ("z", "phi_x"), 3, 1e-4),
+    ],
+)
 def test_sampling_the_lft_equals_rebuilding_the_rig(name, keep, count, size, rng):
     given = [*directions(name, count, size), UncertainParameter(NAMES[name][0], 0.05)]
     uncertain = uncertain_rig(load_rig(name), given, keep)
@@ -72,8 +90,14 @@ def test_the_comparison_notices_what_one_direction_changes(rng):
     """Its smallest change that it could miss is far below what the directions do."""
     given = directions("avis", 2, 1e-5)
     uncertain = uncertain_rig(load_rig("avis"), given)
-    swapped = UncertainRig(uncertain.system, uncertain.blocks, uncertain.parameters[::-1], uncertain.nominal,
-                           uncertain.units, uncertain.coordinates)
+    swapped = UncertainRig(
+        uncertain.system,
+        uncertain.blocks,
+        uncertain.parameters[::-1],
+        uncertain.nominal,
+        uncertain.units,
+        uncertain.coordinates,
+    )
     assert mismatch(uncertain, "avis", ("z", "phi_x"), [1.0, -1.0]) < 1e-10
     assert mismatch(swapped, "avis", ("z", "phi_x"), [1.0, -1.0]) > 1e-6
 
@@ -87,9 +111,14 @@ def test_tiny_changes_need_no_more_copies_than_large_ones():
 
 def test_what_several_deltas_move_adds_up():
     known = load_rig("avis").parameters()
-    uncertain = uncertain_rig(load_rig("avis"), [
-        UncertainDirection("one", (("mass", 2.0), ("isolator1.k_z", -30.0))),
-        UncertainDirection("two", (("mass", -0.5),)), UncertainParameter("mass", 0.1)])
+    uncertain = uncertain_rig(
+        load_rig("avis"),
+        [
+            UncertainDirection("one", (("mass", 2.0), ("isolator1.k_z", -30.0))),
+            UncertainDirection("two", (("mass", -0.5),)),
+            UncertainParameter("mass", 0.1),
+        ],
+    )
     values = uncertain.values([0.5, 1.0, -0.2])
     assert values["mass"] == pytest.approx(known["mass"].value * (1 - 0.02) + 1.0 - 0.5, rel=1e-14)
     assert values["isolator1.k_z"] == pytest.approx(known["isolator1.k_z"].value - 15.0, rel=1e-14)
@@ -99,8 +128,9 @@ def test_what_several_deltas_move_adds_up():
 def test_words():
     changes = (("mass", 1.0), ("isolator1.k_z", 2000.0), ("com_y", 1e-4))
     direction = UncertainDirection("identified direction 1", changes)
-    told = direction.words(0.8, {"mass": 500.0, "isolator1.k_z": 2e5, "com_y": 0.0},
-                           {"mass": "kg", "isolator1.k_z": "N/m", "com_y": "m"})
+    told = direction.words(
+        0.8, {"mass": 500.0, "isolator1.k_z": 2e5, "com_y": 0.0}, {"mass": "kg", "isolator1.k_z": "N/m", "com_y": "m"}
+    )
     assert told == "identified direction 1 at +0.8: com_y +8e-05 m, isolator1.k_z +0.8 %, mass +0.16 %"
     many = UncertainDirection("d", tuple((f"p{k}", 1.0 + k) for k in range(7)))
     told = many.words(-1.0, {f"p{k}": 100.0 for k in range(7)}, {})

@@ -17,21 +17,36 @@ from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter, UncertainRig
 
 OMEGA = 2 * np.pi * np.geomspace(0.05, 300.0, 25)
 
-AVIS = [UncertainParameter("mass", 0.10),
-        *(UncertainParameter(f"isolator{k}.k_z", 0.15) for k in (1, 2, 3, 4)),
-        *(UncertainParameter(f"isolator{k}.c_z", 0.30) for k in (1, 2, 3, 4)),
-        UncertainParameter("J1", 0.10), UncertainParameter("actuator.Az1", 0.05)]
-HALCYONICS = [UncertainParameter("k_s1", 0.15), UncertainParameter("k_s3", 0.15), UncertainParameter("d3", 0.30),
-              UncertainParameter("d4", 0.30), UncertainParameter("Ixx", 0.05), UncertainParameter("mass", 0.02)]
-LOADED = [*HALCYONICS, UncertainParameter("load.mass", 0.10), UncertainParameter("load.L8", 0.01, absolute=True),
-          UncertainParameter("load.Ixx", 0.10)]
-CASES = {"avis, z and phi_x": ("avis", AVIS, ("z", "phi_x")),
-         "avis, phi_x alone": ("avis", AVIS, ("phi_x",)),
-         "avis, six coordinates": ("avis", AVIS, COORDINATES),
-         "halcyonics": ("halcyonics", HALCYONICS, ("z", "phi_x")),
-         "loaded halcyonics": ("halcyonics_loaded", LOADED, ("z", "phi_x")),
-         "loaded halcyonics, three coordinates": ("halcyonics_loaded", LOADED, ("y", "z", "phi_x")),
-         "loaded halcyonics, six coordinates": ("halcyonics_loaded", LOADED, COORDINATES)}
+AVIS = [
+    UncertainParameter("mass", 0.10),
+    *(UncertainParameter(f"isolator{k}.k_z", 0.15) for k in (1, 2, 3, 4)),
+    *(UncertainParameter(f"isolator{k}.c_z", 0.30) for k in (1, 2, 3, 4)),
+    UncertainParameter("J1", 0.10),
+    UncertainParameter("actuator.Az1", 0.05),
+]
+HALCYONICS = [
+    UncertainParameter("k_s1", 0.15),
+    UncertainParameter("k_s3", 0.15),
+    UncertainParameter("d3", 0.30),
+    UncertainParameter("d4", 0.30),
+    UncertainParameter("Ixx", 0.05),
+    UncertainParameter("mass", 0.02),
+]
+LOADED = [
+    *HALCYONICS,
+    UncertainParameter("load.mass", 0.10),
+    UncertainParameter("load.L8", 0.01, absolute=True),
+    UncertainParameter("load.Ixx", 0.10),
+]
+CASES = {
+    "avis, z and phi_x": ("avis", AVIS, ("z", "phi_x")),
+    "avis, phi_x alone": ("avis", AVIS, ("phi_x",)),
+    "avis, six coordinates": ("avis", AVIS, COORDINATES),
+    "halcyonics": ("halcyonics", HALCYONICS, ("z", "phi_x")),
+    "loaded halcyonics": ("halcyonics_loaded", LOADED, ("z", "phi_x")),
+    "loaded halcyonics, three coordinates": ("halcyonics_loaded", LOADED, ("y", "z", "phi_x")),
+    "loaded halcyonics, six coordinates": ("halcyonics_loaded", LOADED, COORDINATES),
+}
 
 
 @cache
@@ -62,8 +77,10 @@ def newton(rig, keep, omega) -> np.ndarray:
 
 def signals(uncertain: UncertainRig, rig) -> tuple[list[str], list[str]]:
     axes = uncertain.coordinates
-    return ([*(f"{a}_rel" for a in axes), *(f"{a}_dot" for a in axes), *(f"{a}_ddot" for a in axes)],
-            [*rig.equations_of_motion().actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)])
+    return (
+        [*(f"{a}_rel" for a in axes), *(f"{a}_dot" for a in axes), *(f"{a}_ddot" for a in axes)],
+        [*rig.equations_of_motion().actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)],
+    )
 
 
 def mismatch(uncertain: UncertainRig, case: str, delta: list[float]) -> float:
@@ -179,12 +196,15 @@ def test_edges_are_named():
     assert [edge_name(name) for name in ("z", "phi_x")] == ["z", "phi_x_edge"]
 
 
-@pytest.mark.parametrize(("parameters", "keep", "words"), [
-    ([UncertainParameter("isolator9.k_z", 0.1)], ("z",), "isolator9.k_z"),
-    ([UncertainParameter("mass", 0.1), UncertainParameter("mass", 0.2)], ("z",), "twice"),
-    ([UncertainParameter("com_y", 0.1)], ("z",), "absolute"),
-    ([UncertainParameter("mass", 0.1)], ("z", "w"), "'w'"),
-])
+@pytest.mark.parametrize(
+    ("parameters", "keep", "words"),
+    [
+        ([UncertainParameter("isolator9.k_z", 0.1)], ("z",), "isolator9.k_z"),
+        ([UncertainParameter("mass", 0.1), UncertainParameter("mass", 0.2)], ("z",), "twice"),
+        ([UncertainParameter("com_y", 0.1)], ("z",), "absolute"),
+        ([UncertainParameter("mass", 0.1)], ("z", "w"), "'w'"),
+    ],
+)
 def test_what_is_refused(parameters, keep, words):
     with pytest.raises(InputError, match=words):
         uncertain_rig(load_rig("avis"), parameters, keep)

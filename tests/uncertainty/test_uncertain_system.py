@@ -17,13 +17,21 @@ from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.uncertainty.uncertain_models import complex_disk, connect, dynamics, matrix, real, ss
 
 NAMES = ("p", "q", "r")
-ELEMENTS = {"p": real("p", 2.0, percent=30), "q": real("q", 3.0, range=(2.0, 5.0)),
-            "r": real("r", -1.5, plus_minus=(0.2, 0.4))}
+ELEMENTS = {
+    "p": real("p", 2.0, percent=30),
+    "q": real("q", 3.0, range=(2.0, 5.0)),
+    "r": real("r", -1.5, plus_minus=(0.2, 0.4)),
+}
 RANGES = {"p": (1.4, 2.6), "q": (2.0, 5.0), "r": (-1.7, -1.1)}
 
 leaves = st.one_of(st.sampled_from(NAMES), st.floats(-2, 2).filter(lambda x: abs(x) > 0.1))
-expressions = st.recursive(leaves, lambda inner: st.one_of(
-    st.tuples(st.sampled_from("+-*/"), inner, inner), st.tuples(st.just("^"), inner, st.integers(-2, 3))), max_leaves=8)
+expressions = st.recursive(
+    leaves,
+    lambda inner: st.one_of(
+        st.tuples(st.sampled_from("+-*/"), inner, inner), st.tuples(st.just("^"), inner, st.integers(-2, 3))
+    ),
+    max_leaves=8,
+)
 
 
 def evaluated(expression, values):
@@ -35,7 +43,7 @@ def evaluated(expression, values):
     sign, left, right = expression
     a = evaluated(left, values)
     if sign == "^":
-        return a ** right if not isinstance(a, float) else a ** float(right)
+        return a**right if not isinstance(a, float) else a ** float(right)
     b = evaluated(right, values)
     return {"+": lambda: a + b, "-": lambda: a - b, "*": lambda: a * b, "/": lambda: a / b}[sign]()
 
@@ -80,15 +88,21 @@ def test_an_expression_has_the_value_of_plain_arithmetic(expression, where):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(expressions, min_size=4, max_size=4), st.integers(0, 10 ** 6))
+@given(st.lists(expressions, min_size=4, max_size=4), st.integers(0, 10**6))
 def test_a_system_with_uncertain_entries_is_the_system_with_their_values(entries, seed):
     rng = np.random.default_rng(seed)
     values = {name: rng.uniform(*RANGES[name]) for name in NAMES}
     size = max(size_of(one, values) for one in entries)
-    table = [[evaluated(entries[0], ELEMENTS), evaluated(entries[1], ELEMENTS)],
-             [evaluated(entries[2], ELEMENTS), evaluated(entries[3], ELEMENTS)]]
-    plain = np.array([[evaluated(entries[0], values), evaluated(entries[1], values)],
-                      [evaluated(entries[2], values), evaluated(entries[3], values)]])
+    table = [
+        [evaluated(entries[0], ELEMENTS), evaluated(entries[1], ELEMENTS)],
+        [evaluated(entries[2], ELEMENTS), evaluated(entries[3], ELEMENTS)],
+    ]
+    plain = np.array(
+        [
+            [evaluated(entries[0], values), evaluated(entries[1], values)],
+            [evaluated(entries[2], values), evaluated(entries[3], values)],
+        ]
+    )
     B, C = np.array([[1.0], [0.5]]), np.array([[1.0, -1.0]])
     made = ss(table, B, C)
     if not isinstance(made, StateSpace):
@@ -109,7 +123,9 @@ def test_mass_spring_damper_of_zhou_and_doyle():
     assert {b.name: b.rows for b in blocks.blocks} == {"m": 1, "c": 1, "k": 1}
     m, c, k = 3.0, 1.0, 2.0
     printed = {  # rows: x1', x2', y_m, y_c, y_k; columns: x1, x2, u, u_m, u_c, u_k
-        "x": np.array([[0, 1], [-k / m, -c / m]]), "loop_m": -0.4}
+        "x": np.array([[0, 1], [-k / m, -c / m]]),
+        "loop_m": -0.4,
+    }
     np.testing.assert_allclose(P.A, printed["x"])
     place = [b.name for b in blocks.blocks].index("m")
     assert P.D[place, place] == pytest.approx(printed["loop_m"])
@@ -130,7 +146,7 @@ def test_worst_case_gain_of_the_mass_spring_damper_against_a_search_of_the_corne
         for c in (0.8, 1.2):
             for k in (1.4, 2.6):
                 zeta = c / (2 * np.sqrt(k * m))
-                peaks.append(1 / (2 * zeta * np.sqrt(1 - zeta ** 2)) / k)
+                peaks.append(1 / (2 * zeta * np.sqrt(1 - zeta**2)) / k)
     assert found.lower <= max(peaks) * 1.001 and found.upper >= max(peaks) and found.upper < 1.01 * max(peaks)
     assert max(hinf_norm(one).gain for one in G.sample(100, seed=1)) <= found.upper
 
@@ -179,10 +195,20 @@ def test_connections_against_python_control():
     g = control.ss([[0, 1], [-1.8 / 2.5, -1.1 / 2.5]], [[0], [1 / 2.5]], [[1, 0]], 0)
     k = K.to_control()
     omega = np.geomspace(0.05, 20, 30)
-    for mine, theirs in ((G @ K, g * k), (G + W, g + W), (G - W, g - W), (W * G, W * g),
-                         (G.feedback(K), control.feedback(g, k)), (G.feedback(K, sign=1), control.feedback(g, k, 1)),
-                         (K @ G, k * g), (2 * G, 2 * g), (G / 2, g / 2), (1 / (1 + G), 1 / (1 + control.tf(g))),
-                         (K - G, k - g), (G ** 2, g * g)):
+    for mine, theirs in (
+        (G @ K, g * k),
+        (G + W, g + W),
+        (G - W, g - W),
+        (W * G, W * g),
+        (G.feedback(K), control.feedback(g, k)),
+        (G.feedback(K, sign=1), control.feedback(g, k, 1)),
+        (K @ G, k * g),
+        (2 * G, 2 * g),
+        (G / 2, g / 2),
+        (1 / (1 + G), 1 / (1 + control.tf(g))),
+        (K - G, k - g),
+        (G**2, g * g),
+    ):
         own = mine.substitute(values).frequency_response(omega)[:, 0, 0]
         np.testing.assert_allclose(own, np.squeeze(theirs(1j * omega)), rtol=1e-9)
     assert G.feedback(K).nstates == 3 and set(G.feedback(K).copies[1:]) == {1}
@@ -215,14 +241,18 @@ def test_dynamics_enter_as_a_block_of_norm_one():
     Delta = tf([-0.9, 2.7], [1.0, 3.0])
     own = loop.substitute(chain=Delta).frequency_response(np.array([0.3, 1.0, 5.0]))[:, 0, 0]
     s = 1j * np.array([0.3, 1.0, 5.0])
-    l = 4 / (s ** 2 + 2 * s + 0.5) * (1 + (s + 0.2) / (0.25 * s + 1) * (-0.9 * s + 2.7) / (s + 3))
+    l = 4 / (s**2 + 2 * s + 0.5) * (1 + (s + 0.2) / (0.25 * s + 1) * (-0.9 * s + 2.7) / (s + 3))
     np.testing.assert_allclose(own, l / (1 + l), rtol=1e-10)
 
 
 def test_dynamics_of_several_channels():
     Delta = dynamics("flex", 0.5, (2, 3))
     assert Delta.shape == (2, 3) and Delta.lft()[1].blocks[0].as_dict() == {
-        "kind": "full", "rows": 2, "cols": 3, "name": "flex"}
+        "kind": "full",
+        "rows": 2,
+        "cols": 3,
+        "name": "flex",
+    }
     D = np.arange(6.0).reshape(2, 3) / 10
     np.testing.assert_allclose(Delta.substitute(flex=D), D / 2)
     for one in Delta.values(20, seed=3):
@@ -253,28 +283,31 @@ def test_two_parameters_of_one_name_are_refused():
     assert (real("k", 1.0, percent=5) + real("k", 1.0, percent=5)).copies == (1,)
 
 
-@pytest.mark.parametrize("call, error, words", [
-    (lambda: real("k", 1.0), InputError, "exactly one of"),
-    (lambda: real("k", 1.0, percent=5, plus_minus=1), InputError, "exactly one of"),
-    (lambda: real("k", 1.0, plus_minus=(-0.5, 0.5)), InputError, "not negative"),
-    (lambda: real("k", 1.0, percent=np.int64(-10)), InputError, "not negative"),
-    (lambda: real("k", 0.0, percent=5), InputError, "low < nominal < high"),
-    (lambda: real("k", 1.0, range=(2, 3)), InputError, "low < nominal < high"),
-    (lambda: real("k", 1.0, range=3), InputError, "expected numbers"),
-    (lambda: real("", 1.0, percent=5), InputError, "expected a name"),
-    (lambda: complex_disk("z", 0.0, -1.0), InputError, "positive radius"),
-    (lambda: dynamics("d", tf([1.0], [1.0, -1.0])), InputError, "stable weight"),
-    (lambda: dynamics("d", np.eye(3), (2, 2)), InputError, "expected one output and input, or 2"),
-    (lambda: ELEMENTS["p"] / real("z", 0.0, plus_minus=1.0), ComputationError, "cannot be inverted"),
-    (lambda: ELEMENTS["p"] ** 0.5, InputError, "whole number"),
-    (lambda: ELEMENTS["p"] + "x", InputError, "expected a StateSpace"),
-    (lambda: ELEMENTS["p"].substitute(x=1.0), InputError, "expected some of p"),
-    (lambda: ELEMENTS["p"].substitute(p="wide"), InputError, "expected a number"),
-    (lambda: matrix([[1.0, 2.0], [ELEMENTS["p"]]]), InputError, "rows of one length"),
-    (lambda: ss([[ELEMENTS["p"]]], [[1.0], [1.0]], [[1.0]]), InputError, "shapes do not fit"),
-    (lambda: matrix([[1, 2]]) @ matrix([[ELEMENTS["p"], 1]]), InputError, "product of shapes"),
-    (lambda: (ELEMENTS["p"] - 3).inverse().substitute(p=3.0), ComputationError, "has no value here"),
-])
+@pytest.mark.parametrize(
+    "call, error, words",
+    [
+        (lambda: real("k", 1.0), InputError, "exactly one of"),
+        (lambda: real("k", 1.0, percent=5, plus_minus=1), InputError, "exactly one of"),
+        (lambda: real("k", 1.0, plus_minus=(-0.5, 0.5)), InputError, "not negative"),
+        (lambda: real("k", 1.0, percent=np.int64(-10)), InputError, "not negative"),
+        (lambda: real("k", 0.0, percent=5), InputError, "low < nominal < high"),
+        (lambda: real("k", 1.0, range=(2, 3)), InputError, "low < nominal < high"),
+        (lambda: real("k", 1.0, range=3), InputError, "expected numbers"),
+        (lambda: real("", 1.0, percent=5), InputError, "expected a name"),
+        (lambda: complex_disk("z", 0.0, -1.0), InputError, "positive radius"),
+        (lambda: dynamics("d", tf([1.0], [1.0, -1.0])), InputError, "stable weight"),
+        (lambda: dynamics("d", np.eye(3), (2, 2)), InputError, "expected one output and input, or 2"),
+        (lambda: ELEMENTS["p"] / real("z", 0.0, plus_minus=1.0), ComputationError, "cannot be inverted"),
+        (lambda: ELEMENTS["p"] ** 0.5, InputError, "whole number"),
+        (lambda: ELEMENTS["p"] + "x", InputError, "expected a StateSpace"),
+        (lambda: ELEMENTS["p"].substitute(x=1.0), InputError, "expected some of p"),
+        (lambda: ELEMENTS["p"].substitute(p="wide"), InputError, "expected a number"),
+        (lambda: matrix([[1.0, 2.0], [ELEMENTS["p"]]]), InputError, "rows of one length"),
+        (lambda: ss([[ELEMENTS["p"]]], [[1.0], [1.0]], [[1.0]]), InputError, "shapes do not fit"),
+        (lambda: matrix([[1, 2]]) @ matrix([[ELEMENTS["p"], 1]]), InputError, "product of shapes"),
+        (lambda: (ELEMENTS["p"] - 3).inverse().substitute(p=3.0), ComputationError, "has no value here"),
+    ],
+)
 def test_wrong_input_is_one_line(call, error, words):
     with pytest.raises(error, match=words) as caught:
         call()

@@ -9,17 +9,16 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import hinf_norm, tf
-from avis_ctrl.uncertainty.weights import (
-    Band,
-    ComplianceBound,
-    ControlEffort,
-    NeglectedDynamics,
-    TransmissibilityBound,
-)
+from avis_ctrl.uncertainty.weights import Band, ComplianceBound, ControlEffort, NeglectedDynamics, TransmissibilityBound
 
 ISOLATION = TransmissibilityBound(4.0, (Band(1.0, 10.0, -6.0),))
-EVERY = [ISOLATION, ComplianceBound(1e-6, 1e-5, 0.5, 100.0), ControlEffort(10.0, 1e-5, 50.0),
-         NeglectedDynamics(), NeglectedDynamics(order=2)]
+EVERY = [
+    ISOLATION,
+    ComplianceBound(1e-6, 1e-5, 0.5, 100.0),
+    ControlEffort(10.0, 1e-5, 50.0),
+    NeglectedDynamics(),
+    NeglectedDynamics(order=2),
+]
 
 
 @pytest.mark.parametrize("weight", EVERY, ids=lambda w: type(w).__name__)
@@ -41,7 +40,7 @@ def test_transmissibility_is_never_asked_laxer_than_specified_and_seldom_stricte
     asked, actual = ISOLATION.asked(2 * np.pi * f), ISOLATION.bound(2 * np.pi * f)
     stricter_dB = 20 * np.log10(asked / actual)
     assert np.min(stricter_dB) >= 0.0
-    half = 2 ** 0.5
+    half = 2**0.5
     transition = ((f > 1 / half) & (f < 1)) | ((f > 10) & (f < 10 * half))
     assert np.max(stricter_dB[~transition]) < 0.5 + 0.01
     assert np.max(stricter_dB) < 10.5 + 0.01
@@ -51,8 +50,10 @@ def test_transmissibility_is_never_asked_laxer_than_specified_and_seldom_stricte
 
 
 def test_a_wider_transition_or_a_larger_tolerance_needs_no_more_states():
-    orders = [TransmissibilityBound(4.0, (Band(1.0, 10.0, -6.0),), transition, tolerance).shape.order
-              for transition, tolerance in ((0.35, 0.5), (0.5, 0.5), (0.7, 0.5), (0.5, 2.0), (1.0, 1.0))]
+    orders = [
+        TransmissibilityBound(4.0, (Band(1.0, 10.0, -6.0),), transition, tolerance).shape.order
+        for transition, tolerance in ((0.35, 0.5), (0.5, 0.5), (0.7, 0.5), (0.5, 2.0), (1.0, 1.0))
+    ]
     assert orders == sorted(orders, reverse=True)
 
 
@@ -112,17 +113,27 @@ def test_control_effort_and_compliance_limits_at_both_ends():
     assert rolled.bound(2 * np.pi * np.array([1e6]))[0] == pytest.approx(1e-6 * 1e4, rel=1e-6)
 
 
-@pytest.mark.parametrize(("make", "field"), [
-    (lambda: Band(10.0, 1.0, -6.0), "high_Hz"), (lambda: Band(0.0, 1.0, -6.0), "low_Hz"),
-    (lambda: Band(1.0, 10.0, np.nan), "limit_dB"), (lambda: TransmissibilityBound("four"), "overall_dB"),
-    (lambda: TransmissibilityBound(4.0, (Band(1, 10, -6), Band(5, 20, -3))), "bands"),
-    (lambda: TransmissibilityBound(4.0, transition_octaves=0.0), "transition"),
-    (lambda: ComplianceBound(-1.0), "limit_m_per_N"), (lambda: ComplianceBound(1e-6, 1e-7, 1.0), "static_limit"),
-    (lambda: ComplianceBound(1e-6, 1e-5), "corner_Hz"), (lambda: ControlEffort(0.0), "limit_V"),
-    (lambda: ControlEffort(10.0, np.nan), "disturbance_level"),
-    (lambda: ControlEffort(10.0, reduction=0.5), "reduction"),
-    (lambda: NeglectedDynamics(1.2), "low"), (lambda: NeglectedDynamics(high=0.9), "high"),
-    (lambda: NeglectedDynamics(order=3), "order"), (lambda: NeglectedDynamics(crossover_Hz=-80.0), "crossover_Hz")])
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Band(10.0, 1.0, -6.0), "high_Hz"),
+        (lambda: Band(0.0, 1.0, -6.0), "low_Hz"),
+        (lambda: Band(1.0, 10.0, np.nan), "limit_dB"),
+        (lambda: TransmissibilityBound("four"), "overall_dB"),
+        (lambda: TransmissibilityBound(4.0, (Band(1, 10, -6), Band(5, 20, -3))), "bands"),
+        (lambda: TransmissibilityBound(4.0, transition_octaves=0.0), "transition"),
+        (lambda: ComplianceBound(-1.0), "limit_m_per_N"),
+        (lambda: ComplianceBound(1e-6, 1e-7, 1.0), "static_limit"),
+        (lambda: ComplianceBound(1e-6, 1e-5), "corner_Hz"),
+        (lambda: ControlEffort(0.0), "limit_V"),
+        (lambda: ControlEffort(10.0, np.nan), "disturbance_level"),
+        (lambda: ControlEffort(10.0, reduction=0.5), "reduction"),
+        (lambda: NeglectedDynamics(1.2), "low"),
+        (lambda: NeglectedDynamics(high=0.9), "high"),
+        (lambda: NeglectedDynamics(order=3), "order"),
+        (lambda: NeglectedDynamics(crossover_Hz=-80.0), "crossover_Hz"),
+    ],
+)
 def test_wrong_weights_are_refused_by_name(make, field):
     with pytest.raises(InputError, match=field):
         make()

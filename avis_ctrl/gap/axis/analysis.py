@@ -1,6 +1,6 @@
 """Gap analysis of one axis, from a problem to a verdict: search, names, contributions, sentences.
 
-    Problem -> base fit -> search -> names (rivals, halves, held-out data) -> stages and sentences
+Problem -> base fit -> search -> names (rivals, halves, held-out data) -> stages and sentences
 """
 
 from __future__ import annotations
@@ -13,17 +13,7 @@ import numpy as np
 
 from avis_ctrl.gap.axis.model import AxisModel, Effect, base_priors
 from avis_ctrl.gap.axis.result import AxisGap, AxisStage, RunnerUp
-from avis_ctrl.gap.axis.search import (
-    Explored,
-    Progress,
-    Rival,
-    at_an_edge,
-    parts,
-    rivals,
-    robust,
-    search,
-    unnamed,
-)
+from avis_ctrl.gap.axis.search import Explored, Progress, Rival, at_an_edge, parts, rivals, robust, search, unnamed
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.result import NamedEffect, missed
@@ -86,8 +76,10 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
         if better is not None:
             best, variable = better
             wrong = [one for one in names if one.effect.variable == variable]
-            refused += [replace(one, refused=f"another function of the {variable} gives a much smaller "
-                                             "residual") for one in wrong]
+            refused += [
+                replace(one, refused=f"another function of the {variable} gives a much smaller residual")
+                for one in wrong
+            ]
         else:
             wrong = [worst] if worst else []
             refused += wrong
@@ -100,8 +92,11 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
         for one in wrong:
             rest = explored.without(best, one.effect.label)
             if rest is None:  # nothing is known of the other effects without this one
-                refused += [replace(other, refused=f"no fit without {one.effect.name} succeeded") for other in names
-                            if other not in wrong]
+                refused += [
+                    replace(other, refused=f"no fit without {one.effect.name} succeeded")
+                    for other in names
+                    if other not in wrong
+                ]
             best = rest or base
         if not wrong:
             break
@@ -113,8 +108,9 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
     return _gap(problem, base, best, free, shares, names, refused, explored, settings)
 
 
-def _better_shape(best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
-                  ) -> tuple[Fitted, str] | None:
+def _better_shape(
+    best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
+) -> tuple[Fitted, str] | None:
     """The model with a free function of the variable of a named effect, and that variable, if its residual is much
     smaller; else None. A law that is only close to the true one must not be named."""
     known = {one.variable for one in best.model.effects if one.outside}
@@ -130,8 +126,9 @@ def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitte
     place = {one.key: k for k, one in reversed(list(enumerate(problem.effects)))}
     for label in best.labels:
         own = next(one for one in best.model.effects if one.label == label)
-        same = [r for r in rivals(best, label, explored, problem.effects) if r.same and place[r.effect.key] <
-                place[own.key]]
+        same = [
+            r for r in rivals(best, label, explored, problem.effects) if r.same and place[r.effect.key] < place[own.key]
+        ]
         if same:
             best = min(same, key=lambda r: place[r.effect.key]).fitted
     return best
@@ -150,9 +147,20 @@ def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, setti
     # Only linear parameters are compared: a shape parameter is often determined by a part of the data alone.
     parameters = _sizes(one)
     found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
-    return Name(one, probability, near, _refusal(best, rest, probability, found, explored, max(
-        others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"),
-                _widening(found, settings))
+    return Name(
+        one,
+        probability,
+        near,
+        _refusal(
+            best,
+            rest,
+            probability,
+            found,
+            explored,
+            max(others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing",
+        ),
+        _widening(found, settings),
+    )
 
 
 def _sizes(one: Effect) -> list[str]:
@@ -166,8 +174,9 @@ def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
     return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
 
 
-def _refusal(best: Fitted, rest: Fitted | None, probability: float, found: Sequence[Half], explored: Explored,
-             rival: str) -> str:
+def _refusal(
+    best: Fitted, rest: Fitted | None, probability: float, found: Sequence[Half], explored: Explored, rival: str
+) -> str:
     settings = explored.settings
     if probability < settings.headline:
         return f"{rival} in its place is as probable"
@@ -191,8 +200,10 @@ def power_by_line(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """(n,) each: frequency [Hz], and residual power of held-out data on that line over the total power of the data."""
     residual, whole = _power(fitted.model)
     # `records` puts the mean of a window at a thousandth of the bin spacing.
-    f = [np.where(omega < 0.01 * np.unique(omega)[:2][-1], 0.0, omega / (2 * np.pi))
-         for omega in (block.omega for block in fitted.model.lines.held.blocks)]
+    f = [
+        np.where(omega < 0.01 * np.unique(omega)[:2][-1], 0.0, omega / (2 * np.pi))
+        for omega in (block.omega for block in fitted.model.lines.held.blocks)
+    ]
     return np.concatenate(f), np.concatenate(residual) / whole
 
 
@@ -221,8 +232,9 @@ class Contributions:
     covariance: np.ndarray
 
     @staticmethod
-    def of(base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored,
-           problem: Problem) -> Contributions:
+    def of(
+        base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored, problem: Problem
+    ) -> Contributions:
         """Contributions of the named effects of `best`; free : the fit with a free function, None if there is none."""
         whole = power(best)
         before, after = power(base), whole
@@ -255,12 +267,21 @@ def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], r
         for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
             k = best.model.names.index(f"{p.name}@{one.effect.label}")
             factor[k] = one.widened
-            beside[k] = value ** 2 * remaining / (3 * max(shares[one.effect.label], remaining, 1e-12))
+            beside[k] = value**2 * remaining / (3 * max(shares[one.effect.label], remaining, 1e-12))
     return robust(best) * np.outer(factor, factor) + np.diag(beside)
 
 
-def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, found: Contributions, names: Sequence[Name],
-         refused: Sequence[Name], explored: Explored, settings: AxisSettings) -> AxisGap:
+def _gap(
+    problem: Problem,
+    base: Fitted,
+    best: Fitted,
+    free: Fitted | None,
+    found: Contributions,
+    names: Sequence[Name],
+    refused: Sequence[Name],
+    explored: Explored,
+    settings: AxisSettings,
+) -> AxisGap:
     covariance, remaining = found.covariance, found.remaining
     effects = [_reported(one, best, covariance, found.of_effect[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -found.alone[one.label])
@@ -269,22 +290,41 @@ def _gap(problem: Problem, base: Fitted, best: Fitted, free: Fitted | None, foun
     outside = [one.label for one in best.model.effects if one.outside]
     stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
     closed = found.after <= settings.within_noise * found.floor or (
-        max(found.after - found.floor, 0.0) < settings.small ** 2)
+        max(found.after - found.floor, 0.0) < settings.small**2
+    )
     verdict = ("partly explained", "explained")[closed] if reported else ("unexplained", "none")[closed]
-    base_values = {name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])),
-                                  unit.format(**problem.units)) for k, (name, unit) in enumerate(best.model.base)}
+    base_values = {
+        name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])), unit.format(**problem.units))
+        for k, (name, unit) in enumerate(best.model.base)
+    }
     where = _where(best, problem)
     onward = next((one.effect.separated_by for one in names if one.rivals), None)
-    unknown = next((one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects
-                    if one.outside), "")
+    unknown = next(
+        (one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects if one.outside), ""
+    )
     sentences = _sentences(problem, verdict, reported, traces, stages, names, refused, unknown)
-    ups = tuple(RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
-                for one in names for r in one.rivals)
-    return AxisGap(problem.kind, verdict, reported, traces, tuple(stages), where, tuple(sentences), onward, base_values,
-                   _ratios(problem, best, covariance), ups,
-                   None if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300))),
-                   remaining, _pictures(base, best, stages), {
-                       "kind": problem.kind, **problem.plain, "baseline": _plain(base), "updated": _plain(best)})
+    ups = tuple(
+        RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
+        for one in names
+        for r in one.rivals
+    )
+    return AxisGap(
+        problem.kind,
+        verdict,
+        reported,
+        traces,
+        tuple(stages),
+        where,
+        tuple(sentences),
+        onward,
+        base_values,
+        _ratios(problem, best, covariance),
+        ups,
+        None if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300))),
+        remaining,
+        _pictures(base, best, stages),
+        {"kind": problem.kind, **problem.plain, "baseline": _plain(base), "updated": _plain(best)},
+    )
 
 
 def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
@@ -294,14 +334,28 @@ def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, pro
     if effect.derived:
         found = _propagated(effect.derived, values, own, problem)
     else:
-        found = {p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
-                 for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))}
-    return NamedEffect(effect.name, effect.location, effect.title, found, one.probability,
-                       tuple(dict.fromkeys(r.effect.key for r in one.rivals)), effect.label, share=share)
+        found = {
+            p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
+            for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))
+        }
+    return NamedEffect(
+        effect.name,
+        effect.location,
+        effect.title,
+        found,
+        one.probability,
+        tuple(dict.fromkeys(r.effect.key for r in one.rivals)),
+        effect.label,
+        share=share,
+    )
 
 
-def _propagated(function: Callable[[np.ndarray], Mapping[str, tuple[float, str]]], values: np.ndarray,
-                covariance: np.ndarray, problem: Problem) -> dict[str, Reported]:
+def _propagated(
+    function: Callable[[np.ndarray], Mapping[str, tuple[float, str]]],
+    values: np.ndarray,
+    covariance: np.ndarray,
+    problem: Problem,
+) -> dict[str, Reported]:
     """Function values with standard deviations to first order."""
     found = {}
     for name, (value, unit) in function(values).items():
@@ -325,21 +379,29 @@ def _stages(base: Fitted, best: Fitted, labels: Sequence[str], explored: Explore
         if rest is None or len(one.labels) == 1:
             break
         one = rest
-    return [AxisStage(name, float(np.sqrt(power(fitted))), None if problem.noise is None else
-                      power(fitted) / max(problem.noise, 1e-300)) for name, fitted in (*models, *chain[::-1])]
+    return [
+        AxisStage(
+            name,
+            float(np.sqrt(power(fitted))),
+            None if problem.noise is None else power(fitted) / max(problem.noise, 1e-300),
+        )
+        for name, fitted in (*models, *chain[::-1])
+    ]
 
 
 def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str, Reported]:
     names = [name.partition("@")[0] for name in best.model.names]
-    return _propagated(lambda values: problem.ratios(dict(zip(names, values, strict=True))), best.model.values,
-                       covariance, problem)
+    return _propagated(
+        lambda values: problem.ratios(dict(zip(names, values, strict=True))), best.model.values, covariance, problem
+    )
 
 
 def _plain(fitted: Fitted) -> dict[str, Any]:
     model = fitted.model
-    return {"base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
-            "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects
-                        if not one.outside]}
+    return {
+        "base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
+        "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects if not one.outside],
+    }
 
 
 def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
@@ -350,9 +412,15 @@ def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
     for k in sorted(np.unique(octave), key=lambda k: -float(residual[octave == k].sum())):
         inside = octave == k
         share = float(residual[inside].sum() / max(residual.sum(), 1e-300))
-        found.append({"from_Hz": float(f[inside].min()), "to_Hz": float(f[inside].max()),
-                      "input": problem.units.get("input", ""), "output": problem.units.get("output", ""),
-                      "share": share})
+        found.append(
+            {
+                "from_Hz": float(f[inside].min()),
+                "to_Hz": float(f[inside].max()),
+                "input": problem.units.get("input", ""),
+                "output": problem.units.get("output", ""),
+                "share": share,
+            }
+        )
         if sum(one["share"] for one in found) >= 0.5:
             break
     return tuple(found)
@@ -360,9 +428,16 @@ def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
 
 def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[Picture, ...]:
     at = np.arange(len(stages), dtype=float)
-    ladder = Picture("Gap on held-out data", "stage", "error over measured [%]",
-                     (Series("left", at, np.array([100 * one.nrmse for one in stages]), "bars"),), (), "linear", "log",
-                     tuple(one.name for one in stages))
+    ladder = Picture(
+        "Gap on held-out data",
+        "stage",
+        "error over measured [%]",
+        (Series("left", at, np.array([100 * one.nrmse for one in stages]), "bars"),),
+        (),
+        "linear",
+        "log",
+        tuple(one.name for one in stages),
+    )
     series = []
     for name, fitted in (("base", base), ("updated", best)):
         f, residual = power_by_line(fitted)
@@ -370,8 +445,15 @@ def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[
         lines = lines[lines > 0]
         rms = np.array([np.sqrt(np.mean(residual[np.round(f, 9) == one])) for one in lines])
         series.append(Series(name, lines, rms, "points" if len(lines) < 40 else "line"))
-    return ladder, Picture("Residual of each model on held-out data", "frequency [Hz]", "r.m.s. on a line, relative",
-                           tuple(series), (), "log", "log")
+    return ladder, Picture(
+        "Residual of each model on held-out data",
+        "frequency [Hz]",
+        "r.m.s. on a line, relative",
+        tuple(series),
+        (),
+        "log",
+        "log",
+    )
 
 
 def percent(share: float) -> str:
@@ -379,36 +461,62 @@ def percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def _sentences(problem: Problem, verdict: str, reported: Sequence[NamedEffect], traces: Sequence[NamedEffect],
-               stages: Sequence[AxisStage], names: Sequence[Name], refused: Sequence[Name], unknown: str) -> list[str]:
+def _sentences(
+    problem: Problem,
+    verdict: str,
+    reported: Sequence[NamedEffect],
+    traces: Sequence[NamedEffect],
+    stages: Sequence[AxisStage],
+    names: Sequence[Name],
+    refused: Sequence[Name],
+    unknown: str,
+) -> list[str]:
     first, last = percent(stages[0].nrmse), percent(stages[-1].nrmse)
     if verdict == "none":
         sentences = [f"No missing effect was found: the error on held-out data is {last}."]
     elif verdict == "unexplained":
-        sentences = [f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
-                     "library explains it."]
+        sentences = [
+            f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
+            "library explains it."
+        ]
     else:
-        sentences = [f"{missed(reported)} With this the gap on held-out data falls from {first} to {last}."
-                     f"{' A part is not explained.' * (verdict != 'explained')}"]
+        sentences = [
+            f"{missed(reported)} With this the gap on held-out data falls from {first} to {last}."
+            f"{' A part is not explained.' * (verdict != 'explained')}"
+        ]
     if traces:
-        sentences.append("Traces, below 1 % of the gap: " + "; ".join(
-            f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})"
-            for one in traces) + ".")
+        sentences.append(
+            "Traces, below 1 % of the gap: "
+            + "; ".join(
+                f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})" for one in traces
+            )
+            + "."
+        )
     for one in names:
-        delay = one.effect.name == "delay" and next(p for e in (*reported, *traces) if e.label == one.effect.label
-                                                    for p in e.parameters.values()).value < 0
+        delay = (
+            one.effect.name == "delay"
+            and next(
+                p for e in (*reported, *traces) if e.label == one.effect.label for p in e.parameters.values()
+            ).value
+            < 0
+        )
         if delay:
-            sentences.append("The delay is negative: the motion comes before the force, so that the force was logged "
-                             "late, or the motion early.")
+            sentences.append(
+                "The delay is negative: the motion comes before the force, so that the force was logged "
+                "late, or the motion early."
+            )
         if one.rivals and one.effect.separated_by:
-            sentences.append(f"{one.effect.name}: these data cannot distinguish it from "
-                             f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
-                             f"{one.effect.separated_by}.")
+            sentences.append(
+                f"{one.effect.name}: these data cannot distinguish it from "
+                f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
+                f"{one.effect.separated_by}."
+            )
     if stages[-1].chi2_per_dof is None:
         sentences.append("Nothing in these data repeats, so the noise cannot be estimated.")
     else:
-        sentences.append(f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured "
-                         "noise.")
+        sentences.append(
+            f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise."
+        )
     if unknown:
         sentences.append(f"The residual is most similar to {unknown}, which is not in the library.")
     lost = {one.effect.name: f"{one.effect.name} reduces the gap, but {one.refused}" for one in refused}

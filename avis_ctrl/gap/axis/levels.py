@@ -67,15 +67,18 @@ class ModeModel(AxisModel):
         gain: complex | np.ndarray = 1.0
         if block.name in lines.high:
             for one, p in zip(self.effects, split(x, self.effects, len(self.base)), strict=True):
-                change = change + (one.dynamics(s / w, p) * w ** 2 if one.dynamics else 0.0)
+                change = change + (one.dynamics(s / w, p) * w**2 if one.dynamics else 0.0)
                 gain = gain * (one.path(s / w, p) if one.path else 1.0)
-        mode = r * 2j * x[1] * w ** 2 / (s ** 2 + 2 * x[1] * w * s + w ** 2 + change)
+        mode = r * 2j * x[1] * w**2 / (s**2 + 2 * x[1] * w * s + w**2 + change)
         return gain * lines.size * (mode + b0 + b1 * (block.omega / lines.middle - 1))
 
     def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         Y, predicted = self._predicted(block, self.values), partial(self._predicted, block)
-        dY = central_differences(predicted, self.values, 1e-6 * np.maximum(np.abs(self.values), 1e-3)
-                                 ) if derivative else []
+        dY = (
+            central_differences(predicted, self.values, 1e-6 * np.maximum(np.abs(self.values), 1e-3))
+            if derivative
+            else []
+        )
         return Prediction(Y[:, None, None], np.array(dY).reshape(len(dY), len(Y), 1, 1))
 
 
@@ -85,34 +88,92 @@ def level_effects(scatters: bool) -> list[Effect]:
     static nonlinearity of the drive predicts; a gain that follows the level adds no scatter."""
     sweep = "a sine swept slowly up and down about the mode at several levels"
     return [
-        Effect("hysteresis", "mode", "hysteresis, which softens the mode and adds loss as the level rises",
-               (Parameter("stiffness_lost", "1", 0.0),), "the loop of force and displacement at low frequency",
-               dynamics=lambda s, p: -p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s)),
-        Effect("softening", "mode", "a spring that softens as the level rises",
-               (Parameter("stiffness_lost", "1", 0.0),), sweep, dynamics=lambda s, p: -p[0] * np.ones_like(s)),
-        Effect("hardening", "mode", "a spring that stiffens as the level rises", (
-            Parameter("stiffness_gained", "1", 0.0),), sweep, dynamics=lambda s, p: p[0] * np.ones_like(s)),
-        Effect("friction_damping", "mode", "friction, whose damping falls as the level rises", (
-            Parameter("damping_ratio_lost", "1", 0.0),), sweep, dynamics=lambda s, p: -2 * p[0] * s),
-        Effect("quadratic_damping", "mode", "a damping that grows with the level", (
-            Parameter("damping_ratio_gained", "1", 0.0),), sweep, dynamics=lambda s, p: 2 * p[0] * s),
-        Effect("saturation" if scatters else "gain_by_level", "drive", "a drive or a sensor that saturates" if scatters
-               else "a gain of the drive or the sensor that falls with the level", (Parameter("gain_lost", "1", 0.0),),
-               "the response far from every mode at several levels", path=lambda s, p: 1 - p[0] * np.ones_like(s)),
-        Effect("dead_zone" if scatters else "gain_by_level", "drive", "a drive or a sensor with a dead zone" if scatters
-               else "a gain of the drive or the sensor that rises with the level",
-               (Parameter("gain_gained", "1", 0.0),), "the response far from every mode at several levels",
-               law="" if scatters else "rising", path=lambda s, p: 1 + p[0] * np.ones_like(s)),
-        Effect("drive_hysteresis", "drive", "hysteresis of the drive (piezo), whose gain and lag grow with the level", (
-            Parameter("gain_gained", "1", 0.0),), "the drive's loop of input and output at low frequency",
-            path=lambda s, p: 1 + p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s)),
-        Effect("other_change", "unnamed", "another change of the mode with the level", tuple(
-            Parameter(name, "1") for name in ("a", "b", "c", "d")), dynamics=lambda s, p: (p[0] + 1j * p[1]) + (
-                p[2] + 1j * p[3]) * (s / 1j - 1), outside=True)]
+        Effect(
+            "hysteresis",
+            "mode",
+            "hysteresis, which softens the mode and adds loss as the level rises",
+            (Parameter("stiffness_lost", "1", 0.0),),
+            "the loop of force and displacement at low frequency",
+            dynamics=lambda s, p: -p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s),
+        ),
+        Effect(
+            "softening",
+            "mode",
+            "a spring that softens as the level rises",
+            (Parameter("stiffness_lost", "1", 0.0),),
+            sweep,
+            dynamics=lambda s, p: -p[0] * np.ones_like(s),
+        ),
+        Effect(
+            "hardening",
+            "mode",
+            "a spring that stiffens as the level rises",
+            (Parameter("stiffness_gained", "1", 0.0),),
+            sweep,
+            dynamics=lambda s, p: p[0] * np.ones_like(s),
+        ),
+        Effect(
+            "friction_damping",
+            "mode",
+            "friction, whose damping falls as the level rises",
+            (Parameter("damping_ratio_lost", "1", 0.0),),
+            sweep,
+            dynamics=lambda s, p: -2 * p[0] * s,
+        ),
+        Effect(
+            "quadratic_damping",
+            "mode",
+            "a damping that grows with the level",
+            (Parameter("damping_ratio_gained", "1", 0.0),),
+            sweep,
+            dynamics=lambda s, p: 2 * p[0] * s,
+        ),
+        Effect(
+            "saturation" if scatters else "gain_by_level",
+            "drive",
+            "a drive or a sensor that saturates"
+            if scatters
+            else "a gain of the drive or the sensor that falls with the level",
+            (Parameter("gain_lost", "1", 0.0),),
+            "the response far from every mode at several levels",
+            path=lambda s, p: 1 - p[0] * np.ones_like(s),
+        ),
+        Effect(
+            "dead_zone" if scatters else "gain_by_level",
+            "drive",
+            "a drive or a sensor with a dead zone"
+            if scatters
+            else "a gain of the drive or the sensor that rises with the level",
+            (Parameter("gain_gained", "1", 0.0),),
+            "the response far from every mode at several levels",
+            law="" if scatters else "rising",
+            path=lambda s, p: 1 + p[0] * np.ones_like(s),
+        ),
+        Effect(
+            "drive_hysteresis",
+            "drive",
+            "hysteresis of the drive (piezo), whose gain and lag grow with the level",
+            (Parameter("gain_gained", "1", 0.0),),
+            "the drive's loop of input and output at low frequency",
+            path=lambda s, p: 1 + p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s),
+        ),
+        Effect(
+            "other_change",
+            "unnamed",
+            "another change of the mode with the level",
+            tuple(Parameter(name, "1") for name in ("a", "b", "c", "d")),
+            dynamics=lambda s, p: (p[0] + 1j * p[1]) + (p[2] + 1j * p[3]) * (s / 1j - 1),
+            outside=True,
+        ),
+    ]
 
 
-def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, transient: Transient = "auto",
-           settings: AxisSettings = SETTINGS) -> Problem:
+def levels(
+    campaign: Campaign,
+    band_Hz: tuple[float, float] | None = None,
+    transient: Transient = "auto",
+    settings: AxisSettings = SETTINGS,
+) -> Problem:
     """Problem for the mode that changes most between the lowest and highest level of a campaign of periodic records.
 
     band_Hz : around one mode; by default around the one that changes most. transient : as in
@@ -129,16 +190,21 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
     found = []
     for level in (known[0], known[-1]):
         # Lines that are too weak for some of the inputs form smaller sets, which are not used.
-        one = max(best_linear_approximations(campaign, level_V=level, transient=transient),
-                  key=lambda r: len(r.inputs) * len(r.frequency_Hz))
+        one = max(
+            best_linear_approximations(campaign, level_V=level, transient=transient),
+            key=lambda r: len(r.inputs) * len(r.frequency_Hz),
+        )
         if one.distortion is None or one.measurement_noise is None:
-            raise InputError("expected repeated periods and more realisations than inputs: without them noise and "
-                             "distortion are not separated", field=f"records at {level:g} V")
+            raise InputError(
+                "expected repeated periods and more realisations than inputs: without them noise and "
+                "distortion are not separated",
+                field=f"records at {level:g} V",
+            )
         found.append(one)
     low, high = _common(found[0], found[1])
     change = high.value - low.value
     size = np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))
-    variance = np.maximum(low.variance() + high.variance(), 1e-12 * size ** 2)
+    variance = np.maximum(low.variance() + high.variance(), 1e-12 * size**2)
     mode, mode_words = _mode(low, high, band_Hz, settings)
     half = max(8 * mode[1] * mode[0], 20 * float(np.median(np.diff(low.frequency_Hz))))
     band = (mode[0] - half, mode[0] + half) if band_Hz is None else band_Hz
@@ -147,13 +213,23 @@ def levels(campaign: Campaign, band_Hz: tuple[float, float] | None = None, trans
         raise InputError("expected at least 24 lines in the band around a mode", field="band_Hz", value=band)
     ratio = np.mean(np.abs(change[use]) ** 2, axis=0) / np.mean(np.maximum(variance[use], 1e-300), axis=0)
     i, j = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    problem = _problem(low.at(use), high.at(use), int(i), int(j), mode,
-                       sum(r.header.level_V == known[-1] for r in campaign.records) / len(high.inputs), settings)
+    problem = _problem(
+        low.at(use),
+        high.at(use),
+        int(i),
+        int(j),
+        mode,
+        sum(r.header.level_V == known[-1] for r in campaign.records) / len(high.inputs),
+        settings,
+    )
     whole = float(np.sqrt(np.mean(np.abs(change / size) ** 2)))
     over = float(np.sqrt(np.mean(np.abs(change) ** 2 / variance)))
-    notes = (f"From {known[0]:g} V to {known[-1]:g} V the responses change by {100 * whole:.3g} % (r.m.s. over all "
-             f"entries), {over:.3g} times noise and distortion together.", *mode_words,
-             f"Fitted: {low.inputs[j]} to {low.outputs[i]}, {band[0]:.5g} to {band[1]:.5g} Hz.")
+    notes = (
+        f"From {known[0]:g} V to {known[-1]:g} V the responses change by {100 * whole:.3g} % (r.m.s. over all "
+        f"entries), {over:.3g} times noise and distortion together.",
+        *mode_words,
+        f"Fitted: {low.inputs[j]} to {low.outputs[i]}, {band[0]:.5g} to {band[1]:.5g} Hz.",
+    )
     return replace(problem, notes=notes, units={"input": low.inputs[j], "output": low.outputs[i]})
 
 
@@ -166,8 +242,9 @@ def _common(a: FrequencyResponse, b: FrequencyResponse) -> tuple[FrequencyRespon
     return tuple(r.at(np.isin(np.round(r.frequency_Hz, 6), both)) for r in (a, b))  # type: ignore[return-value]
 
 
-def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, float] | None, settings: AxisSettings
-          ) -> tuple[tuple[float, float], tuple[str, ...]]:
+def _mode(
+    low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, float] | None, settings: AxisSettings
+) -> tuple[tuple[float, float], tuple[str, ...]]:
     """Frequency [Hz] and damping ratio of the lower-level mode near which the responses change most, and a sentence on
     modes that move. A mode whose shape differs is another mode and has not moved."""
     f = low.frequency_Hz
@@ -176,8 +253,10 @@ def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, fl
     peaks, about = signal.find_peaks(smooth, prominence=6.0)  # twice as high as its surroundings
     peaks = peaks[np.argsort(-about["prominences"])][:8]
     if band is not None:
-        peaks = np.array([k for k in peaks if band[0] <= f[k] <= band[1]] or
-                         [int(np.argmax(np.where((f >= band[0]) & (f <= band[1]), loud, -np.inf)))])
+        peaks = np.array(
+            [k for k in peaks if band[0] <= f[k] <= band[1]]
+            or [int(np.argmax(np.where((f >= band[0]) & (f <= band[1]), loud, -np.inf)))]
+        )
     found = []
     for peak in peaks:
         try:
@@ -186,20 +265,30 @@ def _mode(low: FrequencyResponse, high: FrequencyResponse, band: tuple[float, fl
             continue  # no single mode there
         alike = abs(np.vdot(a.residue, b.residue)) / (np.linalg.norm(a.residue) * np.linalg.norm(b.residue))
         moved = abs(b.frequency_Hz - a.frequency_Hz) / max(np.hypot(a.frequency_std_Hz, b.frequency_std_Hz), 1e-300)
-        found.append((moved if alike ** 2 >= settings.same_shape else 0.0, a, b))
+        found.append((moved if alike**2 >= settings.same_shape else 0.0, a, b))
     if not found:
         raise InputError("expected a mode that stands out; give a band around one", field="band_Hz", value=band)
-    words = [f"{a.frequency_Hz:.5g} +- {a.frequency_std_Hz:.2g} Hz to {b.frequency_Hz:.5g} +- "
-             f"{b.frequency_std_Hz:.2g} Hz ({100 * (b.frequency_Hz / a.frequency_Hz - 1):+.2g} %)"
-             for moved, a, b in sorted(found, key=lambda one: one[1].frequency_Hz) if moved > 4]
+    words = [
+        f"{a.frequency_Hz:.5g} +- {a.frequency_std_Hz:.2g} Hz to {b.frequency_Hz:.5g} +- "
+        f"{b.frequency_std_Hz:.2g} Hz ({100 * (b.frequency_Hz / a.frequency_Hz - 1):+.2g} %)"
+        for moved, a, b in sorted(found, key=lambda one: one[1].frequency_Hz)
+        if moved > 4
+    ]
     size = np.sqrt(np.mean(np.abs(low.value) ** 2, axis=0))
     change = np.sum(np.abs((high.value - low.value) / size) ** 2, axis=(1, 2))
     best = max((a for _, a, _ in found), key=lambda a: change[np.abs(f / a.frequency_Hz - 1) < 2 * a.damping].sum())
     return (best.frequency_Hz, best.damping), (f"Modes move with the level: {'; '.join(words)}.",) if words else ()
 
 
-def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mode: tuple[float, float],
-             realisations: float, settings: AxisSettings) -> Problem:
+def _problem(
+    low: FrequencyResponse,
+    high: FrequencyResponse,
+    i: int,
+    j: int,
+    mode: tuple[float, float],
+    realisations: float,
+    settings: AxisSettings,
+) -> Problem:
     omega, n = 2 * np.pi * low.frequency_Hz, len(low.frequency_Hz)
     size = float(np.sqrt(np.mean(np.abs(low.value[:, i, j]) ** 2)))
     held = np.arange(n) % 3 == 1
@@ -210,9 +299,11 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
         for out in (False, True):
             at = held == out
             name = f"{'held out' if out else 'fitted'} {level}"
-            blocks[out].append(SpectralBlock(name, omega[at], np.zeros((int(at.sum()), 0, 1)),
-                                             response.value[at, i, j][:, None, None]
-                                             ).with_noise(variance[at][:, None, None]))
+            blocks[out].append(
+                SpectralBlock(
+                    name, omega[at], np.zeros((int(at.sum()), 0, 1)), response.value[at, i, j][:, None, None]
+                ).with_noise(variance[at][:, None, None])
+            )
             if out:
                 noise.append(variance[at])
     change = float(np.sqrt(np.mean(np.abs(high.value[:, i, j] - low.value[:, i, j]) ** 2)))
@@ -223,19 +314,28 @@ def _problem(low: FrequencyResponse, high: FrequencyResponse, i: int, j: int, mo
     lines = TwoLevels(data[False], data[True], ("fitted high", "held out high"), middle, size, settings)
     f0, zeta = mode[0], max(mode[1], 1e-4)
     s, w = 1j * omega, 2 * np.pi * f0
-    X = np.column_stack([2j * zeta * w ** 2 / (s ** 2 + 2 * zeta * w * s + w ** 2), np.ones(n), omega / middle - 1])
+    X = np.column_stack([2j * zeta * w**2 / (s**2 + 2 * zeta * w * s + w**2), np.ones(n), omega / middle - 1])
     c = np.linalg.lstsq(X, low.value[:, i, j] / size, rcond=None)[0]
-    base = (("frequency_Hz", "Hz"), ("damping", "1"), *((f"{name}_{part}", "1") for name in REST
-                                                         for part in ("real", "imaginary")))
+    base = (
+        ("frequency_Hz", "Hz"),
+        ("damping", "1"),
+        *((f"{name}_{part}", "1") for name in REST for part in ("real", "imaginary")),
+    )
     start = np.concatenate([[f0, zeta], np.stack([c.real, c.imag], axis=1).ravel()])
     whole = float(np.mean([np.mean(np.abs(block.Y) ** 2) for block in data[True].blocks]))
 
     def ratios(v: Mapping[str, float]) -> dict[str, tuple[float, str]]:
         lost = v.get("stiffness_lost", -v.get("stiffness_gained", 0.0))
         return {"change of the mode's frequency": (100 * (np.sqrt(max(1 - lost, 0.0)) - 1), "%")} if lost else {}
-    return Problem("levels", ModeModel(lines, base, (), start), (True, True, *(False,) * 6),
-                   level_effects(scatter > settings.static * change),
-                   float(np.mean(noise)) / whole, ratios=ratios)
+
+    return Problem(
+        "levels",
+        ModeModel(lines, base, (), start),
+        (True, True, *(False,) * 6),
+        level_effects(scatter > settings.static * change),
+        float(np.mean(noise)) / whole,
+        ratios=ratios,
+    )
 
 
 def read_levels(folder: str | Path, sample_rate_Hz: float | None, y_unit: str = "m") -> Campaign:
@@ -251,8 +351,12 @@ def read_levels(folder: str | Path, sample_rate_Hz: float | None, y_unit: str = 
     if not files:
         raise InputError("expected a folder with u_*.npy and y_*.npy", file=folder)
     if sample_rate_Hz is None or not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
-        raise InputError("missing; expected the sample rate in Hz (--sample-rate), because .npy files hold none",
-                         file=folder, field="sample_rate_Hz", value=sample_rate_Hz)
+        raise InputError(
+            "missing; expected the sample rate in Hz (--sample-rate), because .npy files hold none",
+            file=folder,
+            field="sample_rate_Hz",
+            value=sample_rate_Hz,
+        )
     records: list[Record] = []
     for file in files:
         level = re.search(r"(\d+(?:\.\d+)?)\s*mV", file.name)
@@ -263,8 +367,12 @@ def read_levels(folder: str | Path, sample_rate_Hz: float | None, y_unit: str = 
             raise InputError("expected it beside u_*.npy", file=partner)
         u, y = (_loaded(one) for one in (file, partner))
         if u.shape[0] != y.shape[0] or u.shape[2:] != y.shape[2:]:
-            raise InputError(f"expected samples, realisations and periods of {file.name}, {u.shape}", file=partner,
-                             field="shape", value=y.shape)
+            raise InputError(
+                f"expected samples, realisations and periods of {file.name}, {u.shape}",
+                file=partner,
+                field="shape",
+                value=y.shape,
+            )
         records += _records(float(level.group(1)), u, y, float(sample_rate_Hz), y_unit)
     return Campaign(folder.name, tuple(records))
 
@@ -275,8 +383,12 @@ def _loaded(file: Path) -> np.ndarray:
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"expected an array: {error}".splitlines()[0], file=file) from None
     if x.ndim != 4 or x.dtype.kind not in "fiu" or not np.all(np.isfinite(x)):
-        raise InputError("expected finite numbers, samples x channels x realisations x periods", file=file,
-                         field="shape", value=x.shape)
+        raise InputError(
+            "expected finite numbers, samples x channels x realisations x periods",
+            file=file,
+            field="shape",
+            value=x.shape,
+        )
     return x.astype(float)
 
 
@@ -284,8 +396,16 @@ def _records(level_mV: float, u: np.ndarray, y: np.ndarray, rate: float, y_unit:
     n, count, periods = u.shape[0], u.shape[2], u.shape[3]
     found = []
     for k in range(count):
-        header = RecordHeader(f"{level_mV:g}mV_{k}", rate, n * periods, tuple(f"u{j + 1}" for j in range(u.shape[1])),
-                              tuple(f"y{j + 1}" for j in range(y.shape[1])), "multisine", level_mV / 1000,
-                              period_s=n / rate, y_unit=y_unit)
+        header = RecordHeader(
+            f"{level_mV:g}mV_{k}",
+            rate,
+            n * periods,
+            tuple(f"u{j + 1}" for j in range(u.shape[1])),
+            tuple(f"y{j + 1}" for j in range(y.shape[1])),
+            "multisine",
+            level_mV / 1000,
+            period_s=n / rate,
+            y_unit=y_unit,
+        )
         found.append(Record(header, *(x[:, :, k, :].transpose(2, 0, 1).reshape(n * periods, -1) for x in (u, y))))
     return found

@@ -16,8 +16,13 @@ from avis_ctrl.gap.axis.records import Lines, Signals
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 
 
-def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = None,
-          band_Hz: tuple[float, float] | None = None, settings: AxisSettings = SETTINGS) -> Problem:
+def drive(
+    records: Sequence[Signals],
+    rate: float,
+    cutoff_Hz: float | None = None,
+    band_Hz: tuple[float, float] | None = None,
+    settings: AxisSettings = SETTINGS,
+) -> Problem:
     """Problem of a drive. Its band extends to where force and motion are coherent: only there do delay and lag differ.
 
     Parameters
@@ -43,6 +48,7 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
         columns = _flat(lines.A, lines.V, *map(lines.of, (lambda m: m.sign, *places)))
         x, residual = _least_squares(columns, *_flat(lines.F))
         return residual, bool(x[0] > 0)
+
     require_oriented(fitted, records, ("force", "position"), settings)
     lines = Lines(records, rate, "force", band, cutoff_Hz, settings)
     start, _ = _least_squares(_flat(lines.A, lines.V), *_flat(lines.F))
@@ -50,14 +56,26 @@ def drive(records: Sequence[Signals], rate: float, cutoff_Hz: float | None = Non
     model = MassModel(lines, (("M", "{F} s^2/{x}"), ("Fv", "{F} s/{x}")), (), start)
     noise, notes = repeated(lines, records, "position")
     scale = Scale.of(lines, pitches=True)
-    return Problem("drive", model, (True, False), [*drive_effects(scale), *unnamed_forces(lines)], noise,
-                   {"F": "N", "x": "m", "input": "position", "output": "force"},
-                   lambda v: {"time constant M/Fv": (v["M"] / v["Fv"], "s")} if v["Fv"] > 0 else {}, notes,
-                   {"scale": asdict(scale), "cutoff_Hz": cutoff_Hz, "rate_Hz": rate})
+    return Problem(
+        "drive",
+        model,
+        (True, False),
+        [*drive_effects(scale), *unnamed_forces(lines)],
+        noise,
+        {"F": "N", "x": "m", "input": "position", "output": "force"},
+        lambda v: {"time constant M/Fv": (v["M"] / v["Fv"], "s")} if v["Fv"] > 0 else {},
+        notes,
+        {"scale": asdict(scale), "cutoff_Hz": cutoff_Hz, "rate_Hz": rate},
+    )
 
 
-def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, float] | None = None,
-               units: Mapping[str, str] | None = None, settings: AxisSettings = SETTINGS) -> Problem:
+def oscillator(
+    records: Sequence[Signals],
+    rate: float,
+    band_Hz: tuple[float, float] | None = None,
+    units: Mapping[str, str] | None = None,
+    settings: AxisSettings = SETTINGS,
+) -> Problem:
     """Problem of an oscillator, or of one mode of a structure in a band around it; u and y are force and position.
 
     Raises
@@ -73,13 +91,17 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
     def fitted(some: Sequence[Signals]) -> tuple[float, bool]:
         x, residual = _modal_start(Lines(some, rate, "position", band, None, settings))
         return residual, bool(x[0] > 0 and x[2] > 0)
+
     require_oriented(fitted, records, ("u", "y"), settings)
     lines = Lines(records, rate, "position", band, None, settings)
     start, _ = _modal_start(lines)
     if not (start[0] > 0 and start[2] > 0):
-        raise ComputationError("no oscillator fits", measured=f"mass {start[0]:.3g}, stiffness {start[2]:.3g}",
-                               cause="no resonance in the band, or columns of another kind",
-                               next_step="choose a band around one resonance")
+        raise ComputationError(
+            "no oscillator fits",
+            measured=f"mass {start[0]:.3g}, stiffness {start[2]:.3g}",
+            cause="no resonance in the band, or columns of another kind",
+            next_step="choose a band around one resonance",
+        )
     model = MassModel(lines, (("m", "{F} s^2/{x}"), ("d", "{F} s/{x}"), ("k", "{F}/{x}")), (), start)
     noise, notes = repeated(lines, records, "force")
 
@@ -90,15 +112,24 @@ def oscillator(records: Sequence[Signals], rate: float, band_Hz: tuple[float, fl
             if name in v:
                 found[f"{name}/k"] = v[name] / v["k"], "1/{x}^" + str(int(name[1]) - 1)
         return found
+
     scale = Scale.of(lines, pitches=False)
-    return Problem("oscillator", model, (True, False, True), [*oscillator_effects(scale), *unnamed_forces(lines)],
-                   noise,
-                   {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})}, ratios, notes,
-                   {"scale": asdict(scale), "rate_Hz": rate})
+    return Problem(
+        "oscillator",
+        model,
+        (True, False, True),
+        [*oscillator_effects(scale), *unnamed_forces(lines)],
+        noise,
+        {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})},
+        ratios,
+        notes,
+        {"scale": asdict(scale), "rate_Hz": rate},
+    )
 
 
-def _least_squares(columns: Sequence[np.ndarray], y: np.ndarray, weight: np.ndarray | float = 1.0
-                   ) -> tuple[np.ndarray, float]:
+def _least_squares(
+    columns: Sequence[np.ndarray], y: np.ndarray, weight: np.ndarray | float = 1.0
+) -> tuple[np.ndarray, float]:
     """Coefficients, and the norm of the residual over that of y."""
     X = np.column_stack(columns) * np.broadcast_to(weight, y.shape)[:, None]
     y = y * weight
@@ -121,13 +152,17 @@ def _modal_start(lines: Lines, steps: int = 8) -> tuple[np.ndarray, float]:
     x = np.zeros(3)
     for _ in range(steps):
         x, _ = _least_squares([A, V, Q], F, weight)
-        weight = 1 / np.maximum(np.abs(x[0] * s ** 2 + x[1] * s + x[2]), 1e-300)
+        weight = 1 / np.maximum(np.abs(x[0] * s**2 + x[1] * s + x[2]), 1e-300)
     residual = (F - x[0] * A - x[1] * V - x[2] * Q) * weight
     return x, float(np.linalg.norm(residual) / np.linalg.norm(Q))
 
 
-def require_oriented(fitted: Callable[[Sequence[Signals]], tuple[float, bool]], records: Sequence[Signals],
-                     names: tuple[str, str], settings: AxisSettings) -> None:
+def require_oriented(
+    fitted: Callable[[Sequence[Signals]], tuple[float, bool]],
+    records: Sequence[Signals],
+    names: tuple[str, str],
+    settings: AxisSettings,
+) -> None:
     """Refuse exchanged columns and a flipped sign; a mass must be positive. If the model fits with the sign of the
     input reversed, or with input and output exchanged, but not with the columns as given, the columns are wrong.
 
@@ -144,19 +179,26 @@ def require_oriented(fitted: Callable[[Sequence[Signals]], tuple[float, bool]], 
     swapped, sensible = fitted([Signals(one.name, one.position, one.force) for one in records])
     swapped = swapped if sensible else np.inf
     if swapped < min(turned, settings.no_model, settings.much_better * residual):
-        raise InputError(f"the model leaves {100 * residual:.3g} % of these columns and {100 * swapped:.2g} % with "
-                         "input and output exchanged: the columns look exchanged", field=field)
+        raise InputError(
+            f"the model leaves {100 * residual:.3g} % of these columns and {100 * swapped:.2g} % with "
+            "input and output exchanged: the columns look exchanged",
+            field=field,
+        )
     if turned < settings.no_model:
-        raise InputError("expected a positive mass: with the input's sign turned the model fits "
-                         f"({100 * turned:.2g} % are left), so that the sign of one column looks flipped; give it a "
-                         "scale of -1", field=field)
+        raise InputError(
+            "expected a positive mass: with the input's sign turned the model fits "
+            f"({100 * turned:.2g} % are left), so that the sign of one column looks flipped; give it a "
+            "scale of -1",
+            field=field,
+        )
 
 
 def coherent_to(one: Signals, rate: float, settings: AxisSettings) -> float:
     """Upper end [Hz] of the last third-octave band in which acceleration and force are coherent."""
     with np.errstate(divide="ignore", invalid="ignore"):  # no acceleration at all: coherent nowhere
-        f, coherence = signal.coherence(np.diff(one.position, 2), one.force[1:-1], rate,
-                                        nperseg=max(len(one.force) // 16, 8))
+        f, coherence = signal.coherence(
+            np.diff(one.position, 2), one.force[1:-1], rate, nperseg=max(len(one.force) // 16, 8)
+        )
     top = min(settings.least_cutoff_Hz, 0.4 * rate)
     for upper in top * 2 ** (np.arange(1, 40) / 3):
         band = (f >= upper / 2 ** (1 / 3)) & (f < upper)
@@ -172,24 +214,26 @@ def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[floa
     x = getattr(one, guide) - np.mean(getattr(one, guide))
     n, least = len(x), len(x) // 32
     product = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2)[:n]
-    energy, lags = np.cumsum(x ** 2), np.arange(max(least, 1), n // 2)
+    energy, lags = np.cumsum(x**2), np.arange(max(least, 1), n // 2)
     apart = (energy[n - 1 - lags] + energy[-1] - energy[lags - 1] - 2 * product[lags]) / (n - lags)
-    mean = float(np.mean(x ** 2))
-    good = lags[apart < (settings.repeats ** 2 + 1e-9) * mean]
+    mean = float(np.mean(x**2))
+    good = lags[apart < (settings.repeats**2 + 1e-9) * mean]
     if not len(good):
         return None, ()
-    lag = int(good[0] + np.argmin(apart[good - lags[0]][:max(1, least // 4)]))
+    lag = int(good[0] + np.argmin(apart[good - lags[0]][: max(1, least // 4)]))
     target = one.force if lines.solves_for == "force" else one.position
     change = np.zeros(n)
-    change[:n - lag] = (target[lag:] - target[:-lag]) / np.sqrt(2)
+    change[: n - lag] = (target[lag:] - target[:-lag]) / np.sqrt(2)
     inside = np.array([start + lines.length <= n - lag for start in lines.starts[0]])
     if not inside.any():
         return None, ()
     # The median over the segments: a start or a single disturbance is not noise.
     noise = float(np.median(np.mean(np.abs(lines.transform(change, 0).sum(axis=2)[inside]) ** 2, axis=1)))
     whole = float(np.mean([np.mean(np.abs(block.Y) ** 2) for block in lines.held.blocks]))
-    return noise / whole, (f"The {guide} repeats every {lag / lines.rate:.4g} s; from one repetition to the next the "
-                           f"response scatters by {100 * np.sqrt(noise / whole):.2g} %, which is the measured noise.",)
+    return noise / whole, (
+        f"The {guide} repeats every {lag / lines.rate:.4g} s; from one repetition to the next the "
+        f"response scatters by {100 * np.sqrt(noise / whole):.2g} %, which is the measured noise.",
+    )
 
 
 def position_of(x: np.ndarray, rate: float, output: str, low_Hz: float) -> np.ndarray:

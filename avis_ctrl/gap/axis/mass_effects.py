@@ -37,23 +37,48 @@ class Scale:
     @staticmethod
     def of(lines: Lines, pitches: bool) -> Scale:
         """Scales of the records; pitches : whether to search for spatial frequencies."""
+
         def most(value: Callable[[Motion], float]) -> float:
             return max(float(value(m)) for m in lines.motion)
+
         high = float(lines.s.imag.max()) / (2 * np.pi)
-        return Scale(most(lambda m: np.ptp(m.q)), most(lambda m: np.max(np.abs(m.v))),
-                     most(lambda m: np.max(np.abs(m.q))), most(lambda m: np.max(np.abs(m.u))),
-                     max(float(lines.s.imag.min()) / (2 * np.pi), high / 100), high,
-                     tuple(_pitches(lines)) if pitches else (), lines.settings.least_angle)
+        return Scale(
+            most(lambda m: np.ptp(m.q)),
+            most(lambda m: np.max(np.abs(m.v))),
+            most(lambda m: np.max(np.abs(m.q))),
+            most(lambda m: np.max(np.abs(m.u))),
+            max(float(lines.s.imag.min()) / (2 * np.pi), high / 100),
+            high,
+            tuple(_pitches(lines)) if pitches else (),
+            lines.settings.least_angle,
+        )
 
 
-def _force(name: str, title: str, separated_by: str, *columns: tuple[str, str, Shape], low: float = -np.inf,
-           location: str = "", law: str = "", variable: str = "", shaped_by: Parameter | None = None,
-           seeds: Sequence[float] | np.ndarray = ()) -> Effect:
+def _force(
+    name: str,
+    title: str,
+    separated_by: str,
+    *columns: tuple[str, str, Shape],
+    low: float = -np.inf,
+    location: str = "",
+    law: str = "",
+    variable: str = "",
+    shaped_by: Parameter | None = None,
+    seeds: Sequence[float] | np.ndarray = (),
+) -> Effect:
     """A force that is linear in all parameters except an optional one that shapes it, which has its own seeds."""
     linear = tuple(Parameter(symbol, unit, low) for symbol, unit, _ in columns)
-    return Effect(name, location, title, linear if shaped_by is None else (*linear, shaped_by), separated_by,
-                  tuple(shape for *_, shape in columns), law=law, variable=variable,
-                  seeds=tuple((*(0.0,) * len(columns), seed) for seed in seeds))
+    return Effect(
+        name,
+        location,
+        title,
+        linear if shaped_by is None else (*linear, shaped_by),
+        separated_by,
+        tuple(shape for *_, shape in columns),
+        law=law,
+        variable=variable,
+        seeds=tuple((*(0.0,) * len(columns), seed) for seed in seeds),
+    )
 
 
 def _shape(name: str, unit: str, top: float, least: float = 1e-4, **more: float) -> Parameter:
@@ -67,16 +92,22 @@ def _falling(top: float, count: int = 6) -> np.ndarray:
 def _attached(s: np.ndarray, p: np.ndarray) -> np.ndarray:
     """A sprung mass adds m s^2 (2 zeta w s + w^2)/(s^2 + 2 zeta w s + w^2) (Den Hartog, 1956)."""
     w = 2 * np.pi * p[1]
-    inner = 2 * p[2] * w * s + w ** 2
-    return p[0] * s ** 2 * inner / (s ** 2 + inner)
+    inner = 2 * p[2] * w * s + w**2
+    return p[0] * s**2 * inner / (s**2 + inner)
 
 
 def _coulomb(scale: Scale, title: str, separated_by: str, location: str) -> list[Effect]:
     """Friction of constant size; rounded, for slow motion through rest, where no real friction jumps."""
     friction = partial(_force, "coulomb_friction", title, separated_by, low=0.0, location=location, variable="velocity")
-    return [friction(("Fc", "{F}", lambda m: m.sign)),
-            friction(("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)), law="rounded",
-                     shaped_by=_shape("v_rounded", "{x}/s", scale.speed), seeds=_falling(scale.speed, 10)[1::2])]
+    return [
+        friction(("Fc", "{F}", lambda m: m.sign)),
+        friction(
+            ("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)),
+            law="rounded",
+            shaped_by=_shape("v_rounded", "{x}/s", scale.speed),
+            seeds=_falling(scale.speed, 10)[1::2],
+        ),
+    ]
 
 
 def _delay(s: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -89,25 +120,54 @@ def _lag(s: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 def _path(scale: Scale, location: str) -> list[Effect]:
     longest = 16 / scale.high_Hz
-    return [Effect("delay", location, "a pure delay between force and motion", (Parameter("delay_s", "s", -longest,
-                   longest),), FASTER, path=_delay),
-            Effect("actuator_lag", location, "a first-order lag of the actuator",
-                   (Parameter("time_constant_s", "s", 0.0, longest),), FASTER, path=_lag)]
+    return [
+        Effect(
+            "delay",
+            location,
+            "a pure delay between force and motion",
+            (Parameter("delay_s", "s", -longest, longest),),
+            FASTER,
+            path=_delay,
+        ),
+        Effect(
+            "actuator_lag",
+            location,
+            "a first-order lag of the actuator",
+            (Parameter("time_constant_s", "s", 0.0, longest),),
+            FASTER,
+            path=_lag,
+        ),
+    ]
 
 
 def _attached_to(scale: Scale, name: str, title: str, location: str) -> Effect:
     low, high = scale.low_Hz, scale.high_Hz
     seeds = tuple((0.0, f, 0.03) for f in np.geomspace(low * 1.05, high / 1.05, 24))
-    return Effect(name, location, title, (
-        Parameter("mass", "{F} s^2/{x}", 0.0), Parameter("frequency_Hz", "Hz", low / 2, 2 * high, linear=False),
-        Parameter("damping", "1", 1e-4, 1.0, linear=False)), "a finer resolution about the second resonance",
-        dynamics=_attached, seeds=seeds)
+    return Effect(
+        name,
+        location,
+        title,
+        (
+            Parameter("mass", "{F} s^2/{x}", 0.0),
+            Parameter("frequency_Hz", "Hz", low / 2, 2 * high, linear=False),
+            Parameter("damping", "1", 1e-4, 1.0, linear=False),
+        ),
+        "a finer resolution about the second resonance",
+        dynamics=_attached,
+        seeds=seeds,
+    )
 
 
 def _free(name: str, title: str, shapes: Sequence[Shape], variable: str = "") -> Effect:
-    return Effect(name, "input" if variable == "input" else "unnamed", title,
-                  tuple(Parameter(f"c{k}", "{F}") for k in range(len(shapes))), shapes=tuple(shapes), outside=True,
-                  variable=variable)
+    return Effect(
+        name,
+        "input" if variable == "input" else "unnamed",
+        title,
+        tuple(Parameter(f"c{k}", "{F}") for k in range(len(shapes))),
+        shapes=tuple(shapes),
+        outside=True,
+        variable=variable,
+    )
 
 
 def _once(make: Callable[[Motion], list[np.ndarray]], count: int) -> list[Shape]:
@@ -118,6 +178,7 @@ def _once(make: Callable[[Motion], list[np.ndarray]], count: int) -> list[Shape]
         if id(m) not in kept:
             kept[id(m)] = m, make(m)
         return kept[id(m)][1][k]
+
     return [partial(one, k) for k in range(count)]
 
 
@@ -142,15 +203,32 @@ def unnamed_forces(lines: Lines) -> list[Effect]:
 
     def both(m: Motion) -> list[np.ndarray]:
         x, w = (m.q - m.middle) / m.size, m.v / m.speed
-        return [x ** i * w ** j for i, j in powers]
-    found = [_free("function_of_position", "a force that is another function of the position", _once(position, count),
-                   "position"),
-             _free("function_of_velocity", "a force that is another function of the velocity",
-                   _once(velocity, count // 2 * 2), "velocity"),
-             _free("function_of_both", "a force of position and velocity together", _once(both, len(powers)))]
+        return [x**i * w**j for i, j in powers]
+
+    found = [
+        _free(
+            "function_of_position",
+            "a force that is another function of the position",
+            _once(position, count),
+            "position",
+        ),
+        _free(
+            "function_of_velocity",
+            "a force that is another function of the velocity",
+            _once(velocity, count // 2 * 2),
+            "velocity",
+        ),
+        _free("function_of_both", "a force of position and velocity together", _once(both, len(powers))),
+    ]
     if lines.solves_for == "position":
-        found.append(_free("function_of_input", "a drive whose force is another function of its command",
-                           _once(force, count), "input"))
+        found.append(
+            _free(
+                "function_of_input",
+                "a drive whose force is another function of its command",
+                _once(force, count),
+                "input",
+            )
+        )
     return found
 
 
@@ -164,47 +242,113 @@ def drive_effects(scale: Scale) -> list[Effect]:
     at = partial(_force, location="drive")
     found = [
         *_coulomb(scale, "Coulomb friction, a force of constant size against the motion", SLOW, "drive"),
-        at("force_offset", "a constant force (weight on an inclined axis, or an offset of the current sensor)",
-           RELEASED, ("offset", "{F}", lambda m: np.ones_like(m.v))),
-        at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
-           ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2)),
-        at("coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED,
-           ("Fc_ahead_less_back", "{F}", lambda m, speed: np.abs(np.tanh(m.v / speed)) / 2), law="rounded",
-           shaped_by=_shape("v_rounded", "{x}/s", scale.speed), seeds=_falling(scale.speed, 10)[1::2]),
-        at("viscous_asymmetry", "viscous friction that differs between the two directions",
-           "several constant speeds in each direction",
-           ("Fv_ahead_less_back", "{F} s/{x}", lambda m: np.abs(m.v) / 2)),
-        at("quadratic_drag", "a drag that grows with the square of the speed", "several constant speeds",
-           ("c2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v), low=0.0, variable="velocity"),
-        at("stiffness", "a spring to the ground (a cable, a hose)", AT_REST, ("k", "{F}/{x}", lambda m: m.q),
-           ("force_at_zero", "{F}", lambda m: np.ones_like(m.q)), variable="position"),
-        at("cubic_stiffness", "a spring that stiffens with the cube of the displacement from mid travel", AT_REST,
-           ("k3", "{F}/{x}^3", lambda m: (m.q - m.middle) ** 3), variable="position"),
-        at("stribeck_friction", "Stribeck friction, which falls as the drive starts to move", SLOW,
-           ("Fs", "{F}", lambda m, speed: m.sign * np.exp(-(m.v / speed) ** 2)), low=0.0, variable="velocity",
-           shaped_by=_shape("v_s", "{x}/s", scale.speed / 2), seeds=_falling(scale.speed)[1:]),
-        at("presliding", "presliding, friction that is a spring before it slips",
-           "very small slow motion about one position",
-           ("Fc_presliding", "{F}", lambda m, distance: m.dahl(distance) - m.sign), low=0.0,
-           shaped_by=_shape("distance", "{x}", scale.travel / 4, 1e-6), seeds=scale.travel * 4.0 ** -np.arange(3, 8)),
-        *_stops(scale.travel / 2, "drive", lambda m: m.q - m.middle)]
+        at(
+            "force_offset",
+            "a constant force (weight on an inclined axis, or an offset of the current sensor)",
+            RELEASED,
+            ("offset", "{F}", lambda m: np.ones_like(m.v)),
+        ),
+        at(
+            "coulomb_asymmetry",
+            "Coulomb friction that differs between the two directions",
+            RELEASED,
+            ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2),
+        ),
+        at(
+            "coulomb_asymmetry",
+            "Coulomb friction that differs between the two directions",
+            RELEASED,
+            ("Fc_ahead_less_back", "{F}", lambda m, speed: np.abs(np.tanh(m.v / speed)) / 2),
+            law="rounded",
+            shaped_by=_shape("v_rounded", "{x}/s", scale.speed),
+            seeds=_falling(scale.speed, 10)[1::2],
+        ),
+        at(
+            "viscous_asymmetry",
+            "viscous friction that differs between the two directions",
+            "several constant speeds in each direction",
+            ("Fv_ahead_less_back", "{F} s/{x}", lambda m: np.abs(m.v) / 2),
+        ),
+        at(
+            "quadratic_drag",
+            "a drag that grows with the square of the speed",
+            "several constant speeds",
+            ("c2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v),
+            low=0.0,
+            variable="velocity",
+        ),
+        at(
+            "stiffness",
+            "a spring to the ground (a cable, a hose)",
+            AT_REST,
+            ("k", "{F}/{x}", lambda m: m.q),
+            ("force_at_zero", "{F}", lambda m: np.ones_like(m.q)),
+            variable="position",
+        ),
+        at(
+            "cubic_stiffness",
+            "a spring that stiffens with the cube of the displacement from mid travel",
+            AT_REST,
+            ("k3", "{F}/{x}^3", lambda m: (m.q - m.middle) ** 3),
+            variable="position",
+        ),
+        at(
+            "stribeck_friction",
+            "Stribeck friction, which falls as the drive starts to move",
+            SLOW,
+            ("Fs", "{F}", lambda m, speed: m.sign * np.exp(-((m.v / speed) ** 2))),
+            low=0.0,
+            variable="velocity",
+            shaped_by=_shape("v_s", "{x}/s", scale.speed / 2),
+            seeds=_falling(scale.speed)[1:],
+        ),
+        at(
+            "presliding",
+            "presliding, friction that is a spring before it slips",
+            "very small slow motion about one position",
+            ("Fc_presliding", "{F}", lambda m, distance: m.dahl(distance) - m.sign),
+            low=0.0,
+            shaped_by=_shape("distance", "{x}", scale.travel / 4, 1e-6),
+            seeds=scale.travel * 4.0 ** -np.arange(3, 8),
+        ),
+        *_stops(scale.travel / 2, "drive", lambda m: m.q - m.middle),
+    ]
     if scale.travel >= scale.least_angle:
-        found.append(at("gravity", "gravity on a turning load, m g r sin(angle)", AT_REST,
-                        ("sine", "{F}", lambda m: np.sin(m.q)), ("cosine", "{F}", lambda m: np.cos(m.q)),
-                        variable="position"))
+        found.append(
+            at(
+                "gravity",
+                "gravity on a turning load, m g r sin(angle)",
+                AT_REST,
+                ("sine", "{F}", lambda m: np.sin(m.q)),
+                ("cosine", "{F}", lambda m: np.cos(m.q)),
+                variable="position",
+            )
+        )
     if scale.pitches:
         top = 100 / scale.travel
-        found.append(at("cogging", "a force that is periodic in the position (cogging, pitch of a screw)",
-                        "slow motion over the whole travel", ("sine", "{F}", partial(_wave, np.sin)),
-                        ("cosine", "{F}", partial(_wave, np.cos)), variable="position",
-                        # A derivative step of at most a thousandth of a period over the whole travel.
-                        shaped_by=_shape("periods", "1/{x}", top, 0.01, step=1e-5), seeds=scale.pitches))
-    return [*found, *_path(scale, "drive"),
-            _attached_to(scale, "two_mass_flexibility", "a second mass behind a flexible coupling", "drive")]
+        found.append(
+            at(
+                "cogging",
+                "a force that is periodic in the position (cogging, pitch of a screw)",
+                "slow motion over the whole travel",
+                ("sine", "{F}", partial(_wave, np.sin)),
+                ("cosine", "{F}", partial(_wave, np.cos)),
+                variable="position",
+                # A derivative step of at most a thousandth of a period over the whole travel.
+                shaped_by=_shape("periods", "1/{x}", top, 0.01, step=1e-5),
+                seeds=scale.pitches,
+            )
+        )
+    return [
+        *found,
+        *_path(scale, "drive"),
+        _attached_to(scale, "two_mass_flexibility", "a second mass behind a flexible coupling", "drive"),
+    ]
 
 
 def _stops(reach: float, location: str, place: Shape) -> list[Effect]:
     """Springs that engage beyond a gap: on both sides, above, below."""
+
     def below(m: Motion, gap: float) -> np.ndarray:
         return np.minimum(place(m) + gap, 0.0)
 
@@ -213,11 +357,23 @@ def _stops(reach: float, location: str, place: Shape) -> list[Effect]:
 
     def both(m: Motion, gap: float) -> np.ndarray:
         return below(m, gap) + above(m, gap)
+
     gap = _shape("gap", "{x}", reach, 0.01)
-    return [_force("end_stops", "end stops, a spring that begins behind a gap", "slow motion over the whole travel",
-                   ("k_stop", "{F}/{x}", shape), low=0.0, location=location, law=law, variable="position",
-                   shaped_by=gap, seeds=reach * np.linspace(0.15, 0.85, 5))
-            for law, shape in (("", both), ("above", above), ("below", below))]
+    return [
+        _force(
+            "end_stops",
+            "end stops, a spring that begins behind a gap",
+            "slow motion over the whole travel",
+            ("k_stop", "{F}/{x}", shape),
+            low=0.0,
+            location=location,
+            law=law,
+            variable="position",
+            shaped_by=gap,
+            seeds=reach * np.linspace(0.15, 0.85, 5),
+        )
+        for law, shape in (("", both), ("above", above), ("below", below))
+    ]
 
 
 def _wave(function: Callable[[np.ndarray], np.ndarray], m: Motion, n: float) -> np.ndarray:
@@ -233,7 +389,7 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
     residual = m.u[::step] - X @ np.linalg.lstsq(X, m.u[::step], rcond=None)[0]
     tried = np.arange(2.0, 100.0, 0.25) / float(np.ptp(q))
     power = np.array([abs(np.sum(residual * np.exp(-2j * np.pi * n * q))) for n in tried])
-    peaks = [k for k in np.argsort(-power) if power[k] == power[max(k - 3, 0):k + 4].max()]
+    peaks = [k for k in np.argsort(-power) if power[k] == power[max(k - 3, 0) : k + 4].max()]
     return [float(tried[k]) for k in peaks[:few]]
 
 
@@ -243,31 +399,87 @@ def oscillator_effects(scale: Scale) -> list[Effect]:
     far = "the response far above the resonance at several levels"
     level = _shape("level", "{F}", scale.force, 0.01)
     found = [
-        at("cubic_stiffness", "cubic stiffness, a restoring force k3 y^3", SWEEP,
-           ("k3", "{F}/{x}^3", lambda m: m.q ** 3), variable="position"),
-        at("quadratic_stiffness", "quadratic stiffness, a restoring force k2 y^2",
-           "the mean displacement under a sine at several levels", ("k2", "{F}/{x}^2", lambda m: m.q ** 2),
-           variable="position"),
+        at(
+            "cubic_stiffness",
+            "cubic stiffness, a restoring force k3 y^3",
+            SWEEP,
+            ("k3", "{F}/{x}^3", lambda m: m.q**3),
+            variable="position",
+        ),
+        at(
+            "quadratic_stiffness",
+            "quadratic stiffness, a restoring force k2 y^2",
+            "the mean displacement under a sine at several levels",
+            ("k2", "{F}/{x}^2", lambda m: m.q**2),
+            variable="position",
+        ),
         *_stops(scale.reach, "oscillator", lambda m: m.q),
-        at("quadratic_damping", "quadratic damping, a force d2 |y'| y'", DECAY,
-           ("d2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v), low=0.0, variable="velocity"),
-        at("cubic_damping", "cubic damping, a force d3 y'^3", DECAY, ("d3", "{F} s^3/{x}^3", lambda m: m.v ** 3),
-           low=0.0, variable="velocity"),
+        at(
+            "quadratic_damping",
+            "quadratic damping, a force d2 |y'| y'",
+            DECAY,
+            ("d2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v),
+            low=0.0,
+            variable="velocity",
+        ),
+        at(
+            "cubic_damping",
+            "cubic damping, a force d3 y'^3",
+            DECAY,
+            ("d3", "{F} s^3/{x}^3", lambda m: m.v**3),
+            low=0.0,
+            variable="velocity",
+        ),
         *_coulomb(scale, "friction damping, a force of constant size against the motion", DECAY, "oscillator"),
-        at("position_damping", "damping that grows with the square of the position, a force c y^2 y'", DECAY,
-           ("c", "{F} s/{x}^3", lambda m: m.q ** 2 * m.v), low=0.0),
-        drive("input_nonlinearity", "a drive whose gain changes with its level, u + g u^3", far,
-              ("g", "1/{F}^2", lambda m: -m.u ** 3)),
-        drive("input_nonlinearity_even", "a drive whose gain differs between the two directions, u + g u^2", far,
-              ("g", "1/{F}", lambda m: -m.u ** 2)),
-        drive("input_saturation", "a drive that saturates", far,
-              ("gain_lost", "1", lambda m, level: m.u - level * np.tanh(m.u / level)), low=0.0, shaped_by=level,
-              seeds=_falling(scale.force, 4)),
-        drive("input_dead_zone", "a drive with a dead zone (play, crossover)", far,
-              ("gain_lost", "1", lambda m, level: level * np.tanh(m.u / level)), low=0.0, shaped_by=level,
-              seeds=_falling(scale.force)),
-        at("hysteresis", "hysteresis, joints that stick at small amplitude and slip at large", DECAY,
-           ("F_slip", "{F}", Motion.dahl), low=0.0, shaped_by=_shape("distance", "{x}", 4 * scale.reach, 1e-3),
-           seeds=2 * _falling(scale.reach))]
-    return [*found, *_path(scale, "input"),
-            _attached_to(scale, "attached_oscillator", "a second mode, a sprung mass on the oscillator", "oscillator")]
+        at(
+            "position_damping",
+            "damping that grows with the square of the position, a force c y^2 y'",
+            DECAY,
+            ("c", "{F} s/{x}^3", lambda m: m.q**2 * m.v),
+            low=0.0,
+        ),
+        drive(
+            "input_nonlinearity",
+            "a drive whose gain changes with its level, u + g u^3",
+            far,
+            ("g", "1/{F}^2", lambda m: -(m.u**3)),
+        ),
+        drive(
+            "input_nonlinearity_even",
+            "a drive whose gain differs between the two directions, u + g u^2",
+            far,
+            ("g", "1/{F}", lambda m: -(m.u**2)),
+        ),
+        drive(
+            "input_saturation",
+            "a drive that saturates",
+            far,
+            ("gain_lost", "1", lambda m, level: m.u - level * np.tanh(m.u / level)),
+            low=0.0,
+            shaped_by=level,
+            seeds=_falling(scale.force, 4),
+        ),
+        drive(
+            "input_dead_zone",
+            "a drive with a dead zone (play, crossover)",
+            far,
+            ("gain_lost", "1", lambda m, level: level * np.tanh(m.u / level)),
+            low=0.0,
+            shaped_by=level,
+            seeds=_falling(scale.force),
+        ),
+        at(
+            "hysteresis",
+            "hysteresis, joints that stick at small amplitude and slip at large",
+            DECAY,
+            ("F_slip", "{F}", Motion.dahl),
+            low=0.0,
+            shaped_by=_shape("distance", "{x}", 4 * scale.reach, 1e-3),
+            seeds=2 * _falling(scale.reach),
+        ),
+    ]
+    return [
+        *found,
+        *_path(scale, "input"),
+        _attached_to(scale, "attached_oscillator", "a second mode, a sprung mass on the oscillator", "oscillator"),
+    ]

@@ -97,13 +97,14 @@ def split(values: np.ndarray, effects: Sequence[Effect], base: int) -> list[np.n
     """Parameter values of each effect."""
     found, at = [], base
     for one in effects:
-        found.append(values[at:at + len(one.parameters)])
+        found.append(values[at : at + len(one.parameters)])
         at += len(one.parameters)
     return found
 
 
-def central_differences(function: Callable[[np.ndarray], np.ndarray], p: np.ndarray, steps: Sequence[float]
-                        ) -> list[np.ndarray]:
+def central_differences(
+    function: Callable[[np.ndarray], np.ndarray], p: np.ndarray, steps: Sequence[float]
+) -> list[np.ndarray]:
     """Derivative of a function with respect to each of its parameters."""
     return [(function(p + h) - function(p - h)) / (2 * h.sum()) for h in np.diag(steps)]
 
@@ -131,8 +132,10 @@ class AxisModel:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters: those of the base model, then those of the effects."""
-        return (*(name for name, _ in self.base), *(f"{p.name}@{one.label}" for one in self.effects
-                                                    for p in one.parameters))
+        return (
+            *(name for name, _ in self.base),
+            *(f"{p.name}@{one.label}" for one in self.effects for p in one.parameters),
+        )
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -162,8 +165,11 @@ class AxisModel:
         """The model without one of its effects."""
         parts = split(self.values, self.effects, len(self.base))
         kept = [k for k, one in enumerate(self.effects) if one.label != label]
-        return replace(self, effects=tuple(self.effects[k] for k in kept),
-                       values=np.concatenate([self.values[:len(self.base)], *(parts[k] for k in kept)]))
+        return replace(
+            self,
+            effects=tuple(self.effects[k] for k in kept),
+            values=np.concatenate([self.values[: len(self.base)], *(parts[k] for k in kept)]),
+        )
 
     def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         """Predicted outputs on the lines of a block, and their derivatives."""
@@ -187,17 +193,22 @@ class MassModel(AxisModel):
 
     def _force(self, one: Effect, p: np.ndarray, block: SpectralBlock) -> tuple[np.ndarray, np.ndarray]:
         """(shapes, n, 3) forces of an effect on the lines of a block, and their linear parts (shapes, n)."""
-        by = tuple(map(float, p[len(one.shapes):]))
+        by = tuple(map(float, p[len(one.shapes) :]))
         own = np.array([self.lines.pick(self.lines.of(shape, by), block.name) for shape in one.shapes])
         if self.lines.solves_for == "force" or one.location == "input":
             return own, np.zeros(own.shape[:2])
-        return own, np.array([alpha + 1j * beta * block.omega for alpha, beta in (self.lines.linear_part(shape, by)
-                                                                                  for shape in one.shapes)])
+        return own, np.array(
+            [
+                alpha + 1j * beta * block.omega
+                for alpha, beta in (self.lines.linear_part(shape, by) for shape in one.shapes)
+            ]
+        )
 
     def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
         n, s, around = len(self.base), 1j * block.omega, self.lines.around(block.omega)
-        A, V, Q, F = (self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q,
-                                                                   self.lines.F))
+        A, V, Q, F = (
+            self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q, self.lines.F)
+        )
         regressors, several = (A, V, Q)[:n], split(self.values, self.effects, n)
         Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:n]))
         R = sum(x * one for x, one in zip(self.values, regressors, strict=False))
@@ -205,7 +216,7 @@ class MassModel(AxisModel):
         for one, p in zip(self.effects, several, strict=True):
             if one.shapes:
                 own, linear = forces[one.label] = self._force(one, p, block)
-                R, Z = R + np.tensordot(p[:len(own)], own, 1), Z + p[:len(own)] @ linear
+                R, Z = R + np.tensordot(p[: len(own)], own, 1), Z + p[: len(own)] @ linear
             if one.dynamics:
                 Z, R = Z + one.dynamics(s, p), R + one.dynamics(around, p) * Q
             if one.path:
@@ -217,32 +228,36 @@ class MassModel(AxisModel):
             return Prediction(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
-            return -summed(column) / D - (0.0 if drive else f / D ** 2 * z)
+            return -summed(column) / D - (0.0 if drive else f / D**2 * z)
+
         dY = [force(one, s ** (2 - k)) for k, one in enumerate(regressors)]
         for one, p in zip(self.effects, several, strict=True):
-            c = p[:len(one.shapes)]
+            c = p[: len(one.shapes)]
             if one.shapes:
                 dY += [force(*both) for both in zip(*forces[one.label], strict=True)]
-            for h in np.diag(p * [q.step for q in one.parameters])[len(c):] if one.shapes else ():
+            for h in np.diag(p * [q.step for q in one.parameters])[len(c) :] if one.shapes else ():
                 up, down = (self._force(one, p + step, block) for step in (h, -h))
                 dY.append(force(*(np.tensordot(c, a - b, 1) / (2 * h.sum()) for a, b in zip(up, down, strict=True))))
             if one.dynamics:
-                dY += [force(slope * Q, z) for slope, z in zip(slopes(one.dynamics, around, p),
-                                                              slopes(one.dynamics, s, p), strict=True)]
+                dY += [
+                    force(slope * Q, z)
+                    for slope, z in zip(slopes(one.dynamics, around, p), slopes(one.dynamics, s, p), strict=True)
+                ]
             if one.path:
                 dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
-                dY += [summed(slope * F) / D + (f / D ** 2 * slope[:, 1] if drive else 0.0) for slope in dP]
+                dY += [summed(slope * F) / D + (f / D**2 * slope[:, 1] if drive else 0.0) for slope in dP]
         return Prediction(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 
 def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:
     """Priors of the base parameters, wide enough to have no influence: a factor of e, or as much as the whole
     response."""
-    v = model.values[:len(model.base)]
+    v = model.values[: len(model.base)]
     size = sizes(model, list(range(len(v))))
     up = np.asarray(positive, bool)
-    return Priors(tuple(name for name, _ in model.base), np.where(up, v, 0.0),
-                  np.where(up, settings.shape_spread, size), up)
+    return Priors(
+        tuple(name for name, _ in model.base), np.where(up, v, 0.0), np.where(up, settings.shape_spread, size), up
+    )
 
 
 def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
@@ -262,6 +277,11 @@ def effect_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors
     n = len(one.parameters)
     start, linear = model.values[-n:], np.array([p.linear for p in one.parameters], bool)
     size = sizes(model, list(range(len(model.values) - n, len(model.values))))
-    return Priors(tuple(f"{p.name}@{one.label}" for p in one.parameters), np.where(linear, 0.0, start),
-                  np.where(linear, size, settings.shape_spread), ~linear, np.array([p.low for p in one.parameters]),
-                  np.array([p.high for p in one.parameters]))
+    return Priors(
+        tuple(f"{p.name}@{one.label}" for p in one.parameters),
+        np.where(linear, 0.0, start),
+        np.where(linear, size, settings.shape_spread),
+        ~linear,
+        np.array([p.low for p in one.parameters]),
+        np.array([p.high for p in one.parameters]),
+    )

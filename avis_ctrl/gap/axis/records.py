@@ -70,7 +70,8 @@ def _finer(x: np.ndarray, over: int, rate: float) -> tuple[np.ndarray, np.ndarra
     s = 2j * np.pi * rate * np.arange(len(X)) / (2 * (n - 1))
 
     def at_all(X: np.ndarray) -> np.ndarray:
-        return over * fft.irfft(X, over * 2 * (n - 1))[:over * n]
+        return over * fft.irfft(X, over * 2 * (n - 1))[: over * n]
+
     return at_all(X) + x[0] + slope * t, at_all(s * X) + slope * rate
 
 
@@ -105,8 +106,15 @@ class Lines:
     InputError : records that are too short for the band.
     """
 
-    def __init__(self, records: Sequence[Signals], rate: float, solves_for: str, band_Hz: tuple[float, float],
-                 smooth_Hz: float | None = None, settings: AxisSettings = SETTINGS):
+    def __init__(
+        self,
+        records: Sequence[Signals],
+        rate: float,
+        solves_for: str,
+        band_Hz: tuple[float, float],
+        smooth_Hz: float | None = None,
+        settings: AxisSettings = SETTINGS,
+    ):
         self.rate, self.solves_for, self.settings, self.smooth_Hz = rate, solves_for, settings, smooth_Hz
         self.records = list(records)
         # With several records, whole records are held out.
@@ -119,9 +127,12 @@ class Lines:
         inside = (f >= band_Hz[0]) & (f <= min(band_Hz[1], 0.45 * rate))
         self.k = _thinned(k[inside], f[inside], settings)
         if len(self.k) < settings.fewest_lines // 4:
-            raise InputError(f"expected at least {settings.fewest_lines // 4} lines of the band in each of "
-                             f"{settings.spans * settings.segments} segments: a longer record or a wider band",
-                             field="samples", value=shortest)
+            raise InputError(
+                f"expected at least {settings.fewest_lines // 4} lines of the band in each of "
+                f"{settings.spans * settings.segments} segments: a longer record or a wider band",
+                field="samples",
+                value=shortest,
+            )
         # The mean of a window is a line too, at a frequency close to zero.
         self.s = 2j * np.pi * np.maximum(self.k, 1e-3) * rate / self.length
         self.starts: list[np.ndarray] = []
@@ -137,8 +148,9 @@ class Lines:
         self.linear: dict[Hashable, tuple[Shape, tuple[float, float]]] = {}
         self.picked: dict[Hashable, tuple[Sequence[np.ndarray], np.ndarray]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
-        self.Q, self.V, self.A = ([self.transform(one.position, i, order) for i, one in enumerate(self.records)]
-                                  for order in range(3))
+        self.Q, self.V, self.A = (
+            [self.transform(one.position, i, order) for i, one in enumerate(self.records)] for order in range(3)
+        )
         self.Y = [one.sum(axis=2) for one in (self.F if solves_for == "force" else self.Q)]
         self.rows: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.fitted, self.held = self._data(False), self._data(True)
@@ -164,15 +176,21 @@ class Lines:
             return signal.sosfiltfilt(signal.butter(4, 2 * self.smooth_Hz / self.rate, output="sos"), x)
 
         q, v = _finer(smooth(one.position), over, self.rate)
-        return Motion(q, v, _finer(one.force, over, self.rate)[0], float((q.max() + q.min()) / 2), float(np.std(q)),
-                      float(np.sqrt(np.mean(v ** 2))))
+        return Motion(
+            q,
+            v,
+            _finer(one.force, over, self.rate)[0],
+            float((q.max() + q.min()) / 2),
+            float(np.std(q)),
+            float(np.sqrt(np.mean(v**2))),
+        )
 
     def transform(self, x: np.ndarray, record: int, order: int = 0) -> np.ndarray:
         """(segments, k, 3) terms of the windowed derivative of a signal, given at the sample rate or at the finer rate
         of the motion."""
         over = round(len(x) / len(self.records[record].force))
         starts, length = self.starts[record] * over, self.length * over
-        X = np.fft.rfft(np.stack([x[a:a + length] for a in starts]), axis=1) / length
+        X = np.fft.rfft(np.stack([x[a : a + length] for a in starts]), axis=1) / length
         at = self.k[:, None] + np.array([-1, 0, 1])
         lines = np.where(at < 0, X[:, np.abs(at)].conj(), X[:, np.abs(at)])
         return np.array([-0.25, 0.5, -0.25]) * (2j * np.pi * at * self.rate / self.length) ** order * lines
@@ -185,8 +203,10 @@ class Lines:
         """(segments, k, 3) by record: a function of the motion with shape parameters `by`; computed once."""
         key = id(shape), by
         if key not in self.kept:
-            self.kept[key] = shape, [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i)
-                                     for i, m in enumerate(self.motion)]
+            self.kept[key] = (
+                shape,
+                [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i) for i, m in enumerate(self.motion)],
+            )
         return self.kept[key][1]
 
     def linear_part(self, shape: Shape, by: tuple[float, ...] = ()) -> tuple[float, float]:
@@ -234,15 +254,18 @@ class Lines:
             self.rows[name] = tuple(np.array(at)[inside].T)
             omega = np.tile(self.s.imag, int(inside.sum()))
             Y = self.pick(self.Y, name)[:, None, None]
-            blocks.append(SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y).with_noise(
-                floor_of(omega, Y, self.settings)))
-            levels.append(float(2.0 ** one * loud.max()))
+            blocks.append(
+                SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y).with_noise(
+                    floor_of(omega, Y, self.settings)
+                )
+            )
+            levels.append(float(2.0**one * loud.max()))
         return Data(tuple(blocks), tuple(levels))
 
 
 def floor_of(omega: np.ndarray, Y: np.ndarray, settings: AxisSettings) -> np.ndarray:
     """(n, 1, 1) minimum noise variance of every line."""
-    return np.full((len(omega), 1, 1), settings.floor ** 2 * float(np.mean(np.abs(Y) ** 2)))
+    return np.full((len(omega), 1, 1), settings.floor**2 * float(np.mean(np.abs(Y) ** 2)))
 
 
 def _thinned(k: np.ndarray, f: np.ndarray, settings: AxisSettings) -> np.ndarray:

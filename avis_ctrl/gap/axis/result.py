@@ -62,16 +62,33 @@ class AxisGap:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data in the shape of the contract's gap.json; numbers that are not finite become None."""
-        remaining = {"nrmse": number(self.stages[-1].nrmse), "over_noise": number(self.over_noise),
-                     "share": number(self.share_left), "where": list(self.where), "grows_with_level": None}
-        return {"format": "avis-gap-axis", "version": 2, "kind": self.kind, "verdict": self.verdict,
-                "effects": [one.to_json() for one in self.effects], "traces": [one.to_json() for one in self.traces],
-                "gap": [{"stage": one.name, "nrmse": number(one.nrmse), "chi2_per_dof": number(one.chi2_per_dof)}
-                        for one in self.stages],
-                "where": list(self.where), "remaining": remaining, "next_experiment": self.next_experiment,
-                "base_parameters": _plain(self.parameters), "ratios": _plain(self.ratios),
-                "runners_up": [vars(one) for one in self.runners_up], "sentences": list(self.sentences),
-                "seconds": round(self.seconds, 2)}
+        remaining = {
+            "nrmse": number(self.stages[-1].nrmse),
+            "over_noise": number(self.over_noise),
+            "share": number(self.share_left),
+            "where": list(self.where),
+            "grows_with_level": None,
+        }
+        return {
+            "format": "avis-gap-axis",
+            "version": 2,
+            "kind": self.kind,
+            "verdict": self.verdict,
+            "effects": [one.to_json() for one in self.effects],
+            "traces": [one.to_json() for one in self.traces],
+            "gap": [
+                {"stage": one.name, "nrmse": number(one.nrmse), "chi2_per_dof": number(one.chi2_per_dof)}
+                for one in self.stages
+            ],
+            "where": list(self.where),
+            "remaining": remaining,
+            "next_experiment": self.next_experiment,
+            "base_parameters": _plain(self.parameters),
+            "ratios": _plain(self.ratios),
+            "runners_up": [vars(one) for one in self.runners_up],
+            "sentences": list(self.sentences),
+            "seconds": round(self.seconds, 2),
+        }
 
 
 def _plain(several: Mapping[str, Reported]) -> dict[str, Any]:

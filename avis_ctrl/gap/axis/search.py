@@ -57,8 +57,9 @@ class Explored:
 
     def base(self, model: AxisModel, priors: Priors) -> Fitted:
         """The fit without effects."""
-        found = fit(model, priors, priors.z(model.values), self.data, first_variances(self.data, self.settings),
-                    self.settings)
+        found = fit(
+            model, priors, priors.z(model.values), self.data, first_variances(self.data, self.settings), self.settings
+        )
         self.fits[frozenset()] = found
         return found
 
@@ -133,7 +134,7 @@ def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.nda
     model = now.model.with_effect(one, seed)
     rows = []
     for block, L in zip(data.blocks, now.weights.L, strict=True):
-        dY = model.columns(block)[-len(seed):]
+        dY = model.columns(block)[-len(seed) :]
         rows.append(as_real(whitened(L[:, None], dY)))
     C = now.weights.flatten(np.concatenate(rows, axis=1))
     linear = np.array([p.linear for p in one.parameters], bool)
@@ -153,7 +154,7 @@ def shortlist(found: Sequence[Candidate], residual: np.ndarray, settings: AxisSe
         if reduced > a.reduction + b.reduction + 2 * settings.certain:
             pairs.append(Candidate((*a.effects, *b.effects), reduced, C))
     pairs.sort(key=lambda c: -c.reduction)
-    return [*singles[:settings.refits], *pairs[:settings.pairs]]
+    return [*singles[: settings.refits], *pairs[: settings.pairs]]
 
 
 def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
@@ -177,8 +178,11 @@ def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress
         best = max(tried, key=lambda one: explored.score(one) - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
             best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
-        if best is now or explored.score(best) <= explored.score(now) or (
-                explored.held_out(best) <= explored.held_out(now)):
+        if (
+            best is now
+            or explored.score(best) <= explored.score(now)
+            or (explored.held_out(best) <= explored.held_out(now))
+        ):
             revisions += 1
             best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
@@ -196,7 +200,7 @@ def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_on
         laws = [one for one in effects if one.key == own.key]
         found = candidates(rest, explored.data, laws if laws_only else effects)
         least = 0.5 * settings.not_far_behind * max(c.reduction for c in found if c.effects[0][0].key == own.key)
-        for c in found[:settings.starts + len(laws)]:
+        for c in found[: settings.starts + len(laws)]:
             if c.reduction < least:
                 break
             one = explored.with_effects(rest, c.effects)
@@ -260,7 +264,7 @@ def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effec
     mine = next((c for c in found if c.effects[0][0].label == label), None)
     least = 0.5 * mine.reduction if mine is not None else 0.0
     known: list[Rival] = []
-    for c in found[:2 * settings.refits]:
+    for c in found[: 2 * settings.refits]:
         effect = c.effects[0][0]
         if effect.key == own.key or c.reduction < settings.not_far_behind * least:
             continue
@@ -288,7 +292,7 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> Cells:
         determinant[at] = weights.log_determinants[group] / len(at)
     octave = 0 * rows.segment if held else np.floor(np.log2(rows.frequency)).astype(int)
     places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
-    count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e ** 2, determinant))
+    count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e**2, determinant))
     louder = np.maximum(e2 / count, 1.0) if held else np.ones(len(e2))
     residual = e2 / louder + count * np.log(louder)
     return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (residual + rest), strict=True)}
@@ -319,9 +323,11 @@ def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
     rows = row_table(fitted, fitted.model.lines.fitted)
     information = np.sum(fitted.J[[fitted.priors.names.index(name) for name in names]] ** 2, axis=0)
     found = []
-    for values, words in ((rows.frequency, ("the lower part of the band", "the upper part of the band")),
-                          (rows.when, ("the first half of the record", "the second half of the record")),
-                          (rows.level, ("low levels", "high levels"))):
+    for values, words in (
+        (rows.frequency, ("the lower part of the band", "the upper part of the band")),
+        (rows.when, ("the first half of the record", "the second half of the record")),
+        (rows.level, ("low levels", "high levels")),
+    ):
         order = np.argsort(values, kind="stable")
         middle = values[order][np.searchsorted(np.cumsum(information[order]), information.sum() / 2)]
         below = values <= middle
@@ -335,7 +341,8 @@ def robust(fitted: Fitted) -> np.ndarray:
     (1986) 13), which allows any correlation within a segment. No variance is below that of the fit."""
     segment, slope = row_table(fitted, fitted.model.lines.fitted).segment, fitted.priors.slopes(fitted.z)
     groups = np.unique(segment)
-    scores = np.array([fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups)
-                       for one in groups])
+    scores = np.array(
+        [fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups) for one in groups]
+    )
     P, few = fitted.covariance, len(groups) / max(len(groups) - 1, 1)
     return not_below(few * P @ (scores.T @ scores) @ P, P) * np.outer(slope, slope)

@@ -66,8 +66,10 @@ class SensorModel(AxisModel):
         H = [np.asarray(model[kind], complex) for kind in c.names]
         for one, p in zip(self.effects, split(values, self.effects, base), strict=True):
             assert one.channel is not None
-            H = [h * one.channel(s, p) if one.location in (kind, "drive") else h
-                 for kind, h in zip(c.names, H, strict=True)]
+            H = [
+                h * one.channel(s, p) if one.location in (kind, "drive") else h
+                for kind, h in zip(c.names, H, strict=True)
+            ]
         found = np.log(np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1) / c.measured[rows])
         parts = 1 + np.stack([found.real, found.imag], axis=2).reshape(len(rows), -1)
         return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
@@ -81,13 +83,18 @@ class SensorModel(AxisModel):
         if not derivative:
             return Prediction(Y[:, :, None], np.empty((0, *Y.shape, 1)))
         least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
-        dY = central_differences(partial(self._predicted, rows), self.values,
-                                 np.maximum(1e-5 * np.abs(self.values), least))
+        dY = central_differences(
+            partial(self._predicted, rows), self.values, np.maximum(1e-5 * np.abs(self.values), least)
+        )
         return Prediction(Y[:, :, None], np.array(dY)[..., None])
 
 
-def seismometer(responses: Responses, distortion: np.ndarray | None = None, ratio_variance: np.ndarray | None = None,
-                settings: AxisSettings = SETTINGS) -> Problem:
+def seismometer(
+    responses: Responses,
+    distortion: np.ndarray | None = None,
+    ratio_variance: np.ndarray | None = None,
+    settings: AxisSettings = SETTINGS,
+) -> Problem:
     """Problem of a seismometer driven by its calibration coil.
 
     Parameters
@@ -103,8 +110,11 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     f = np.asarray(responses.frequency_Hz, float)
     n, least = len(f), settings.frequencies
     if n < least or "ground" in responses.value:
-        raise InputError(f"expected coil, displacement or both at {least} frequencies or more", field="responses",
-                         value=(n, sorted(responses.value)))
+        raise InputError(
+            f"expected coil, displacement or both at {least} frequencies or more",
+            field="responses",
+            value=(n, sorted(responses.value)),
+        )
     names = tuple(kind for kind in ("coil", "displacement") if kind in responses.value)
     h = np.zeros(n) if distortion is None else np.asarray(distortion, float).ravel()
     if h.shape != (n,) or not np.all(np.isfinite(h)) or np.any(h < 0):
@@ -115,9 +125,13 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     both = sum(relative.values()) if ratio_variance is None else np.asarray(ratio_variance)
     n -= n % 2
     measured = np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1)[:n]
-    measured_noise, noise = (np.repeat(np.maximum(one[::2] + one[1::2], settings.floor ** 2), 2, axis=1)
-                             for one in (np.stack([relative[names[0]] + harmonic, *([both] if len(H) > 1 else [])],
-                                                  axis=1)[:n] / 2 for harmonic in (0.0, h ** 2)))
+    measured_noise, noise = (
+        np.repeat(np.maximum(one[::2] + one[1::2], settings.floor**2), 2, axis=1)
+        for one in (
+            np.stack([relative[names[0]] + harmonic, *([both] if len(H) > 1 else [])], axis=1)[:n] / 2
+            for harmonic in (0.0, h**2)
+        )
+    )
     # A nonlinear mass scatters by as much as its harmonics contain, in addition to the scatter at all frequencies.
     spread = np.sqrt(1 + (h[:n] / max(float(np.median(h)), 1e-12)) ** 2)
     spread = np.sqrt(spread[::2] * spread[1::2])
@@ -129,23 +143,35 @@ def seismometer(responses: Responses, distortion: np.ndarray | None = None, rati
     for name, inside in (("fitted", ~inner), ("held out", inner)):
         at = rows[name] = pairs[inside]
         Y = np.full(2 * len(names), 1 + 1j) / spread[at][:, None]
-        block = SpectralBlock(name, 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1]), np.zeros((len(at), 0, 1)),
-                              Y[:, :, None])
+        block = SpectralBlock(
+            name, 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1]), np.zeros((len(at), 0, 1)), Y[:, :, None]
+        )
         data[name] = Data((block.with_noise(noise[at][:, :, None] * np.eye(2 * len(names))),), (1.0,))
     lines = Channels(f, measured, spread, names, data["fitted"], data["held out"], rows, settings)
     units = dict(zip(start.names, start.information.units, strict=True))
     model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
     positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
-    notes = [f"The highest of the {len(f)} frequencies, {f[-1]:.4g} Hz, is not used: they are evaluated in pairs."
-             ] if n < len(f) else []
+    notes = (
+        [f"The highest of the {len(f)} frequencies, {f[-1]:.4g} Hz, is not used: they are evaluated in pairs."]
+        if n < len(f)
+        else []
+    )
     if np.any(h):
-        notes.append(f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the "
-                     "mass itself is nonlinear, which no effect of a channel holds.")
+        notes.append(
+            f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the "
+            "mass itself is nonlinear, which no effect of a channel holds."
+        )
     outputs = " and ".join(names)
     power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
-    return Problem("seismometer", model, positive, sensor_effects(f, names),
-                   float(np.sum(measured_noise[rows["held out"]])) / power,
-                   {"F": "", "x": "", "input": "drive", "output": outputs}, notes=tuple(notes))
+    return Problem(
+        "seismometer",
+        model,
+        positive,
+        sensor_effects(f, names),
+        float(np.sum(measured_noise[rows["held out"]])) / power,
+        {"F": "", "x": "", "input": "drive", "output": outputs},
+        notes=tuple(notes),
+    )
 
 
 HIGHER = "higher frequencies: the phase of a delay stays proportional to them, that of a pole bends"
@@ -164,31 +190,71 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
         # A mode of damping ratio 0.87 has the phase of a delay to fourth order; a real mount does not.
         damping = mode(p)["damping"][0]
         return f"a mount with a damping of {damping:.2g} is none" if damping > LARGEST_MODE_DAMPING else ""
+
     for place in ("drive", *reversed(channels)) if len(channels) > 1 else channels:
         what = f"of the {place}"
         found += [
             # No channel can lead; the drive's column may have been logged late.
-            Effect("delay", place, f"a pure delay {what}", (
-                Parameter("delay_s", "s", -longest if place == "drive" else 0.0, longest),), HIGHER,
-                   channel=lambda s, p: np.exp(-s * p[0])),
-            Effect("first_order_lag", place, f"a first-order lag {what}",
-                   (Parameter("time_constant_s", "s", 0.0, longest),), HIGHER, channel=lambda s, p: 1 / (1 + s * p[0])),
-            Effect("mechanical_mode", place, f"a mechanical mode {what}", (
-                Parameter("lag_s", "s", 0.0),
-                Parameter("inverse_square_s2", "s^2", 0.0, (2 * np.pi * 1.05 * top) ** -2)),
+            Effect(
+                "delay",
+                place,
+                f"a pure delay {what}",
+                (Parameter("delay_s", "s", -longest if place == "drive" else 0.0, longest),),
+                HIGHER,
+                channel=lambda s, p: np.exp(-s * p[0]),
+            ),
+            Effect(
+                "first_order_lag",
+                place,
+                f"a first-order lag {what}",
+                (Parameter("time_constant_s", "s", 0.0, longest),),
+                HIGHER,
+                channel=lambda s, p: 1 / (1 + s * p[0]),
+            ),
+            Effect(
+                "mechanical_mode",
+                place,
+                f"a mechanical mode {what}",
+                (
+                    Parameter("lag_s", "s", 0.0),
+                    Parameter("inverse_square_s2", "s^2", 0.0, (2 * np.pi * 1.05 * top) ** -2),
+                ),
                 "frequencies up to the mode, where the magnitude rises",
-                channel=lambda s, p: 1 / (1 + p[0] * s + p[1] * s ** 2), derived=mode, implausible=heavy),
-            Effect("highpass", place, f"a first-order high-pass (AC coupling) {what}",
-                   (Parameter("corner_Hz", "Hz", 0.0, 10 * low),), "lower frequencies",
-                   channel=lambda s, p: s / (s + 2 * np.pi * p[0]))]
+                channel=lambda s, p: 1 / (1 + p[0] * s + p[1] * s**2),
+                derived=mode,
+                implausible=heavy,
+            ),
+            Effect(
+                "highpass",
+                place,
+                f"a first-order high-pass (AC coupling) {what}",
+                (Parameter("corner_Hz", "Hz", 0.0, 10 * low),),
+                "lower frequencies",
+                channel=lambda s, p: s / (s + 2 * np.pi * p[0]),
+            ),
+        ]
     if "displacement" in channels:
-        found.append(Effect("crosstalk", "displacement", "a share of the velocity in the displacement channel",
-                            (Parameter("share_s", "s", -longest, longest),), "the magnitude at higher frequencies",
-                            channel=lambda s, p: 1 + s * p[0]))
+        found.append(
+            Effect(
+                "crosstalk",
+                "displacement",
+                "a share of the velocity in the displacement channel",
+                (Parameter("share_s", "s", -longest, longest),),
+                "the magnitude at higher frequencies",
+                channel=lambda s, p: 1 + s * p[0],
+            )
+        )
     z = 1 / (2 * np.pi * np.sqrt(low * top))
-    found.append(Effect("other_dynamics", "drive", "other dynamics of the mass itself",
-                        tuple(Parameter(f"c{k}", "1") for k in range(4)), channel=lambda s, p: 1 + sum(
-                            c * (s * z) ** (k + 1) for k, c in enumerate(p)) / (1 + np.abs(s * z) ** 4), outside=True))
+    found.append(
+        Effect(
+            "other_dynamics",
+            "drive",
+            "other dynamics of the mass itself",
+            tuple(Parameter(f"c{k}", "1") for k in range(4)),
+            channel=lambda s, p: 1 + sum(c * (s * z) ** (k + 1) for k, c in enumerate(p)) / (1 + np.abs(s * z) ** 4),
+            outside=True,
+        )
+    )
     return found
 
 
@@ -201,9 +267,12 @@ def of_sines(records: Sequence[SineRecord], measured: Sequence[str], driven: str
     """
     used = distinct(records)
     if len(used) < SETTINGS.frequencies:
-        raise ComputationError("too few sine records", measured=f"{len(used)} usable frequencies",
-                               cause="records refused or columns mapped wrongly",
-                               next_step=f"map the columns; give at least {SETTINGS.frequencies} frequencies")
+        raise ComputationError(
+            "too few sine records",
+            measured=f"{len(used)} usable frequencies",
+            cause="records refused or columns mapped wrongly",
+            next_step=f"map the columns; give at least {SETTINGS.frequencies} frequencies",
+        )
     at = [used[0].channels.index(role) for role in measured]
     # Distortion in every channel is that of the motion; in one channel alone it is its own noise or hum.
     distortion = np.array([min(float(np.sqrt(np.sum(record.harmonics[j] ** 2))) for j in at) for record in used])

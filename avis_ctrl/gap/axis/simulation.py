@@ -26,14 +26,20 @@ def predicted(model: Mapping[str, Any], which: str, record: Signals, rate: float
     """
     kind, own = str(model["kind"]), model[which]
     if kind not in ("drive", "oscillator"):
-        raise InputError("expected a drive or an oscillator: other kinds are responses, which predict no record",
-                         field="kind", value=kind)
+        raise InputError(
+            "expected a drive or an oscillator: other kinds are responses, which predict no record",
+            field="kind",
+            value=kind,
+        )
     scale = Scale(**{**model["scale"], "pitches": tuple(model["scale"]["pitches"])})
     library = {one.label: one for one in (drive_effects if kind == "drive" else oscillator_effects)(scale)}
     strange = [one["label"] for one in own["effects"] if one["label"] not in library]
     if strange:
-        raise InputError("expected effects of the library: an effect of the user's own is not in the model file",
-                         field="effects", value=strange)
+        raise InputError(
+            "expected effects of the library: an effect of the user's own is not in the model file",
+            field="effects",
+            value=strange,
+        )
     effects = [(library[one["label"]], np.array(one["values"])) for one in own["effects"]]
     if kind == "drive":
         return _force(own["base"], effects, record, rate, float(model["cutoff_Hz"]))
@@ -57,8 +63,13 @@ def _shaped(one: Effect, p: np.ndarray, motion: Motion) -> np.ndarray:
     return sum((c * shape(motion, *p[n:]) for c, shape in zip(p[:n], one.shapes, strict=True)), np.zeros_like(motion.q))
 
 
-def _force(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray]], record: Signals, rate: float,
-           cutoff_Hz: float) -> np.ndarray:
+def _force(
+    base: Mapping[str, float],
+    effects: Sequence[tuple[Effect, np.ndarray]],
+    record: Signals,
+    rate: float,
+    cutoff_Hz: float,
+) -> np.ndarray:
     lines = Lines([record], rate, "force", (0.0, cutoff_Hz), cutoff_Hz, SETTINGS)
     motion, over = lines.motion[0], lines.over
     s = _lines(len(motion.q), over * rate)
@@ -74,8 +85,9 @@ def _force(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray
     return signal.sosfiltfilt(low, found)[::over]
 
 
-def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray]], record: Signals, rate: float,
-            scale: Scale) -> np.ndarray:
+def _motion(
+    base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarray]], record: Signals, rate: float, scale: Scale
+) -> np.ndarray:
     """Runge-Kutta integration from the measured initial state; static forces are interpolated from a table."""
     over, u = 2 * SETTINGS.oversampled, record.force
     for one, p in effects:
@@ -96,18 +108,47 @@ def _motion(base: Mapping[str, float], effects: Sequence[tuple[Effect, np.ndarra
         elif one.location != "input":
             table = table + _shaped(one, p, flat)
     start = np.array([record.position[0], (record.position[1] - record.position[0]) * rate])
-    found = _integrated(fine, over, len(record.force), 1 / (rate * over), base["m"], base["d"], base["k"],
-                        table.reshape(q.shape), reach, speed, slip, sprung, start)
+    found = _integrated(
+        fine,
+        over,
+        len(record.force),
+        1 / (rate * over),
+        base["m"],
+        base["d"],
+        base["k"],
+        table.reshape(q.shape),
+        reach,
+        speed,
+        slip,
+        sprung,
+        start,
+    )
     if not np.all(np.isfinite(found)):
-        raise ComputationError("the motion diverges", measured=f"record {record.name}", cause="an input beyond the "
-                               "levels that the model was fitted to", next_step="predict a record of the same level")
+        raise ComputationError(
+            "the motion diverges",
+            measured=f"record {record.name}",
+            cause="an input beyond the levels that the model was fitted to",
+            next_step="predict a record of the same level",
+        )
     return found
 
 
 @numba.njit(cache=True)
-def _integrated(u: np.ndarray, over: int, n: int, h: float, m: float, d: float, k: float, table: np.ndarray,
-                reach: float, speed: float, slip: np.ndarray, sprung: np.ndarray, start: np.ndarray
-                ) -> np.ndarray:  # pragma: no cover
+def _integrated(
+    u: np.ndarray,
+    over: int,
+    n: int,
+    h: float,
+    m: float,
+    d: float,
+    k: float,
+    table: np.ndarray,
+    reach: float,
+    speed: float,
+    slip: np.ndarray,
+    sprung: np.ndarray,
+    start: np.ndarray,
+) -> np.ndarray:  # pragma: no cover
     x = np.zeros(5)  # q, v, displacement and velocity of the sprung mass, state of the friction
     x[0], x[1], x[2], x[3] = start[0], start[1], start[0], start[1]
     found = np.empty(n)
@@ -124,8 +165,9 @@ def _integrated(u: np.ndarray, over: int, n: int, h: float, m: float, d: float, 
                 b = min(max((z[1] / speed + 1) / 2 * last, 0.0), last - 1e-9)
                 ia, ib = int(a), int(b)
                 fa, fb = a - ia, b - ib
-                force = ((1 - fa) * ((1 - fb) * table[ia, ib] + fb * table[ia, ib + 1])
-                         + fa * ((1 - fb) * table[ia + 1, ib] + fb * table[ia + 1, ib + 1]))
+                force = (1 - fa) * ((1 - fb) * table[ia, ib] + fb * table[ia, ib + 1]) + fa * (
+                    (1 - fb) * table[ia + 1, ib] + fb * table[ia + 1, ib + 1]
+                )
                 w, pull = sprung[1], 0.0
                 if sprung[0] > 0:
                     pull = 2 * sprung[2] * w * (z[1] - z[3]) + w * w * (z[0] - z[2])

@@ -42,23 +42,57 @@ class AttachedOscillator(AtPoint):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         mass = model.rig.mounted_body().mass
-        frequency = EffectParameter("frequency_Hz", "Hz", "of the mass on its spring", 0.0, 0.3, 300.0, 10.0, False,
-                                    tuple(np.geomspace(*SETTINGS.attached_Hz)))
+        frequency = EffectParameter(
+            "frequency_Hz",
+            "Hz",
+            "of the mass on its spring",
+            0.0,
+            0.3,
+            300.0,
+            10.0,
+            False,
+            tuple(np.geomspace(*SETTINGS.attached_Hz)),
+        )
         damping = EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 2.0, 0.05, False, (0.05,), True)
         own = EffectParameter("mass_kg", "kg", "sprung mass", 0.0, 0.0, mass, 0.01 * mass)
         variant = place.partition("/")[2]
         if variant == "oblique":
             most = float(np.sqrt(mass))
-            root = [EffectParameter(f"along_{axis}", "sqrt(kg)", f"root of the mass times its direction's {axis}", 0.0,
-                                    -most, most, 0.1 * most) for axis in "xyz"]
+            root = [
+                EffectParameter(
+                    f"along_{axis}",
+                    "sqrt(kg)",
+                    f"root of the mass times its direction's {axis}",
+                    0.0,
+                    -most,
+                    most,
+                    0.1 * most,
+                )
+                for axis in "xyz"
+            ]
             # The position along the line of action has no effect, so it may end at a bound.
             return (*root, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant in THREE_AXES:
-            each = [replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
-                    for axis in "xyz"]
-            turns = [EffectParameter(f"turn_{axis}", "rad", f"{axis} component of the rotation vector of its axes", 0.0,
-                                     -LIBRARY.most_turned, LIBRARY.most_turned, 0.3, False, (0.0,), True)
-                     for axis in "xyz" if variant == "turned"]
+            each = [
+                replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
+                for axis in "xyz"
+            ]
+            turns = [
+                EffectParameter(
+                    f"turn_{axis}",
+                    "rad",
+                    f"{axis} component of the rotation vector of its axes",
+                    0.0,
+                    -LIBRARY.most_turned,
+                    LIBRARY.most_turned,
+                    0.3,
+                    False,
+                    (0.0,),
+                    True,
+                )
+                for axis in "xyz"
+                if variant == "turned"
+            ]
             return (own, *each, damping, *self.position(), *turns)
         across = [one for one in self.position() if len(variant) > 1 or one.name != f"{variant}_m"]
         return (own, frequency, damping, *across)
@@ -96,8 +130,9 @@ class AttachedOscillator(AtPoint):
         frequencies = (*np.geomspace(grid[0], grid[-1], count), SETTINGS.stiff_Hz)
         others = [k for k in range(3) if k != first]
         points = place_of(values) + np.outer(np.linspace(-LIBRARY.reach_m, LIBRARY.reach_m, 25), a / np.sqrt(mass))
-        pair, point = _along_the_others(score, values["damping"], frequencies, points,
-                                        "".join("xyz"[k] for k in others))
+        pair, point = _along_the_others(
+            score, values["damping"], frequencies, points, "".join("xyz"[k] for k in others)
+        )
         frequency = np.full(3, values["frequency_Hz"])
         frequency[others] = pair
         return [("payload/axes", tuple(map(float, (mass, *frequency, values["damping"], *point))))]
@@ -117,8 +152,12 @@ class AttachedOscillator(AtPoint):
         if not np.any(along(values)):
             return found
         line = reported_line(values, covariance, "mass_kg", "kg")
-        return {"mass_kg": line.pop("mass_kg"), "frequency_Hz": found["frequency_Hz"], "damping": found["damping"],
-                **line}
+        return {
+            "mass_kg": line.pop("mass_kg"),
+            "frequency_Hz": found["frequency_Hz"],
+            "damping": found["damping"],
+            **line,
+        }
 
 
 def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]]:
@@ -131,8 +170,14 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
     if variant == "turned":
         rows = Rotation.from_rotvec([values[f"turn_{axis}"] for axis in "xyz"]).as_matrix().T @ rows
     axes = "xyz" if variant in THREE_AXES else variant
-    return [(rows["xyz".index(axis)], values["mass_kg"],
-             values[f"frequency_{axis}_Hz" if variant in THREE_AXES else "frequency_Hz"]) for axis in axes]
+    return [
+        (
+            rows["xyz".index(axis)],
+            values["mass_kg"],
+            values[f"frequency_{axis}_Hz" if variant in THREE_AXES else "frequency_Hz"],
+        )
+        for axis in axes
+    ]
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
@@ -154,8 +199,11 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
     best, step, step_m = max(found, key=lambda seed: seed.chi2), np.sqrt(grid[1] / grid[0]), 0.5
     for _ in range(SETTINGS.halvings):
         f, zeta, point = *best.values[3:5], np.array(best.values[5:])
-        near = [seed for one, other in ((f, zeta), (f * step, zeta), (f / step, zeta), (f, zeta / 2))
-                if (seed := at(one, other, about(point, step_m)))]
+        near = [
+            seed
+            for one, other in ((f, zeta), (f * step, zeta), (f / step, zeta), (f, zeta / 2))
+            if (seed := at(one, other, about(point, step_m)))
+        ]
         found += near
         best, step, step_m = max([best, *near], key=lambda seed: seed.chi2), np.sqrt(step), step_m / 2
     return found
@@ -171,22 +219,24 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
     def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
         rows = at_points(point[None], "xyz")[0]
         return *_best_triple(np.einsum("ap,fpgq,bq->fagb", rows, G, rows, optimize=True), b @ rows.T), point
-    starts = sorted((at(point) for point in points), key=lambda one: -one[0])[:SETTINGS.followed_places]
+
+    starts = sorted((at(point) for point in points), key=lambda one: -one[0])[: SETTINGS.followed_places]
     found = []
     for chi2, mass, triple, point in starts:
         best = chi2, mass, triple, point
         for halving in range(1, SETTINGS.halvings + 1):
-            near = about(best[3], 0.5 ** halving)
+            near = about(best[3], 0.5**halving)
             best = max(best, at(near[_best_point(G, b, at_points(near, "xyz"), best[2])]), key=lambda one: one[0])
         chi2, mass, triple, point = best
         if mass > 0:
             values = (min(mass, 0.5 * parameters[0].high), *frequencies[triple], zeta, *point)
-            found.append(Seed(tuple(map(float, values)), chi2, 8, n ** 3))
+            found.append(Seed(tuple(map(float, values)), chi2, 8, n**3))
     return found
 
 
-def _along_the_others(score: Score, damping: float, frequencies: Sequence[float], points: np.ndarray, axes: str
-                      ) -> tuple[tuple[float, float], np.ndarray]:
+def _along_the_others(
+    score: Score, damping: float, frequencies: Sequence[float], points: np.ndarray, axes: str
+) -> tuple[tuple[float, float], np.ndarray]:
     """Frequencies along two axes, and the point (3,), with the largest joint reduction of chi-square. The two masses
     are free, because unnamed effects have absorbed part of their response."""
     G, b = _at_frequencies(score, frequencies, damping)
@@ -194,7 +244,7 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
     for rows, point in zip(at_points(points, axes), points, strict=True):
         H, g = np.einsum("ap,fpgq,bq->afbg", rows, G, rows, optimize=True), rows @ b.T
         one, other, both = np.diag(H[0, :, 0])[:, None], np.diag(H[1, :, 1]), H[0, :, 1]
-        size = one * other - both ** 2
+        size = one * other - both**2
         masses = np.array([other * g[0][:, None] - both * g[1], one * g[1] - both * g[0][:, None]]) / size
         reduced = np.where(np.all(masses > 0, axis=0), masses[0] * g[0][:, None] + masses[1] * g[1], 0.0)
         k, j = np.unravel_index(int(np.argmax(reduced)), reduced.shape)
@@ -202,11 +252,13 @@ def _along_the_others(score: Score, damping: float, frequencies: Sequence[float]
     return (frequencies[best[1][0]], frequencies[best[1][1]]), best[2]
 
 
-def _at_frequencies(score: Score, frequencies: Sequence[float] | np.ndarray, damping: float
-                    ) -> tuple[np.ndarray, np.ndarray]:
+def _at_frequencies(
+    score: Score, frequencies: Sequence[float] | np.ndarray, damping: float
+) -> tuple[np.ndarray, np.ndarray]:
     """(n, 21, n, 21) Gram matrix of the unit matrices at each frequency, and (n, 21) product with the residual."""
-    kept = np.concatenate([unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies],
-                          dtype=np.float32)
+    kept = np.concatenate(
+        [unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies], dtype=np.float32
+    )
     n = len(frequencies)
     return (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
 

@@ -143,8 +143,10 @@ def differs_from_zero(values: Values, std: Values, names: Iterable[str]) -> bool
 
 def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
     """Parameters of mounts, contacts or drives that differ from their mean; words has {} for the name."""
-    return (EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
-            for one in names)
+    return (
+        EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
+        for one in names
+    )
 
 
 def shares(values: Values) -> np.ndarray:
@@ -213,6 +215,7 @@ class Effect(ABC):
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """Contribution to a record on lines omega; for a force proportional to `strength`, the unit force is cached."""
+
         def on_lines(act: Callable[..., np.ndarray | None], values: Values) -> np.ndarray | None:
             if getattr(Effect, act.__name__) is getattr(type(self), act.__name__):
                 return None
@@ -220,8 +223,10 @@ class Effect(ABC):
             def samples() -> np.ndarray:
                 found = act(record, place, values)
                 return np.empty((len(record.volts), 0)) if found is None else found
+
             found = record.kept(f"{self.name}@{place} {act.__name__} {values}", omega, samples)
             return found if found.shape[1] else None
+
         volts = on_lines(self.volts, values)
         if volts is not None:
             volts = volts - record.kept("volts", omega, lambda: record.volts)
@@ -251,8 +256,10 @@ class Effect(ABC):
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """Parameters as the report shows them; by default unchanged."""
-        return {one.name: Reported(values[one.name], float(np.sqrt(max(covariance[k, k], 0.0))), one.unit)
-                for k, one in enumerate(self.parameters(model, place))}
+        return {
+            one.name: Reported(values[one.name], float(np.sqrt(max(covariance[k, k], 0.0))), one.unit)
+            for k, one in enumerate(self.parameters(model, place))
+        }
 
 
 _registry: dict[str, Effect] = {}
@@ -269,8 +276,10 @@ def register(effect: type[Effect]) -> type[Effect]:
     if not name:
         raise InputError("expected an effect with a name", field="effect", value=effect.__name__)
     known = _registry.get(name)
-    if known is not None and (type(known).__module__, type(known).__qualname__) != (effect.__module__,
-                                                                                    effect.__qualname__):
+    if known is not None and (type(known).__module__, type(known).__qualname__) != (
+        effect.__module__,
+        effect.__qualname__,
+    ):
         raise InputError("expected a name that no other effect has", field="effect", value=name)
     _registry[name] = effect()
     return effect

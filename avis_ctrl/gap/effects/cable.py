@@ -32,15 +32,28 @@ class CableStiffness(AtPoint):
         size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # 2 % of one mount of four, on any rig
         most = 200 * size
         if place.endswith("oblique"):
-            own = [EffectParameter(f"along_{axis}", "sqrt(N/m)", f"root of the stiffness times its direction's {axis}",
-                                   0.0, -float(np.sqrt(most)), float(np.sqrt(most)), float(np.sqrt(size)))
-                   for axis in "xyz"]
+            own = [
+                EffectParameter(
+                    f"along_{axis}",
+                    "sqrt(N/m)",
+                    f"root of the stiffness times its direction's {axis}",
+                    0.0,
+                    -float(np.sqrt(most)),
+                    float(np.sqrt(most)),
+                    float(np.sqrt(size)),
+                )
+                for axis in "xyz"
+            ]
         else:
-            own = [EffectParameter(f"k_{axis}_N_per_m", "N/m", f"stiffness along {axis}", 0.0, 0.0, most, size)
-                   for axis in "xyz"]
-        return (*own, EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,),
-                                      True),
-                *(replace(one, optional=True) for one in self.position()))
+            own = [
+                EffectParameter(f"k_{axis}_N_per_m", "N/m", f"stiffness along {axis}", 0.0, 0.0, most, size)
+                for axis in "xyz"
+            ]
+        return (
+            *own,
+            EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,), True),
+            *(replace(one, optional=True) for one in self.position()),
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         k, V = np.linalg.eigh(tie(values))
@@ -56,14 +69,17 @@ class CableStiffness(AtPoint):
         of = _along_one if place.endswith("oblique") else _along_axes
         found = of(G, b, positions(parameters), parameters[0].high)
         for halving in range(1, SETTINGS.halvings + 1) if found else ():
-            near = about(np.array(found[0].values[-3:]), 0.5 ** halving)
+            near = about(np.array(found[0].values[-3:]), 0.5**halving)
             found = sorted(found + of(G, b, near, parameters[0].high), key=lambda seed: -seed.chi2)
         return found
 
     def implausible(self, values: Values, std: Values) -> str:
         names = [name for name in values if name.startswith(("along_", "k_"))]
-        return "" if differs_from_zero(values, std, names) else (
-            "a cable whose stiffness the data do not distinguish from zero")
+        return (
+            ""
+            if differs_from_zero(values, std, names)
+            else ("a cable whose stiffness the data do not distinguish from zero")
+        )
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """For one direction: stiffness, direction, and the foot of the line of action. Otherwise all stiffnesses,

@@ -122,20 +122,60 @@ class BaseCompliance(OfMounts):
 
         def frequency(coordinate: str) -> EffectParameter:
             about = f"along {coordinate}" if len(coordinate) == 1 else f"about {coordinate[1]}"
-            return EffectParameter(f"{coordinate}_Hz", "Hz", f"of the chassis on its base, {about}", 0.0, 1.0, 300.0,
-                                   10.0, False, (20.0,), True)
-        found = (EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 400 * m, m, False, (2 * m,)),
-                 EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True),
-                 *(frequency(coordinate) for coordinate in COORDINATES[:3]))
+            return EffectParameter(
+                f"{coordinate}_Hz",
+                "Hz",
+                f"of the chassis on its base, {about}",
+                0.0,
+                1.0,
+                300.0,
+                10.0,
+                False,
+                (20.0,),
+                True,
+            )
+
+        found = (
+            EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 400 * m, m, False, (2 * m,)),
+            EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True),
+            *(frequency(coordinate) for coordinate in COORDINATES[:3]),
+        )
         if place.endswith("translation"):
             return found
-        return (*found, *(frequency(coordinate) for coordinate in COORDINATES[3:]),
-                *(EffectParameter(f"gyration_{axis}_m", "m", f"radius of gyration about {axis}", 0.0, 0.03, 5.0, 0.3,
-                                  False, (0.5,), True) for axis in "xyz"),
-                EffectParameter("centre_z_m", "m", "height of its mass over the table's centre", 0.0, -3.0, 1.0, 0.3,
-                                False, (-0.5,), True),
-                EffectParameter("base_z_m", "m", "height of its springs over its mass", 0.0, -2.0, 2.0, 0.3, False,
-                                (0.0,), True))
+        return (
+            *found,
+            *(frequency(coordinate) for coordinate in COORDINATES[3:]),
+            *(
+                EffectParameter(
+                    f"gyration_{axis}_m",
+                    "m",
+                    f"radius of gyration about {axis}",
+                    0.0,
+                    0.03,
+                    5.0,
+                    0.3,
+                    False,
+                    (0.5,),
+                    True,
+                )
+                for axis in "xyz"
+            ),
+            EffectParameter(
+                "centre_z_m",
+                "m",
+                "height of its mass over the table's centre",
+                0.0,
+                -3.0,
+                1.0,
+                0.3,
+                False,
+                (-0.5,),
+                True,
+            ),
+            EffectParameter(
+                "base_z_m", "m", "height of its springs over its mass", 0.0, -2.0, 2.0, 0.3, False, (0.0,), True
+            ),
+        )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Short fits to few lines, from the best resonance of each coordinate by itself, and from points with one
@@ -151,8 +191,10 @@ class BaseCompliance(OfMounts):
         few = Score(score.model, blocks).chi2
         wide, steep = (score.chi2 > times * score.dof for times in (SETTINGS.wide, SETTINGS.steep))
         starts = [one.values for one in own]
-        relative = [[_with_relative_noise(block, fraction) for block in blocks]
-                    for fraction in (SETTINGS.fractions if steep else ())]
+        relative = [
+            [_with_relative_noise(block, fraction) for block in blocks]
+            for fraction in (SETTINGS.fractions if steep else ())
+        ]
         reached = self._followed(score.model, place, starts, [*relative, blocks], wide)
         if steep and starts and (reached is None or reached.chi2 > SETTINGS.converged * reached.dof):
             straight = self._followed(score.model, place, starts, [blocks], False)
@@ -169,8 +211,13 @@ class BaseCompliance(OfMounts):
         # The rig's parameters fit part of the noise with and without the chassis, so only those of the chassis count.
         # The frequency of each coordinate was chosen from a grid: any combination could have been the best.
         values = _effect(reached).values
-        found = Seed(values, score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2, len(values),
-                     SETTINGS.own_Hz[2] ** len(_coordinates(place)), few - reached.chi2)
+        found = Seed(
+            values,
+            score.chi2 - score.chi2 / max(few, 1.0) * reached.chi2,
+            len(values),
+            SETTINGS.own_Hz[2] ** len(_coordinates(place)),
+            few - reached.chi2,
+        )
         return [found] if found.chi2 > 0 else own
 
     def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
@@ -180,11 +227,17 @@ class BaseCompliance(OfMounts):
         here = Score(self._standing(rest, one.place, one.values), blocks)
         if here.chi2 < SETTINGS.explained * here.dof:
             return []
-        found = self._best_elsewhere(rest, one, blocks)[:SETTINGS.followed_groups]
+        found = self._best_elsewhere(rest, one, blocks)[: SETTINGS.followed_groups]
         return [(one.place, values) for chi2, values in found if chi2 < np.inf]
 
-    def _followed(self, model: TableModel, place: str, starts: Sequence[tuple[float, ...]],
-                  weights: Sequence[Sequence[SpectralBlock]], wide: bool) -> LikelihoodFit[TableModel] | None:
+    def _followed(
+        self,
+        model: TableModel,
+        place: str,
+        starts: Sequence[tuple[float, ...]],
+        weights: Sequence[Sequence[SpectralBlock]],
+        wide: bool,
+    ) -> LikelihoodFit[TableModel] | None:
         """The best fit from these starts with the first weights, continued with the later ones; None if all fail.
         wide : also start from one frequency for all coordinates, and refine one coordinate after the other."""
         first, *later = weights
@@ -192,8 +245,11 @@ class BaseCompliance(OfMounts):
         # Relative weights are not noise: all of chi-square counts as the gap.
         noise = 0 if later else start.dof
         gap = start.chi2 - noise
-        alike = [values for chi2, values in (self._alike(model, place, first) if wide else [])
-                 if chi2 - noise < SETTINGS.promising * gap or not later]
+        alike = [
+            values
+            for chi2, values in (self._alike(model, place, first) if wide else [])
+            if chi2 - noise < SETTINGS.promising * gap or not later
+        ]
         trials = [self._standing(model, place, values) for values in [*starts, *alike]]
         made: list[LikelihoodFit[TableModel]] = []
         for most, iterations in SETTINGS.tried_by_fractions if later else SETTINGS.tried:
@@ -201,7 +257,7 @@ class BaseCompliance(OfMounts):
             made = sorted((one for one in fits if one is not None), key=attrgetter("chi2"))
             trials = [one.model for one in made]
         enough = SETTINGS.negligible * gap if later else SETTINGS.explained * noise
-        for one in made[:SETTINGS.followed_fits] if wide else []:
+        for one in made[: SETTINGS.followed_fits] if wide else []:
             if one.chi2 - noise < SETTINGS.followed * gap and made[0].chi2 > enough:
                 made = sorted([*made, self._one_by_one(one, place, first, noise, enough)], key=attrgetter("chi2"))
         reached = made[0] if made else None
@@ -209,19 +265,28 @@ class BaseCompliance(OfMounts):
             reached = reached and _short_fit(reached.model, then, SETTINGS.later_iterations)
         return reached
 
-    def _alike(self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]
-               ) -> list[tuple[float, tuple[float, ...]]]:
+    def _alike(
+        self, model: TableModel, place: str, blocks: Sequence[SpectralBlock]
+    ) -> list[tuple[float, tuple[float, ...]]]:
         """(expected chi-square, values) of starts with one frequency for all coordinates, the best first."""
         payload = model.rig.mounted_body().mass
         coordinates = _coordinates(place)
         shape = SETTINGS.alike_shape if len(coordinates) > 3 else ()
-        starts = [(SETTINGS.alike_mass * payload, 0.05, *[f] * len(coordinates), *shape)
-                  for f in np.geomspace(*SETTINGS.alike_Hz).tolist()]
+        starts = [
+            (SETTINGS.alike_mass * payload, 0.05, *[f] * len(coordinates), *shape)
+            for f in np.geomspace(*SETTINGS.alike_Hz).tolist()
+        ]
         expected = [(self._expected(model, place, values, blocks), values) for values in starts]
         return sorted(one for one in expected if one[0] < np.inf)
 
-    def _one_by_one(self, reached: LikelihoodFit[TableModel], place: str, blocks: Sequence[SpectralBlock],
-                    noise: float, enough: float) -> LikelihoodFit[TableModel]:
+    def _one_by_one(
+        self,
+        reached: LikelihoodFit[TableModel],
+        place: str,
+        blocks: Sequence[SpectralBlock],
+        noise: float,
+        enough: float,
+    ) -> LikelihoodFit[TableModel]:
         """Refine a fit with other frequencies of coupled coordinates while chi-square comes closer to `noise`, its
         value for an exact model, and until it is below `enough`."""
         for _ in range(SETTINGS.rounds):
@@ -238,16 +303,19 @@ class BaseCompliance(OfMounts):
             reached = made
         return reached
 
-    def _best_elsewhere(self, rest: TableModel, one: ActiveEffect, blocks: Sequence[SpectralBlock]
-                        ) -> list[tuple[float, tuple[float, ...]]]:
+    def _best_elsewhere(
+        self, rest: TableModel, one: ActiveEffect, blocks: Sequence[SpectralBlock]
+    ) -> list[tuple[float, tuple[float, ...]]]:
         """(expected chi-square, values) of the best start with other frequencies in each group of coupled coordinates,
         the best first. The parameters of the other coordinates can compensate for a wrong frequency, which makes a
         local minimum that no descent can escape."""
-        return sorted(min((self._expected(rest, one.place, moved, blocks), moved) for moved in group)
-                      for group in _elsewhere(one))
+        return sorted(
+            min((self._expected(rest, one.place, moved, blocks), moved) for moved in group) for group in _elsewhere(one)
+        )
 
-    def _expected(self, model: TableModel, place: str, values: tuple[float, ...], blocks: Sequence[SpectralBlock]
-                  ) -> float:
+    def _expected(
+        self, model: TableModel, place: str, values: tuple[float, ...], blocks: Sequence[SpectralBlock]
+    ) -> float:
         """Chi-square expected after one step of all parameters from a start; infinite if the step fails."""
         try:
             return Score(self._standing(model, place, values), blocks).chi2
@@ -266,7 +334,7 @@ class BaseCompliance(OfMounts):
             key = ("recoil", float(f))
             if key not in score.kept:
                 score.kept[key] = recoils(score, partial(receptance, frequency_Hz=f, damping=zeta))
-            rows.append(score.kept[key][:len(coordinates)])
+            rows.append(score.kept[key][: len(coordinates)])
             labels += [(coordinate, float(f)) for coordinate in coordinates]
         A = np.concatenate(rows)
         gram, product = A @ A.T, A @ score.e
@@ -282,29 +350,41 @@ class BaseCompliance(OfMounts):
         if leader <= 0:
             return []
         ratio = SETTINGS.mass_ratio
-        best = {coordinate: f for coordinate, f in best.items()
-                if len(coordinate) > 1 or leader / ratio < inverse[coordinate] < ratio * leader}
+        best = {
+            coordinate: f
+            for coordinate, f in best.items()
+            if len(coordinate) > 1 or leader / ratio < inverse[coordinate] < ratio * leader
+        }
         mass = self.parameters(score.model, place)[0]
         m = float(np.clip(1 / leader, 2 * mass.low, mass.high / 2))
         at = {coordinate: best.get(coordinate, SETTINGS.stiff_Hz) for coordinate in coordinates}
         values = [m, zeta, *(at[coordinate] for coordinate in coordinates[:3])]
         if len(coordinates) > 3:
-            radii = [np.sqrt(1 / (inverse[coordinate] * m)) if inverse.get(coordinate, 0.0) > 0 else 0.6
-                     for coordinate in coordinates[3:]]
-            values += [*(at[coordinate] for coordinate in coordinates[3:]), *np.clip(radii, 0.1, 3.0).tolist(), -0.3,
-                       0.0]
+            radii = [
+                np.sqrt(1 / (inverse[coordinate] * m)) if inverse.get(coordinate, 0.0) > 0 else 0.6
+                for coordinate in coordinates[3:]
+            ]
+            values += [
+                *(at[coordinate] for coordinate in coordinates[3:]),
+                *np.clip(radii, 0.1, 3.0).tolist(),
+                -0.3,
+                0.0,
+            ]
         return [Seed(tuple(float(v) for v in values), took.chi2, 2 * len(best))]
 
     def implausible(self, values: Values, std: Values) -> str:
-        return "" if differs_from_zero(values, std, ["mass_kg"]) else (
-            "a chassis so heavy that the data do not distinguish it from a fixed one")
+        return (
+            ""
+            if differs_from_zero(values, std, ["mass_kg"])
+            else ("a chassis so heavy that the data do not distinguish it from a fixed one")
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         mass, damping, stiffness = of_chassis(values)
         s = ops.s[:, None, None]
         tied = stiffness + s * damping
         if "rx_Hz" in values:
-            B = np.linalg.inv(s ** 2 * mass + tied)
+            B = np.linalg.inv(s**2 * mass + tied)
             H = B @ tied[:, :, :3]
         else:
             B, H, along = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex), range(3)
@@ -328,7 +408,7 @@ def of_chassis(values: Values) -> np.ndarray:
     found = np.zeros((3, 6, 6))
     centre = np.array([0.0, 0.0, values.get("centre_z_m", 0.0)])
     G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values.get("base_z_m", 0.0)]))
-    each = (inertia, 2 * values["damping"] * inertia * w, inertia * w ** 2)
+    each = (inertia, 2 * values["damping"] * inertia * w, inertia * w**2)
     for which, place, one in zip(found, (G, below, below), each, strict=True):
         which += place.T @ np.diag(one[:3]) @ place
         which[3:, 3:] += np.diag(one[3:])
@@ -337,7 +417,7 @@ def of_chassis(values: Values) -> np.ndarray:
 
 def _with_relative_noise(block: SpectralBlock, fraction: float) -> SpectralBlock:
     """The block with noise of this fraction of its response added to its noise."""
-    relative, = relative_noise([block], fraction)
+    (relative,) = relative_noise([block], fraction)
     assert block.noise is not None and relative.noise is not None
     return block.with_noise(block.noise + relative.noise, block.dof)
 
@@ -359,10 +439,18 @@ def _elsewhere(one: ActiveEffect) -> list[list[tuple[float, ...]]]:
             if len(coordinate) > 1:
                 values[names.index(f"gyration_{coordinate[1]}_m")] = SETTINGS.alike_shape[0]
         return tuple(values)
+
     groups = [[coordinate for coordinate in together if coordinate in free] for together in TOGETHER]
     # The frequency of one of two coordinates may be right.
-    return [[moved(coordinates, factors) for factors in product((None, *SETTINGS.elsewhere), repeat=len(coordinates))
-             if any(factors)] for coordinates in groups if coordinates]
+    return [
+        [
+            moved(coordinates, factors)
+            for factors in product((None, *SETTINGS.elsewhere), repeat=len(coordinates))
+            if any(factors)
+        ]
+        for coordinates in groups
+        if coordinates
+    ]
 
 
 def _effect(found: LikelihoodFit[TableModel]) -> ActiveEffect:

@@ -4,17 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import (
-    Added,
-    Effect,
-    EffectParameter,
-    Reported,
-    Table,
-    Values,
-    register,
-    shares,
-    uneven,
-)
+from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Reported, Table, Values, register, shares, uneven
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 
@@ -70,7 +60,7 @@ class ActuatorLag(Effect):
         found = super().reported(model, place, values, covariance)
         if tau <= 1e-9:  # at its bound there is no corner
             return found
-        return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau ** 2), "Hz"), **found}
+        return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau**2), "Hz"), **found}
 
 
 def time_constants(values: Values) -> np.ndarray:
@@ -112,8 +102,17 @@ class ActuatorSaturation(Effect):
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
         peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
         grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))
-        limit = EffectParameter("limit_V", "V", "voltage at which the drives clip", model.rig.drive_limit_V,
-                                peak / 50, peak, peak, False, grid)
+        limit = EffectParameter(
+            "limit_V",
+            "V",
+            "voltage at which the drives clip",
+            model.rig.drive_limit_V,
+            peak / 50,
+            peak,
+            peak,
+            False,
+            grid,
+        )
         own = uneven(model.actuators[:-1], "limit of drive {} over the mean, less one") if "/" in place else ()
         return (limit, *own)
 
@@ -127,6 +126,7 @@ class ActuatorSaturation(Effect):
 
         def clipped(k: int, limit: float) -> np.ndarray:
             return record.kept(f"{self.name} {k} {limit}", omega, lambda: np.clip(record.volts[:, [k]], -limit, limit))
+
         volts = np.hstack([clipped(k, float(limit)) for k, limit in enumerate(limits)])
         return Added(volts=volts - record.kept("volts", omega, lambda: record.volts))
 

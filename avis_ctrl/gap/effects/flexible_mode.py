@@ -43,13 +43,34 @@ class PayloadFlexibleMode(Effect):
         for k in range(COUNTS[place.partition("/")[2]]):
             of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
             found += [
-                EffectParameter(f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 0.0, 3.0, 400.0, 20.0, False,
-                                tuple(np.geomspace(*SETTINGS.mode_Hz).tolist())),
-                EffectParameter(f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,),
-                                True),
-                *(EffectParameter(f"shape{of}_{name.replace('.', '_')}", "1/sqrt(kg)",
-                                  f"mass-normalised shape {of_mode} at {name}", 0.0, -1.0, 1.0, 0.01, optional=not own)
-                  for name, own in zip(names, driven, strict=True))]
+                EffectParameter(
+                    f"frequency{of}_Hz",
+                    "Hz",
+                    f"{of_mode}, free",
+                    0.0,
+                    3.0,
+                    400.0,
+                    20.0,
+                    False,
+                    tuple(np.geomspace(*SETTINGS.mode_Hz).tolist()),
+                ),
+                EffectParameter(
+                    f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,), True
+                ),
+                *(
+                    EffectParameter(
+                        f"shape{of}_{name.replace('.', '_')}",
+                        "1/sqrt(kg)",
+                        f"mass-normalised shape {of_mode} at {name}",
+                        0.0,
+                        -1.0,
+                        1.0,
+                        0.01,
+                        optional=not own,
+                    )
+                    for name, own in zip(names, driven, strict=True)
+                ),
+            ]
         return tuple(found)
 
     def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
@@ -62,7 +83,7 @@ class PayloadFlexibleMode(Effect):
         parameters = self.parameters(model, place)
         own = len(parameters) // COUNTS[place.partition("/")[2]]
         for k in range(0, len(parameters), own):
-            shape = parameters[k + 2:k + own]
+            shape = parameters[k + 2 : k + own]
             size = np.sqrt(np.mean(np.square([values[one.name] for one in shape if not one.optional])))
             found |= {one.name: (0.0, max(float(size), SETTINGS.smallest_shape)) for one in shape if one.optional}
         return found
@@ -71,8 +92,11 @@ class PayloadFlexibleMode(Effect):
         at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
         for frequency, zeta, shape in modes(values):
             if np.any(shape):
-                ops.added.append(AddedCoordinate(second_order(ops.s, frequency, zeta), shape, at_actuators @ shape,
-                                                 at_sensors @ shape))
+                ops.added.append(
+                    AddedCoordinate(
+                        second_order(ops.s, frequency, zeta), shape, at_actuators @ shape, at_sensors @ shape
+                    )
+                )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Residues over all paths at the frequencies that reduce chi-square most; the shape is their symmetric part of
@@ -90,7 +114,7 @@ class PayloadFlexibleMode(Effect):
         """The modes in order of frequency."""
         found = list(super().reported(model, place, values, covariance).items())
         own = len(found) // COUNTS[place.partition("/")[2]]
-        each = sorted((found[k:k + own] for k in range(0, len(found), own)), key=lambda mode: mode[0][1].value)
+        each = sorted((found[k : k + own] for k in range(0, len(found), own)), key=lambda mode: mode[0][1].value)
         return dict(zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True))
 
 
@@ -108,13 +132,15 @@ def shape_points(model: Table) -> bool:
 
 def shape_rows(rig: Any, actuators: Sequence[str], sensors: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """(n_u, n_g) and (n_y, n_g): mount and axis of each motor and of each sensor, with its sign."""
-    return _shape_rows(tuple(map(rig.nearest_mount, actuators)), tuple(map(rig.nearest_mount, sensors)),
-                       mount_geometry(rig).names)
+    return _shape_rows(
+        tuple(map(rig.nearest_mount, actuators)), tuple(map(rig.nearest_mount, sensors)), mount_geometry(rig).names
+    )
 
 
 @lru_cache(maxsize=16)
-def _shape_rows(actuators: tuple[tuple[str, float], ...], sensors: tuple[tuple[str, float], ...],
-                mounts: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _shape_rows(
+    actuators: tuple[tuple[str, float], ...], sensors: tuple[tuple[str, float], ...], mounts: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray]:
     at_actuators, at_sensors = np.zeros((len(actuators), len(mounts))), np.zeros((len(sensors), len(mounts)))
     for found, channels in ((at_actuators, actuators), (at_sensors, sensors)):
         for k, (mount, sign) in enumerate(channels):
@@ -161,5 +187,5 @@ def _seed(model: TableModel, f: float, zeta: float, residues: np.ndarray, chi2: 
     if sign <= 0 or size == 0:
         return None
     values = f, zeta, *(shape * np.sqrt(sigma[0] * sign / size))
-    share = sigma[0] ** 2 / float(np.sum(sigma ** 2))
+    share = sigma[0] ** 2 / float(np.sum(sigma**2))
     return Seed(tuple(float(v) for v in values), chi2 * float(share), len(residues), trials)

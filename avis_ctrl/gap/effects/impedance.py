@@ -49,8 +49,12 @@ def _at_points(points: bytes, axes: str, oblique: bool) -> np.ndarray:
     for point in np.frombuffer(points).reshape(-1, 3):
         G = point_map(point)
         pairs = [("xyz".index(a),) * 2 for a in axes] + ([(0, 1), (0, 2), (1, 2)] if oblique else [])
-        found.append([symmetric_coordinates(np.outer(G[i], G[j]) if i == j else np.outer(G[i], G[j]) + np.outer(
-            G[j], G[i])) for i, j in pairs])
+        found.append(
+            [
+                symmetric_coordinates(np.outer(G[i], G[j]) if i == j else np.outer(G[i], G[j]) + np.outer(G[j], G[i]))
+                for i, j in pairs
+            ]
+        )
     return np.array(found)
 
 
@@ -80,10 +84,10 @@ def peaks(score: Score) -> tuple[float, ...]:
     omega, power, start = [], [], 0
     for part in score.parts:
         n = len(part.block.omega)
-        e = score.e[start:start + 2 * part.block.Y.size].reshape(2, n, -1)
+        e = score.e[start : start + 2 * part.block.Y.size].reshape(2, n, -1)
         start += 2 * part.block.Y.size
         omega.append(part.block.omega)
-        power.append(np.mean(e ** 2, axis=(0, 2)))
+        power.append(np.mean(e**2, axis=(0, 2)))
     f, P = np.concatenate(omega) / (2 * np.pi), np.concatenate(power)
     # Mean power in steps of frequency, relative to the median around each step.
     reach = SETTINGS.peak_reach
@@ -93,13 +97,13 @@ def peaks(score: Score) -> tuple[float, ...]:
     occupied = count > 0
     mean = np.bincount(step, P)[occupied] / count[occupied]
     centre = np.exp(np.bincount(step, P * np.log(f))[occupied] / np.maximum(np.bincount(step, P)[occupied], 1e-300))
-    about = np.array([np.median(mean[max(k - reach, 0):k + reach + 1]) for k in range(len(mean))])
+    about = np.array([np.median(mean[max(k - reach, 0) : k + reach + 1]) for k in range(len(mean))])
     found: list[float] = []
     for k in np.argsort(-mean / about):
         apart = all(abs(np.log(centre[k] / one)) > SETTINGS.peaks_apart for one in found)
         if apart and mean[k] > SETTINGS.peak_height * about[k]:
             found.append(float(centre[k]))
-    score.kept["peaks"] = tuple(found[:SETTINGS.most_peaks])
+    score.kept["peaks"] = tuple(found[: SETTINGS.most_peaks])
     return score.kept["peaks"]
 
 
@@ -109,7 +113,7 @@ def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.
     for part in score.parts:
         made, response = part.made, part.response
         through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
-        amount = part.s ** 2 * (made.M @ response.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
+        amount = part.s**2 * (made.M @ response.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
         measured = response.left[:, :, :6] @ through
         columns.append(-np.moveaxis(measured[:, :, :, None] * amount[:, None], 2, 0))
     return score.directions(columns)

@@ -19,8 +19,11 @@ from avis_ctrl.gap.starting_values import SETTINGS
 @cache
 def directions() -> np.ndarray:
     """(n, 3) directions over a hemisphere."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi / 2, SETTINGS.polar),
-                                np.linspace(0, 2 * np.pi, SETTINGS.around, endpoint=False), indexing="ij")
+    polar, around = np.meshgrid(
+        np.linspace(0, np.pi / 2, SETTINGS.polar),
+        np.linspace(0, 2 * np.pi, SETTINGS.around, endpoint=False),
+        indexing="ij",
+    )
     every = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
     return np.unique(np.round(every.reshape(-1, 3), 12), axis=0)
 
@@ -31,7 +34,7 @@ def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[fl
     d = basis @ b
     A = basis @ G @ np.swapaxes(basis, 1, 2)
     every = directions()
-    V = np.column_stack([every ** 2, *(every[:, i] * every[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
+    V = np.column_stack([every**2, *(every[:, i] * every[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
     along = d @ V.T
     size = A.reshape(len(A), -1) @ (V[:, :, None] * V[:, None, :]).reshape(len(V), -1).T
     mass = np.where(size > 0, along / np.where(size > 0, size, 1.0), 0.0)
@@ -52,8 +55,12 @@ def reported_line(values: Values, covariance: np.ndarray, size: str, unit: str) 
     rows = [*range(first, first + 3), *range(last, last + 3)]
     x = np.array([values[names[row]] for row in rows])
     line = of_line(x)
-    slope = np.array([(of_line(x + step) - of_line(x - step)) / (2 * np.abs(step).max())
-                      for step in np.eye(6) * 1e-6 * max(float(np.abs(x[:3]).max()), 1e-3)]).T
+    slope = np.array(
+        [
+            (of_line(x + step) - of_line(x - step)) / (2 * np.abs(step).max())
+            for step in np.eye(6) * 1e-6 * max(float(np.abs(x[:3]).max()), 1e-3)
+        ]
+    ).T
     std = np.sqrt(np.maximum(np.diag(slope @ covariance[np.ix_(rows, rows)] @ slope.T), 0.0))
     labels = [(size, unit), *((f"direction_{axis}", "1") for axis in "xyz"), *((f"{axis}_m", "m") for axis in "xyz")]
     return {name: Reported(float(v), float(s), u) for (name, u), v, s in zip(labels, line, std, strict=True)}

@@ -59,10 +59,20 @@ class MountRelaxation(OfMounts):
     holds_states = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0,
-                                0.1),
-                EffectParameter("corner_Hz", "Hz", "above which the branch acts", 0.0, 0.02, 300.0, 1.0, False,
-                                (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0)))
+        return (
+            EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0, 0.1),
+            EffectParameter(
+                "corner_Hz",
+                "Hz",
+                "above which the branch acts",
+                0.0,
+                0.02,
+                300.0,
+                1.0,
+                False,
+                (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0),
+            ),
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         x = ops.s / (2 * np.pi * values["corner_Hz"])
@@ -113,21 +123,45 @@ class MountSurge(OfMounts):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         count = int(np.sum(vertical(model.rig)))
-        return (EffectParameter("frequency_Hz", "Hz", "of the mass inside the mounts", np.inf, 4.0, 400.0, 20.0, False,
-                                tuple(np.geomspace(*SETTINGS.surge_Hz).tolist())),
-                EffectParameter("payload_share", "1", "of the mount's compliance between mass and payload", 0.5, 0.05,
-                                0.95, 0.2, False, (0.5,), True),
-                EffectParameter("damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False,
-                                (0.015, 0.05, 0.15), True),
-                *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2))
+        return (
+            EffectParameter(
+                "frequency_Hz",
+                "Hz",
+                "of the mass inside the mounts",
+                np.inf,
+                4.0,
+                400.0,
+                20.0,
+                False,
+                tuple(np.geomspace(*SETTINGS.surge_Hz).tolist()),
+            ),
+            EffectParameter(
+                "payload_share",
+                "1",
+                "of the mount's compliance between mass and payload",
+                0.5,
+                0.05,
+                0.95,
+                0.2,
+                False,
+                (0.5,),
+                True,
+            ),
+            EffectParameter(
+                "damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False, (0.015, 0.05, 0.15), True
+            ),
+            *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2),
+        )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Seeds over frequency and damping: to first order the mass is a sprung mass on the payload at the mount."""
         rig = score.model.rig
         rows = mount_geometry(rig).payload[vertical(rig)]
         units = symmetric_coordinates(rows[:, :, None] * rows[:, None, :])
-        tried = [*product(np.geomspace(*SETTINGS.surge_Hz).tolist(), SETTINGS.dampings),
-                 *product(peaks(score), SETTINGS.peak_dampings)]
+        tried = [
+            *product(np.geomspace(*SETTINGS.surge_Hz).tolist(), SETTINGS.dampings),
+            *product(peaks(score), SETTINGS.peak_dampings),
+        ]
         found = []
         for f, zeta in tried:
             G, b = project(score, partial(sprung, frequency_Hz=f, damping=zeta), ("sprung", f, zeta))
@@ -138,8 +172,11 @@ class MountSurge(OfMounts):
         return sorted(found, key=lambda seed: -seed.chi2)
 
     def implausible(self, values: Values, std: Values) -> str:
-        return "" if differs_from_zero(values, std, ["frequency_Hz"]) else (
-            "a resonance whose frequency the data do not determine")
+        return (
+            ""
+            if differs_from_zero(values, std, ["frequency_Hz"])
+            else ("a resonance whose frequency the data do not determine")
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         up = vertical(ops.base.rig)
@@ -154,13 +191,13 @@ class MountSurge(OfMounts):
         found = super().reported(model, place, values, covariance)
         k = mount_geometry(model.effective.rig).stiffness[vertical(model.rig)]
         f, a, w = values["frequency_Hz"], values["payload_share"], surge_omega(values)
-        m = k / (a * (1 - a) * w ** 2)
+        m = k / (a * (1 - a) * w**2)
         slope = np.zeros(len(values))
         slope[:2] = -2 * np.mean(m) / f, -np.mean(m) * (1 - 2 * a) / (a * (1 - a))
         variance = float(slope @ covariance @ slope) + _of_mean(m)
         mass = Reported(float(np.mean(m)), float(np.sqrt(max(variance, 0.0))), "kg")
         own = found.pop("frequency_Hz")
-        frequency = Reported(own.value, float(np.sqrt(own.std ** 2 + _of_mean(w / (2 * np.pi)))), "Hz")
+        frequency = Reported(own.value, float(np.sqrt(own.std**2 + _of_mean(w / (2 * np.pi)))), "Hz")
         return {"frequency_Hz": frequency, "mass_kg": mass, **found}
 
 
@@ -198,8 +235,20 @@ class LevelingLoop(OfMounts):
         if place.endswith("each"):
             return (rate, *uneven(range(1, LIBRARY.leveled), "rate of valve {} over the mean, less one"))
         # A valve may be faster than the data can show; its corner then ends at the upper bound.
-        return (rate, EffectParameter("valve_corner_Hz", "Hz", "first-order lag of the valves", 0.0, *LIBRARY.valve_Hz,
-                                      1.0, False, (0.1, 0.3, 1.0, 3.0), True))
+        return (
+            rate,
+            EffectParameter(
+                "valve_corner_Hz",
+                "Hz",
+                "first-order lag of the valves",
+                0.0,
+                *LIBRARY.valve_Hz,
+                1.0,
+                False,
+                (0.1, 0.3, 1.0, 3.0),
+                True,
+            ),
+        )
 
     def implausible(self, values: Values, std: Values) -> str:
         slow = values.get("valve_corner_Hz", np.inf) < 1.001 * LIBRARY.valve_Hz[0]
@@ -248,17 +297,22 @@ class CubicStiffness(OfMounts):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         others = (stiffness(model, 2, "quadratic"), stiffness(model, 5, "quintic")) if "/" in place else ()
-        return (stiffness(model, 3, "cubic"), *others,
-                *uneven(range(1, int(np.sum(vertical(model.rig)))), "that of mount {} over the mean, less one"))
+        return (
+            stiffness(model, 3, "cubic"),
+            *others,
+            *uneven(range(1, int(np.sum(vertical(model.rig)))), "that of mount {} over the mean, less one"),
+        )
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         d = record.deflection[:, record.vertical]
-        return stiffened(sum(values[name] * d ** n for n, name in powers(values)), record, values)
+        return stiffened(sum(values[name] * d**n for n, name in powers(values)), record, values)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, from the spectra of the powers."""
+
         def of_power(n: int) -> np.ndarray:
             return record.kept(f"{self.name} {n}", omega, lambda: record.deflection[:, record.vertical] ** n)
+
         return Added(force=stiffened(sum(values[name] * of_power(n) for n, name in powers(values)), record, values))
 
     def implausible(self, values: Values, std: Values) -> str:
@@ -268,8 +322,9 @@ class CubicStiffness(OfMounts):
 def stiffness(model: Table, n: int, words: str) -> EffectParameter:
     """Coefficient of a force proportional to the n-th power of the deflection."""
     size = 1e-2 * float(np.mean(mount_geometry(model.rig).stiffness)) / largest_rms(model) ** (n - 1)
-    return EffectParameter(f"k{n}_N_per_m{n}", f"N/m^{n}", f"{words} stiffness, mean of the mounts", 0.0, -1e4 * size,
-                           1e4 * size, size)
+    return EffectParameter(
+        f"k{n}_N_per_m{n}", f"N/m^{n}", f"{words} stiffness, mean of the mounts", 0.0, -1e4 * size, 1e4 * size, size
+    )
 
 
 def powers(values: Values) -> list[tuple[int, str]]:
@@ -314,26 +369,40 @@ class ContactFriction(Effect):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         rms, k = median_rms(model), float(np.mean(mount_geometry(model.rig).stiffness))
-        return (EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
-                EffectParameter("slip_m", "m", "displacement at which a contact slips", 0.0, 1e-3 * rms, 1e3 * rms, rms,
-                                False, tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0))),
-                *uneven(model.actuators[:-1], "stiffness of the contact of {} over the mean, less one"))
+        return (
+            EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
+            EffectParameter(
+                "slip_m",
+                "m",
+                "displacement at which a contact slips",
+                0.0,
+                1e-3 * rms,
+                1e3 * rms,
+                rms,
+                False,
+                tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)),
+            ),
+            *uneven(model.actuators[:-1], "stiffness of the contact of {} over the mean, less one"),
+        )
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         return pushed(Contacts(record, values["slip_m"]).friction(0, len(record.volts)), record, values)
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """As `force`, interpolated between values of the slip."""
-        f = record.interpolated(self.name, values["slip_m"], omega,
-                                lambda slip: Contacts(record, slip).friction(0, len(record.volts)))
+        f = record.interpolated(
+            self.name, values["slip_m"], omega, lambda slip: Contacts(record, slip).friction(0, len(record.volts))
+        )
         return Added(force=pushed(f, record, values))
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         k, slip = values["stiffness_N_per_m"], values["slip_m"]
         slope = np.array([slip, k])
         variance = float(slope @ covariance[:2, :2] @ slope)
-        return {"force_N": Reported(k * slip, float(np.sqrt(max(variance, 0.0))), "N"),
-                **super().reported(model, place, values, covariance)}
+        return {
+            "force_N": Reported(k * slip, float(np.sqrt(max(variance, 0.0))), "N"),
+            **super().reported(model, place, values, covariance),
+        }
 
 
 def contacts(values: Values) -> np.ndarray:
@@ -384,8 +453,21 @@ class StiffnessDrift(OfMounts):
             return (change,)
         begin, end = campaign_clock(model)
         T = end - begin
-        return (change, EffectParameter("time_constant_s", "s", "of the approach to the end", 0.0, 0.01 * T, 10 * T, T,
-                                        False, (0.1 * T, 0.3 * T, T), True))
+        return (
+            change,
+            EffectParameter(
+                "time_constant_s",
+                "s",
+                "of the approach to the end",
+                0.0,
+                0.01 * T,
+                10 * T,
+                T,
+                False,
+                (0.1 * T, 0.3 * T, T),
+                True,
+            ),
+        )
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         begin, end = record.campaign_s
@@ -399,7 +481,7 @@ class StiffnessDrift(OfMounts):
         # is relative to the table's stiffness at the beginning.
         own, ratio = found["relative_change"], drift_over_stiffness(model)
         begin = 1 - own.value * ratio / 2
-        one = Reported(own.value * ratio / begin, own.std * ratio / begin ** 2, own.unit)
+        one = Reported(own.value * ratio / begin, own.std * ratio / begin**2, own.unit)
         found["relative_change"] = one
         if model.motion:
             begin_s, end_s = campaign_clock(model)

@@ -21,8 +21,12 @@ class ComOffset(Effect):
         return ("payload",) if "com_x" in model.rig.parameters() else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(EffectParameter(f"offset_{axis}_m", "m", f"centre of mass beyond the model's along {axis}", 0.0,
-                                     -0.5, 0.5, 0.05) for axis in "xyz")
+        return tuple(
+            EffectParameter(
+                f"offset_{axis}_m", "m", f"centre of mass beyond the model's along {axis}", 0.0, -0.5, 0.5, 0.05
+            )
+            for axis in "xyz"
+        )
 
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         known = model.rig.parameters()
@@ -43,8 +47,17 @@ class ProductOfInertia(Effect):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         known = model.rig.parameters()
         largest = 0.9 * min(known[name].value for name in ("J1", "J2", "J3"))
-        return (EffectParameter(f"{place}_kgm2", "kg m^2", "entry of the inertia tensor beyond the model's", 0.0,
-                                -largest, largest, 0.1 * largest),)
+        return (
+            EffectParameter(
+                f"{place}_kgm2",
+                "kg m^2",
+                "entry of the inertia tensor beyond the model's",
+                0.0,
+                -largest,
+                largest,
+                0.1 * largest,
+            ),
+        )
 
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         name = PRODUCTS[place]
@@ -55,9 +68,20 @@ class AtPoint(Effect):
     """An effect at a point of the payload."""
 
     def position(self) -> tuple[EffectParameter, ...]:
-        return tuple(EffectParameter(f"{axis}_m", "m", f"its place along {axis}, from the geometric centre", 0.0,
-                                     -SETTINGS.reach_m, SETTINGS.reach_m, 0.2, False, grid)
-                     for axis, grid in zip("xyz", ((-0.4, 0.0, 0.4), (-0.3, 0.0, 0.3), (-0.15, 0.25)), strict=True))
+        return tuple(
+            EffectParameter(
+                f"{axis}_m",
+                "m",
+                f"its place along {axis}, from the geometric centre",
+                0.0,
+                -SETTINGS.reach_m,
+                SETTINGS.reach_m,
+                0.2,
+                False,
+                grid,
+            )
+            for axis, grid in zip("xyz", ((-0.4, 0.0, 0.4), (-0.3, 0.0, 0.3), (-0.15, 0.25)), strict=True)
+        )
 
 
 def place_of(values: Values) -> np.ndarray:

@@ -13,7 +13,7 @@ from avis_ctrl.rigs.rigid_body import GRAVITY
 def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
     """s^2 + 2 zeta w s + w^2, (n,)."""
     w = 2 * np.pi * frequency_Hz
-    return s ** 2 + 2 * damping * w * s + w ** 2
+    return s**2 + 2 * damping * w * s + w**2
 
 
 def receptance(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
@@ -24,7 +24,7 @@ def receptance(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray
 def sprung(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
     """Dynamic stiffness of a sprung mass of 1 kg, (n,)."""
     w = 2 * np.pi * frequency_Hz
-    return s ** 2 * ((2 * damping * w * s + w ** 2) / second_order(s, frequency_Hz, damping))
+    return s**2 * ((2 * damping * w * s + w**2) / second_order(s, frequency_Hz, damping))
 
 
 def suspensions(rig: Rig) -> dict[str, tuple[float, float]]:
@@ -61,8 +61,10 @@ class GeophoneCorner(_OfSensor):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         f, z = suspensions(model.rig)[place]
-        return (EffectParameter("corner_Hz", "Hz", "suspension frequency", f, f / 5, 5 * f, f),
-                EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z))
+        return (
+            EffectParameter("corner_Hz", "Hz", "suspension frequency", f, f / 5, 5 * f, f),
+            EffectParameter("damping", "1", "damping ratio of the suspension", z, z / 5, 5 * z, z),
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         # Relative to the present corner, which the tolerance fit may have moved: both then change the same parameter.
@@ -101,8 +103,11 @@ class SensorMisalignment(_OfSensor):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         own = axis_of(model, place)
-        return tuple(EffectParameter(f"towards_{axis}_deg", "deg", f"tilt of the axis towards {axis}", 0.0, -60.0, 60.0,
-                                     5.0) for axis in "xyz" if axis != own)
+        return tuple(
+            EffectParameter(f"towards_{axis}_deg", "deg", f"tilt of the axis towards {axis}", 0.0, -60.0, 60.0, 5.0)
+            for axis in "xyz"
+            if axis != own
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         from avis_ctrl.rigs.rigid_body import point_map
@@ -113,7 +118,8 @@ class SensorMisalignment(_OfSensor):
             direction = direction + np.tan(np.radians(angle)) * np.eye(3)["xyz".index(name.split("_")[1])]
         rows = ops.rows.copy()
         rows[:, ops.sensor(place)] += direction / np.linalg.norm(direction) @ point_map(position) - own @ point_map(
-            position)
+            position
+        )
         ops.rows = rows
 
 
@@ -133,13 +139,16 @@ class TiltCoupling(Effect):
         return ("horizontal geophones",) if horizontal and model.sensors.unit in ("V", "m/s^2") else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("gravity_m_per_s2", "m/s^2", "acceleration read for a tilt of 1 rad", 0.0, -30.0, 30.0,
-                                GRAVITY),)
+        return (
+            EffectParameter(
+                "gravity_m_per_s2", "m/s^2", "acceleration read for a tilt of 1 rad", 0.0, -30.0, 30.0, GRAVITY
+            ),
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         n = len(ops.omega)
         rows = np.broadcast_to(ops.rows, (n, *ops.rows.shape[1:])).astype(complex)
-        per_tilt = values["gravity_m_per_s2"] / ops.s ** 2
+        per_tilt = values["gravity_m_per_s2"] / ops.s**2
         axes = ops.base.rig.sensor_axes()
         for k, name in enumerate(ops.base.sensors.names):
             direction = axes[name][1]

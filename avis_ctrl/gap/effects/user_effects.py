@@ -79,8 +79,9 @@ def try_out(own: OwnEffects, model: TableModel) -> None:
         except AvisError as error:
             raise InputError(str(error), file=own.path, field=name) from None
         except Exception as error:
-            raise InputError(f"expected an effect that runs: {one_line(error, own.path)}", file=own.path,
-                             field=name) from None
+            raise InputError(
+                f"expected an effect that runs: {one_line(error, own.path)}", file=own.path, field=name
+            ) from None
 
 
 def _tried(effect: Effect, model: TableModel) -> None:
@@ -98,13 +99,19 @@ def _tried(effect: Effect, model: TableModel) -> None:
         for one in parameters:
             _require_range(one)
         for start in effect.starts(model, place)[:1]:
-            values = [float(value + one.size * (one.linear and value + one.size <= one.high))
-                      for one, value in zip(parameters, start, strict=True)]
+            values = [
+                float(value + one.size * (one.linear and value + one.size <= one.high))
+                for one, value in zip(parameters, start, strict=True)
+            ]
             added = model.with_effect(active(effect, model, place, values))
             if not np.all(np.isfinite(added.response(omega))):
                 raise InputError("expected a finite response", field=f"place {place}", value=values)
-            effect.reported(model, place, dict(zip((one.name for one in parameters), values, strict=True)),
-                            np.zeros((len(values), len(values))))
+            effect.reported(
+                model,
+                place,
+                dict(zip((one.name for one in parameters), values, strict=True)),
+                np.zeros((len(values), len(values))),
+            )
 
 
 def _require_range(one: EffectParameter) -> None:
@@ -115,5 +122,6 @@ def _require_range(one: EffectParameter) -> None:
     if not one.linear and not one.grid:
         raise InputError("expected a grid of values, for it is not linear", field=one.name)
     if one.linear and not one.low <= one.none <= one.high:
-        raise InputError("expected its value without the effect (none) within low and high", field=one.name,
-                         value=one.none)
+        raise InputError(
+            "expected its value without the effect (none) within low and high", field=one.name, value=one.none
+        )

@@ -103,8 +103,15 @@ class _Samples:
     def of(record: str, periods: int, y: np.ndarray, nominal: Converter) -> _Samples:
         within = (y > nominal.limits_V[0] + nominal.lsb_V) & (y < nominal.limits_V[1] - nominal.lsb_V)
         codes = np.rint(y[within] / nominal.lsb_V).astype(np.int64)
-        return _Samples(record, periods, *np.unique(y, return_counts=True), *np.unique(codes, return_counts=True),
-                        len(codes), float(codes.std()) if len(codes) else 0.0, int(np.abs(np.diff(codes)).sum()))
+        return _Samples(
+            record,
+            periods,
+            *np.unique(y, return_counts=True),
+            *np.unique(codes, return_counts=True),
+            len(codes),
+            float(codes.std()) if len(codes) else 0.0,
+            int(np.abs(np.diff(codes)).sum()),
+        )
 
 
 def nominal_converter(rig: Rig) -> Converter:
@@ -131,8 +138,9 @@ def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, .
     InputError : y not in V, a rig without converter.
     """
     if campaign.y_unit != "V":
-        raise InputError("expected V: the converter's steps are seen in its own unit", field="unit of y",
-                         value=campaign.y_unit)
+        raise InputError(
+            "expected V: the converter's steps are seen in its own unit", field="unit of y", value=campaign.y_unit
+        )
     nominal = nominal_converter(rig)
     of_channel: dict[str, list[_Samples]] = {name: [] for name in campaign.y_names}
     for source in campaign.records:
@@ -167,9 +175,13 @@ def _resolution(name: str, of: Sequence[_Samples], nominal: Converter, level: fl
     value, std = step.q * lsb, step.std * lsb
     bits = np.log2(2 * nominal.range_V / value)
     return ConverterFinding(
-        name, "resolution", {"resolution_V": Reported(value, std, "V")}, 1 - min(1.0, step.p),
+        name,
+        "resolution",
+        {"resolution_V": Reported(value, std, "V")},
+        1 - min(1.0, step.p),
         f"Sensor {name} is converted in steps of {1e3 * value:.4g} +- {1e3 * std:.2g} mV, {step.q:.3g} times the"
-        f" {1e3 * lsb:.4g} mV of the rig file: {bits:.2f} instead of {nominal.bits} bits over its range.")
+        f" {1e3 * lsb:.4g} mV of the rig file: {bits:.2f} instead of {nominal.bits} bits over its range.",
+    )
 
 
 def _comb(of: Sequence[_Samples]) -> _Step | None:
@@ -253,8 +265,9 @@ def _gaps(of: Sequence[_Samples]) -> _Step | None:
     return _Step(q, std, float((1 - SETTINGS.neighbour) ** min(counts.sum(), 1e5)))
 
 
-def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float, level: float
-              ) -> ConverterFinding | None:
+def _clipping(
+    name: str, of: Sequence[_Samples], nominal: Converter, lsb: float, level: float
+) -> ConverterFinding | None:
     """Clipping at either end of a channel's range."""
     parameters, p_all, count, records = {}, 0.0, 0, set()
     for end, sign, bound in (("low", -1.0, -nominal.limits_V[0]), ("high", 1.0, nominal.limits_V[1])):
@@ -272,14 +285,19 @@ def _clipping(name: str, of: Sequence[_Samples], nominal: Converter, lsb: float,
     levels = " and ".join(f"{e.value:.4g}" for e in parameters.values())
     names = tuple(one.record for one in of if one.record in records)
     return ConverterFinding(
-        name, "clipping", parameters, 1 - min(1.0, p_all),
+        name,
+        "clipping",
+        parameters,
+        1 - min(1.0, p_all),
         f"Sensor {name} clips at {levels} V, {count} samples of record{'s' if len(names) > 1 else ''}"
         f" {', '.join(names)}; the rig file's converter ends at {nominal.limits_V[0]:.4g} and"
-        f" {nominal.limits_V[1]:.4g} V.")
+        f" {nominal.limits_V[1]:.4g} V.",
+    )
 
 
-def _plateau(of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: float, lsb: float, level: float
-             ) -> tuple[float, float, float, dict[str, int]] | None:
+def _plateau(
+    of: Sequence[_Samples], sign: float, bound: float, nominal_lsb: float, lsb: float, level: float
+) -> tuple[float, float, float, dict[str, int]] | None:
     """Level, width, p-value and samples by record of a flat end that no record exceeds."""
     top = max(float(np.max(sign * one.values)) for one in of)
     if top <= 0 or top > bound - max(SETTINGS.nominal_margin * nominal_lsb, lsb):

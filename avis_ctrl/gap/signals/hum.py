@@ -138,8 +138,9 @@ def find_hum(residuals: Sequence[RecordResidual]) -> HumFinding | None:
     return _finding(residuals, best.nominal_Hz, frequency, lines, chance, residuals[0].header.y_unit)
 
 
-def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
-             ) -> np.ndarray:
+def polluted(
+    finding: HumFinding, samples: int, sample_rate_Hz: float, half_lines: int = SETTINGS.polluted_lines
+) -> np.ndarray:
     """(samples // 2 + 1,) mask of the lines of a record's transform that hum reaches, to be left out of a fit.
 
     half_lines : on either side of each harmonic found in any channel. A transform without window leaks as 1/distance,
@@ -149,12 +150,13 @@ def polluted(finding: HumFinding, samples: int, sample_rate_Hz: float, half_line
     for k in finding.harmonics:
         middle = k * finding.frequency_Hz.value * samples / sample_rate_Hz
         low, high = int(np.ceil(middle - half_lines)), int(np.floor(middle + half_lines))
-        mask[max(low, 0):high + 1] = True
+        mask[max(low, 0) : high + 1] = True
     return mask
 
 
-def subtract(finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: float, channels: Sequence[str]
-             ) -> np.ndarray:
+def subtract(
+    finding: HumFinding, e: np.ndarray, y: np.ndarray, sample_rate_Hz: float, channels: Sequence[str]
+) -> np.ndarray:
     """(samples, n_y) y minus the sines of the detected lines, with amplitudes and phases fitted to e (samples, n_y).
 
     e : the residual of the same record, so that the response to u at these frequencies remains.
@@ -247,15 +249,17 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
             # Shifted to zero frequency and averaged down to about 60 values, which makes the fine search cheap.
             block = max(n // 64, 1)
             turned = one.e[:, j] * window * np.exp(-2j * np.pi * k * start / rate * np.arange(n))
-            coarse = turned[:n // block * block].reshape(-1, block).mean(axis=1)
+            coarse = turned[: n // block * block].reshape(-1, block).mean(axis=1)
             t = (np.arange(len(coarse)) * block + (block - 1) / 2) / rate
             pieces.append((k, t, coarse, float(_spread(one, k * start)[j]), n / rate))
 
     def power(shift: float) -> float:
         return -sum(abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t))) ** 2 / s for k, t, c, s, _ in pieces)
+
     reach = 1.0 / max(one.header.duration_s for one in residuals)
-    shift = float(optimize.minimize_scalar(power, bounds=(-reach, reach), method="bounded",
-                                           options={"xatol": 1e-5 * reach}).x)
+    shift = float(
+        optimize.minimize_scalar(power, bounds=(-reach, reach), method="bounded", options={"xatol": 1e-5 * reach}).x
+    )
     information = 0.0
     for k, t, c, s, duration in pieces:
         # The window's mean is 1/2; s is the variance of the cosine or sine amplitude.
@@ -274,7 +278,7 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
         c = _fitted(A, one.e)
         v = np.maximum(np.array([_spread(one, k * f0) for k in ks]), 1e-300)
         # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; only its radial component changes the amplitude.
-        power += (c[:len(ks)] ** 2 + c[len(ks):] ** 2 - 2 * v) / v
+        power += (c[: len(ks)] ** 2 + c[len(ks) :] ** 2 - 2 * v) / v
         weight += 1 / v
     for k, j in hits:
         i = ks.index(int(k) + 1)
@@ -283,15 +287,23 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
 
 
-def _finding(residuals: Sequence[RecordResidual], nominal: float, frequency: Reported, lines: tuple[HumLine, ...],
-             chance: float, unit: str) -> HumFinding:
+def _finding(
+    residuals: Sequence[RecordResidual],
+    nominal: float,
+    frequency: Reported,
+    lines: tuple[HumLine, ...],
+    chance: float,
+    unit: str,
+) -> HumFinding:
     largest = lines[0]
     names = residuals[0].header.y_names
     at = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
     channels = sorted({line.channel for line in lines}, key=names.index)
     A = largest.amplitude
-    sentence = (f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {at} Hz in"
-                f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
-                f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
-                " the lines next to it.")
+    sentence = (
+        f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {at} Hz in"
+        f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
+        f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
+        " the lines next to it."
+    )
     return HumFinding(nominal, frequency, lines, {"frequency_Hz": frequency, "amplitude_V": A}, 1 - chance, sentence)

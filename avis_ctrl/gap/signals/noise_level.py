@@ -101,7 +101,7 @@ class FloorLevel:
 
     @property
     def parameters(self) -> dict[str, Reported]:
-        """"velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz."""
+        """ "velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz."""
         return {"velocity_rms": self.mean_rms} | {f"velocity_rms_{axis}": one for axis, one in self.rms.items()}
 
     @property
@@ -115,10 +115,12 @@ class FloorLevel:
         """The finding in one sentence."""
         m, seen = self.mean_rms, self.mean_seen
         each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in self.rms.items())
-        return (f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
-                f" ({each}), {m.value / self.ambient:.3g} times the rig file's ambient {1e6 * self.ambient:.3g} um/s;"
-                f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to "
-                f"{min(self.seen_to_Hz.values()):.3g} Hz, the rest is a power law carried on.")
+        return (
+            f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
+            f" ({each}), {m.value / self.ambient:.3g} times the rig file's ambient {1e6 * self.ambient:.3g} um/s;"
+            f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to "
+            f"{min(self.seen_to_Hz.values()):.3g} Hz, the rest is a power law carried on."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +143,13 @@ class NoiseLevels:
         return floor if floor and floor.significant and floor.clear and floor.foreign <= SETTINGS.foreign else None
 
 
-def noise_levels(residuals: Sequence[RecordResidual], floor_response: FloorResponse, rig: Rig,
-                 hum: HumFinding | None = None, steps_V: dict[str, float] | None = None) -> NoiseLevels:
+def noise_levels(
+    residuals: Sequence[RecordResidual],
+    floor_response: FloorResponse,
+    rig: Rig,
+    hum: HumFinding | None = None,
+    steps_V: dict[str, float] | None = None,
+) -> NoiseLevels:
     """Levels of floor motion and sensor noise, and which of them are above the rig's [ambient].
 
     Parameters
@@ -160,24 +167,35 @@ def noise_levels(residuals: Sequence[RecordResidual], floor_response: FloorRespo
     ambient = getattr(rig, "ambient", None)
     if ambient is None:
         raise InputError("the rig file does not say what is normal on site", field="ambient")
-    masks = None if hum is None else [polluted(hum, one.header.samples, one.header.sample_rate_Hz, 4)
-                                      for one in residuals]
+    masks = (
+        None if hum is None else [polluted(hum, one.header.samples, one.header.sample_rate_Hz, 4) for one in residuals]
+    )
     rate = first.sample_rate_Hz
     high = quiet_lines(residuals, (SETTINGS.sensor_band[0] * rate, SETTINGS.sensor_band[1] * rate), False, masks)
     if not any(len(one.left) for one in high):
-        raise InputError("expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
-                         " to estimate the noise", field="residuals")
+        raise InputError(
+            "expected lines that hold noise alone, above a tenth of the sample rate; records are too short"
+            " to estimate the noise",
+            field="residuals",
+        )
     sensors = _sensor_noise(high, first.y_names, first.y_unit)
     lsb = {name: (steps_V or {}).get(name, nominal_converter(rig).lsb_V) for name in first.y_names}
     expected = {name: float(np.hypot(ambient.sensor_noise_rms_V, lsb[name] / np.sqrt(12))) for name in first.y_names}
-    raised = tuple(name for name in first.y_names
-                   if sensors[name].value > SETTINGS.sensor_factor * expected[name]
-                   and sensors[name].value - SETTINGS.significant * sensors[name].std > expected[name])
+    raised = tuple(
+        name
+        for name in first.y_names
+        if sensors[name].value > SETTINGS.sensor_factor * expected[name]
+        and sensors[name].value - SETTINGS.significant * sensors[name].std > expected[name]
+    )
     unknown = [k for k, one in enumerate(residuals) if not one.header.floor_names]
     floor = None
     if unknown:
-        low = quiet_lines([residuals[k] for k in unknown], SETTINGS.floor_band_Hz, True,
-                          None if masks is None else [masks[k] for k in unknown])
+        low = quiet_lines(
+            [residuals[k] for k in unknown],
+            SETTINGS.floor_band_Hz,
+            True,
+            None if masks is None else [masks[k] for k in unknown],
+        )
         D = np.array([sensors[name].value ** 2 for name in first.y_names])
         floor = _floor(low, floor_response, D, ambient.floor_velocity_rms_m_per_s, rate)
     return NoiseLevels(floor, sensors, raised)
@@ -195,15 +213,16 @@ def _sensor_noise(high: Sequence[QuietLines], names: tuple[str, ...], unit: str)
     return {name: Reported(float(a), float(s), unit) for name, a, s in zip(names, rms, std, strict=True)}
 
 
-def _floor(low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarray, ambient: float, rate: float
-           ) -> FloorLevel | None:
+def _floor(
+    low: Sequence[QuietLines], floor_response: FloorResponse, D: np.ndarray, ambient: float, rate: float
+) -> FloorLevel | None:
     """Level of the floor from v_hat of every line, band by band."""
     edges = _edges()
     count = len(edges) - 1
     estimated = [_floor_lines(one, floor_response, D) for one in low if len(one.left)]
     if not estimated:
         return None
-    white = ambient ** 2 / (SETTINGS.floor_band_Hz[1] - SETTINGS.floor_band_Hz[0]) * rate / 2
+    white = ambient**2 / (SETTINGS.floor_band_Hz[1] - SETTINGS.floor_band_Hz[0]) * rate / 2
     S, std = np.full((count, 3), np.nan), np.full((count, 3), np.inf)
     louder, foreign = _foreign(estimated, edges, len(D) - 3)
     for b in range(count):
@@ -228,8 +247,9 @@ def _foreign(estimated: Sequence[FloorLines], edges: np.ndarray, n_out: int) -> 
         band = (f >= low) & (f < high)
         if n_out < 1 or np.count_nonzero(band) < 10:
             continue
-        inside, beyond = (max(float(np.median(p[band])) / (n - 1 / 3) - 1, 0.0)
-                          for p, n in ((parallel, 3), (outside, n_out)))
+        inside, beyond = (
+            max(float(np.median(p[band])) / (n - 1 / 3) - 1, 0.0) for p, n in ((parallel, 3), (outside, n_out))
+        )
         louder[b] += beyond
         if inside + beyond > 1:
             shares.append(beyond / (inside + beyond))
@@ -258,8 +278,9 @@ def _floor_lines(one: QuietLines, floor_response: FloorResponse, D: np.ndarray) 
     return one.frequency_Hz, np.abs(v) ** 2 / one.left[:, None], noise, inside, outside, one.left, one.level
 
 
-def _band(one: FloorLines, low: float, high: float, white: float, louder: float
-          ) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _band(
+    one: FloorLines, low: float, high: float, white: float, louder: float
+) -> tuple[np.ndarray, np.ndarray, float] | None:
     """S (3,), its variance, and the record's level; None with fewer than four lines."""
     f, power, noise, _, outside, fraction, level = one
     inside = (f >= low) & (f < high)
@@ -275,7 +296,7 @@ def _band(one: FloorLines, low: float, high: float, white: float, louder: float
         S = np.maximum(np.sum(w * (P - N), axis=0) / w.sum(axis=0), 0.25 * white)
     total = w.sum(axis=0)
     raw = np.sum(w * (P - N), axis=0) / total
-    return raw, np.sum(w ** 2 * (S + N) ** 2 / h, axis=0) / total ** 2 * HANN_SHARED, level
+    return raw, np.sum(w**2 * (S + N) ** 2 / h, axis=0) / total**2 * HANN_SHARED, level
 
 
 def _at_zero_level(rows: list[tuple[np.ndarray, np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
@@ -299,8 +320,9 @@ def _at_zero_level(rows: list[tuple[np.ndarray, np.ndarray, float]]) -> tuple[np
     return S, std
 
 
-def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarray, ambient: float, foreign: float
-           ) -> FloorLevel | None:
+def _level(
+    S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarray, ambient: float, foreign: float
+) -> FloorLevel | None:
     width, centre = np.diff(edges), np.sqrt(edges[1:] * edges[:-1])
     seen2, seen_v, all2, all_v = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     ends = {}
@@ -311,20 +333,23 @@ def _level(S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarra
         ends[axis] = float(edges[m])
         seen2[j], seen_v[j] = np.sum(S[:m, j] * width[:m]), np.sum((std[:m, j] * width[:m]) ** 2)
         tail, tail_std = _tail(centre[:m], S[:m, j], std[:m, j], edges[m])
-        all2[j], all_v[j] = seen2[j] + tail, seen_v[j] + tail_std ** 2
+        all2[j], all_v[j] = seen2[j] + tail, seen_v[j] + tail_std**2
 
     def root(square: float, variance: float) -> Reported:
         rms = np.sqrt(max(square, 1e-30))
         return Reported(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
+
     rms = {axis: root(all2[j], all_v[j]) for j, axis in enumerate("xyz")}
     seen = {axis: root(seen2[j], seen_v[j]) for j, axis in enumerate("xyz")}
     mean, mean_seen = root(all2.mean(), all_v.sum() / 9), root(seen2.mean(), seen_v.sum() / 9)
 
     def above(one: Reported, factor: float) -> bool:
         return one.value > factor * ambient and one.value - SETTINGS.significant * one.std > ambient
+
     significant = _excess(ambient, mean, mean_seen, seen) > SETTINGS.significant
-    clear = (any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values()))
-             or any(above(one, SETTINGS.total_factor) for one in (mean, *rms.values())))
+    clear = any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values())) or any(
+        above(one, SETTINGS.total_factor) for one in (mean, *rms.values())
+    )
     return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, significant, clear)
 
 
@@ -341,8 +366,8 @@ def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[fl
     shape = f[None, :] ** -slopes[:, None]
     x = np.geomspace(end, SETTINGS.floor_band_Hz[1], 200)
     integral = np.trapezoid(x[None, :] ** -slopes[:, None], x, axis=1)
-    w = 1 / std ** 2
-    a_var = 1 / (shape ** 2 @ w)
+    w = 1 / std**2
+    a_var = 1 / (shape**2 @ w)
     a = np.maximum((shape * S) @ w * a_var, 0.0)
     chi2 = ((S - a[:, None] * shape) ** 2) @ w
     # A spectrum that is not a power law widens all errors.
@@ -351,4 +376,4 @@ def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[fl
     weight /= weight.sum()
     tail = a * integral
     mean = float(weight @ tail)
-    return mean, float(np.sqrt(weight @ (a_var * scale * integral ** 2 + (tail - mean) ** 2)))
+    return mean, float(np.sqrt(weight @ (a_var * scale * integral**2 + (tail - mean) ** 2)))

@@ -66,8 +66,12 @@ class QuietLines:
         return np.abs(self.e) ** 2 / self.left[:, None]
 
 
-def quiet_lines(residuals: Sequence[RecordResidual], band_Hz: tuple[float, float], narrow: bool,
-                polluted: Sequence[np.ndarray] | None = None) -> tuple[QuietLines, ...]:
+def quiet_lines(
+    residuals: Sequence[RecordResidual],
+    band_Hz: tuple[float, float],
+    narrow: bool,
+    polluted: Sequence[np.ndarray] | None = None,
+) -> tuple[QuietLines, ...]:
     """Quiet lines of each record, in a band.
 
     narrow : use narrow windows, for the band of the modes; otherwise wide ones.
@@ -99,7 +103,7 @@ def _plain(one: RecordResidual, keep: np.ndarray) -> QuietLines:
 
 
 def _level(one: RecordResidual) -> float:
-    return float(np.sqrt(np.mean(one.u ** 2)))
+    return float(np.sqrt(np.mean(one.u**2)))
 
 
 def _regression(residuals: Sequence[RecordResidual], keep: Sequence[np.ndarray], narrow: bool) -> list[QuietLines]:
@@ -114,7 +118,7 @@ def _regression(residuals: Sequence[RecordResidual], keep: Sequence[np.ndarray],
     blocks = len(lines) // width
     if not blocks:
         return [_plain(one, np.zeros(len(one.E), bool)) for one in residuals]
-    at = lines[:blocks * width].reshape(blocks, width)
+    at = lines[: blocks * width].reshape(blocks, width)
     x = np.linspace(-1, 1, width)[:, None] ** np.arange(order + 1)
     U = np.stack([one.U[at] for one in residuals], axis=1)
     # Columns are normalised over all records together; columns of silent bands stay harmless.

@@ -48,7 +48,7 @@ class RecordResidual:
     def driven(self) -> np.ndarray:
         """(n,) mask of the lines that u excites."""
         power = np.sum(np.abs(self.U) ** 2, axis=1)
-        return power > FIT.silent_line ** 2 * power.max() if power.max() > 0 else np.zeros(len(power), bool)
+        return power > FIT.silent_line**2 * power.max() if power.max() > 0 else np.zeros(len(power), bool)
 
     @property
     def silent(self) -> bool:
@@ -70,5 +70,6 @@ class RecordResidual:
 def record_residuals(campaign: Campaign, predicted: Mapping[str, np.ndarray]) -> tuple[RecordResidual, ...]:
     """Residuals of the records for which a prediction (samples, n_y) is given by name; memory holds all of them."""
     records = (campaign.named(name).load() for name in predicted)
-    return tuple(RecordResidual(record.header, record.u, record.y - predicted[record.header.name])
-                 for record in records)
+    return tuple(
+        RecordResidual(record.header, record.u, record.y - predicted[record.header.name]) for record in records
+    )

@@ -30,21 +30,28 @@ class Repaired:
     clipped: dict[str, float]
 
 
-def channel_limits(rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFinding, ...] = ()
-                   ) -> dict[str, tuple[float, float]]:
+def channel_limits(
+    rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFinding, ...] = ()
+) -> dict[str, tuple[float, float]]:
     """Lowest and highest value [V] that each channel can show: as found, otherwise as in the rig file."""
     limits = dict.fromkeys(names, nominal_converter(rig).limits_V)
     for one in findings:
         if one.kind == "clipping" and one.channel in limits:
             low, high = limits[one.channel]
             of = one.parameters
-            limits[one.channel] = (of["clip_low_V"].value if "clip_low_V" in of else low,
-                                   of["clip_high_V"].value if "clip_high_V" in of else high)
+            limits[one.channel] = (
+                of["clip_low_V"].value if "clip_low_V" in of else low,
+                of["clip_high_V"].value if "clip_high_V" in of else high,
+            )
     return limits
 
 
-def repair(campaign: Campaign, rig: Rig, predicted: Mapping[str, np.ndarray] | None = None,
-           findings: tuple[ConverterFinding, ...] = ()) -> Repaired:
+def repair(
+    campaign: Campaign,
+    rig: Rig,
+    predicted: Mapping[str, np.ndarray] | None = None,
+    findings: tuple[ConverterFinding, ...] = (),
+) -> Repaired:
     """Every record in memory, with clipped samples replaced if a prediction (samples, n_y) of the record is given.
 
     Samples within half a nominal step of a limit count as clipped. u is limited to the rig's drive limit: larger

@@ -14,8 +14,9 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded
 
 
-def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping: float, drift: int = 1
-              ) -> SingleAxisFit:
+def fit_decay(
+    time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping: float, drift: int = 1
+) -> SingleAxisFit:
     """Corner frequency and damping ratio of a decay, common to all channels.
 
     Parameters
@@ -30,11 +31,17 @@ def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping:
     time, y = np.asarray(time, float).ravel(), np.asarray(channels, float)
     y = y[:, None] if y.ndim == 1 else y
     if y.shape[0] != len(time) or len(time) < 32 or not np.all(np.isfinite(y)) or not np.all(np.diff(time) > 0):
-        raise InputError("expected at least 32 finite samples of each channel at increasing times", field="decay",
-                         value=(len(time), y.shape))
+        raise InputError(
+            "expected at least 32 finite samples of each channel at increasing times",
+            field="decay",
+            value=(len(time), y.shape),
+        )
     if not (corner_Hz > 0 and damping > 0) or not 0 <= drift <= 3:
-        raise InputError("expected a positive corner in Hz and damping to start from, and a drift of degree 0 to 3",
-                         field="corner_Hz, damping, drift", value=(corner_Hz, damping, drift))
+        raise InputError(
+            "expected a positive corner in Hz and damping to start from, and a drift of degree 0 to 3",
+            field="corner_Hz, damping, drift",
+            value=(corner_Hz, damping, drift),
+        )
     if not np.all(y.std(0) > 0):
         raise InputError("expected channels that move; one is constant", field="decay")
     y, t = y / y.std(0), time - time[0]
@@ -43,23 +50,32 @@ def fit_decay(time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping:
     def left(x: np.ndarray) -> np.ndarray:
         X = _columns(t, x * start, drift)
         return y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+
     found = least_squares(lambda x: left(x).ravel(), np.ones(2), bounds=(1e-3, 1e3), xtol=1e-12, ftol=1e-12)
     theta, e = found.x * start, left(found.x)
     if np.linalg.norm(e) > 0.5 * np.linalg.norm(y):
-        raise ComputationError("no decaying oscillation fits the record",
-                               measured=f"{100 * np.linalg.norm(e) / np.linalg.norm(y):.0f} % of it is left",
-                               cause="a start before the release, or a second event inside",
-                               next_step="choose the stretch after one release")
-    return concluded("free decay of a second-order oscillator", {"corner_Hz": "Hz", "damping": ""}, theta, e,
-                     found.jac.reshape(*e.shape, 2) / start, 2 + (3 + drift) * y.shape[1], (time, y, y - e),
-                     notes=("at the amplitudes of this stretch; what moves with the amplitude, the deviations do not "
-                            "hold",))
+        raise ComputationError(
+            "no decaying oscillation fits the record",
+            measured=f"{100 * np.linalg.norm(e) / np.linalg.norm(y):.0f} % of it is left",
+            cause="a start before the release, or a second event inside",
+            next_step="choose the stretch after one release",
+        )
+    return concluded(
+        "free decay of a second-order oscillator",
+        {"corner_Hz": "Hz", "damping": ""},
+        theta,
+        e,
+        found.jac.reshape(*e.shape, 2) / start,
+        2 + (3 + drift) * y.shape[1],
+        (time, y, y - e),
+        notes=("at the amplitudes of this stretch; what moves with the amplitude, the deviations do not hold",),
+    )
 
 
 def _columns(t: np.ndarray, theta: np.ndarray, drift: int) -> np.ndarray:
     """(n, 3 + drift): both solutions and the drift; finite at critical damping and beyond."""
     w0, zeta = 2 * np.pi * theta[0], theta[1]
-    rest = complex(w0 * np.emath.sqrt(1 - zeta ** 2))
+    rest = complex(w0 * np.emath.sqrt(1 - zeta**2))
     envelope = np.exp(-zeta * w0 * t)
     if rest.imag:  # aperiodic: cosh and sinh, combined with the exponential before they overflow
         slow, fast = np.exp(-(zeta * w0 - abs(rest.imag)) * t), np.exp(-(zeta * w0 + abs(rest.imag)) * t)

@@ -20,9 +20,15 @@ from avis_ctrl.identification.single_axis.fit import SingleAxisFit, regression
 Coulomb = Literal["symmetric", "asymmetric", "none"]
 
 
-def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_Hz: float = 60.0,
-              coulomb: Coulomb = "symmetric", offset: bool = True, reference: np.ndarray | None = None
-              ) -> SingleAxisFit:
+def fit_drive(
+    time: np.ndarray,
+    position: np.ndarray,
+    force: np.ndarray,
+    cutoff_Hz: float = 60.0,
+    coulomb: Coulomb = "symmetric",
+    offset: bool = True,
+    reference: np.ndarray | None = None,
+) -> SingleAxisFit:
     """Mass, viscous and Coulomb friction and offset of a drive.
 
     Parameters
@@ -44,8 +50,11 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
     rate = _sample_rate(time)
     others = [position, force] if reference is None else [position, force, np.asarray(reference, float).ravel()]
     if any(other.shape != time.shape for other in others):
-        raise InputError(f"expected {len(time)} samples of each channel", field="samples",
-                         value=tuple(other.shape[0] for other in others))
+        raise InputError(
+            f"expected {len(time)} samples of each channel",
+            field="samples",
+            value=tuple(other.shape[0] for other in others),
+        )
     if not all(np.all(np.isfinite(other)) for other in others):
         raise InputError("expected finite numbers", field="samples")
     if not 0 < cutoff_Hz < rate / 2:
@@ -64,21 +73,25 @@ def fit_drive(time: np.ndarray, position: np.ndarray, force: np.ndarray, cutoff_
     return regression(model, units, X[inside], y[inside], time[inside], None if Z is None else Z[inside])
 
 
-def _columns(position: np.ndarray, rate: float, sections: np.ndarray, coulomb: str, offset: bool
-             ) -> tuple[dict[str, str], np.ndarray]:
+def _columns(
+    position: np.ndarray, rate: float, sections: np.ndarray, coulomb: str, offset: bool
+) -> tuple[dict[str, str], np.ndarray]:
     """Units by name and columns (n, p) of the inverse dynamic model after the parallel filter."""
     q = signal.sosfiltfilt(sections, position)
     v = np.gradient(q, 1 / rate)
     a = np.empty_like(q)
-    a[1:-1] = (q[2:] - 2 * q[1:-1] + q[:-2]) * rate ** 2
+    a[1:-1] = (q[2:] - 2 * q[1:-1] + q[:-2]) * rate**2
     a[0], a[-1] = a[1], a[-2]
     sign = np.sign(v)
     found: list[tuple[str, str, np.ndarray]] = [("M", "kg", a)]
     if coulomb == "asymmetric":
         ahead, back = v > 0, v < 0
-        found += [("Fv_ahead", "N s/m", v * ahead), ("Fv_back", "N s/m", v * back),
-                  ("Fc_ahead", "N", signal.sosfiltfilt(sections, 1.0 * ahead)),
-                  ("Fc_back", "N", signal.sosfiltfilt(sections, -1.0 * back))]
+        found += [
+            ("Fv_ahead", "N s/m", v * ahead),
+            ("Fv_back", "N s/m", v * back),
+            ("Fc_ahead", "N", signal.sosfiltfilt(sections, 1.0 * ahead)),
+            ("Fc_back", "N", signal.sosfiltfilt(sections, -1.0 * back)),
+        ]
     else:
         found.append(("Fv", "N s/m", v))
         if coulomb == "symmetric":
@@ -91,6 +104,9 @@ def _columns(position: np.ndarray, rate: float, sections: np.ndarray, coulomb: s
 def _sample_rate(time: np.ndarray) -> float:
     steps = np.diff(time)
     if len(time) < 32 or not np.all(np.isfinite(time)) or np.any(steps <= 0) or np.ptp(steps) > 0.01 * np.mean(steps):
-        raise InputError("expected at least 32 uniform, increasing times", field="t",
-                         value=None if len(time) < 2 else (float(np.min(steps)), float(np.max(steps))))
+        raise InputError(
+            "expected at least 32 uniform, increasing times",
+            field="t",
+            value=None if len(time) < 2 else (float(np.min(steps)), float(np.max(steps))),
+        )
     return float((len(time) - 1) / (time[-1] - time[0]))

@@ -100,11 +100,17 @@ class SingleAxisFit(Shown):
 
     def lines(self) -> list[str]:
         """The result as text: one line for each parameter, then the residual."""
-        found = [f"{name} = {uncertain_value.text(value, sigma, unit)}" for name, value, sigma, unit
-                 in zip(self.names, self.values, self.standard_deviation, self.information.units, strict=True)]
-        found.append(f"rank {self.information.rank} of {len(self.names)}; residual "
-                     f"{100 * self.residual.share:.2f} % of the measured; chi2/dof {self.chi2_per_dof:.3g} against "
-                     f"{self.noise} noise")
+        found = [
+            f"{name} = {uncertain_value.text(value, sigma, unit)}"
+            for name, value, sigma, unit in zip(
+                self.names, self.values, self.standard_deviation, self.information.units, strict=True
+            )
+        ]
+        found.append(
+            f"rank {self.information.rank} of {len(self.names)}; residual "
+            f"{100 * self.residual.share:.2f} % of the measured; chi2/dof {self.chi2_per_dof:.3g} against "
+            f"{self.noise} noise"
+        )
         return [*found, f"standard deviations: {self.covariance_method}", *self.notes]
 
 
@@ -112,12 +118,12 @@ def andrews_lags(scores: np.ndarray) -> int:
     """Number of lags of the Bartlett kernel for scores (n, p): 1.1447 (alpha(1) n)^(1/3)."""
     n = len(scores)
     now, before = scores[1:], scores[:-1]
-    power = np.maximum(np.sum(before ** 2, axis=0), np.finfo(float).tiny)
+    power = np.maximum(np.sum(before**2, axis=0), np.finfo(float).tiny)
     rho = np.clip(np.sum(now * before, axis=0) / power, -0.999, 0.999)
     sigma4 = np.mean((now - rho * before) ** 2, axis=0) ** 2
     # Each score is normalised, so that the parameters' units have no influence.
-    weight = 1 / np.maximum(np.mean(scores ** 2, axis=0) ** 2, np.finfo(float).tiny)
-    top = np.sum(weight * 4 * rho ** 2 * sigma4 / ((1 - rho) ** 6 * (1 + rho) ** 2))
+    weight = 1 / np.maximum(np.mean(scores**2, axis=0) ** 2, np.finfo(float).tiny)
+    top = np.sum(weight * 4 * rho**2 * sigma4 / ((1 - rho) ** 6 * (1 + rho) ** 2))
     bottom = np.sum(weight * sigma4 / (1 - rho) ** 4)
     alpha = top / bottom if bottom > 0 else 0.0
     return int(min(np.ceil(1.1447 * (alpha * n) ** (1 / 3)), n // 4))
@@ -162,10 +168,22 @@ def inverse_product(Z: np.ndarray, X: np.ndarray) -> np.ndarray:
     return np.linalg.pinv((Z / size_z).T @ (X / size), rcond=1e-12) / size[:, None] / size_z
 
 
-def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: np.ndarray, J: np.ndarray, spent: float,
-              drawn: tuple[np.ndarray, np.ndarray, np.ndarray], *, instruments: np.ndarray | None = None,
-              lags: int | None = None, method: str = "", relative: np.ndarray | None = None,
-              given_chi2: float | None = None, notes: tuple[str, ...] = ()) -> SingleAxisFit:
+def concluded(
+    model: str,
+    parameters: Mapping[str, str],
+    theta: np.ndarray,
+    e: np.ndarray,
+    J: np.ndarray,
+    spent: float,
+    drawn: tuple[np.ndarray, np.ndarray, np.ndarray],
+    *,
+    instruments: np.ndarray | None = None,
+    lags: int | None = None,
+    method: str = "",
+    relative: np.ndarray | None = None,
+    given_chi2: float | None = None,
+    notes: tuple[str, ...] = (),
+) -> SingleAxisFit:
     """Build the result of a fit from its residual.
 
     Parameters
@@ -183,7 +201,7 @@ def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: n
     J, e = J.reshape(n, -1, p), e.reshape(n, -1)
     Z = J if instruments is None else instruments.reshape(J.shape)
     bread, dof = inverse_product(Z.reshape(-1, p), J.reshape(-1, p)), e.size - round(spent)
-    level = float(np.sum(e ** 2)) / dof if lags is None else 1.0
+    level = float(np.sum(e**2)) / dof if lags is None else 1.0
     plain = bread @ np.einsum("nrp,nrq->pq", Z, Z) @ bread.T * level
     scores = np.einsum("nrp,nr->np", Z, e)
     used = andrews_lags(scores) if lags is None else min(lags, n // 4)
@@ -195,20 +213,47 @@ def concluded(model: str, parameters: Mapping[str, str], theta: np.ndarray, e: n
     flat = np.abs(left) ** 2
     tiny, honest, white = np.finfo(float).tiny, np.sqrt(np.diag(covariance)), np.sqrt(np.abs(np.diag(plain)))
     residual = ResidualStatistics(
-        float(np.sqrt(np.mean(flat))), float(np.linalg.norm(left) / max(float(np.linalg.norm(reference)), tiny)),
+        float(np.sqrt(np.mean(flat))),
+        float(np.linalg.norm(left) / max(float(np.linalg.norm(reference)), tiny)),
         float(np.sum(np.real(np.conj(left[1:]) * left[:-1])) / max(float(np.sum(flat)), tiny)),
-        float(np.max(honest / np.maximum(white, tiny))), used)
-    how = method or (f"Newey-West, {used} lags by Andrews' rule; {residual.inflation:.1f} times those of a white "
-                     "residual")
-    information = Information(tuple(parameters), theta, tuple(parameters.values()),
-                              np.einsum("nrp,nrq->pq", J, J) / level, np.where(theta == 0, 1.0, np.abs(theta)))
-    chi2 = float(np.sum(e ** 2)) / level if given_chi2 is None else given_chi2
-    return SingleAxisFit(model, information, covariance, how, chi2, dof, "residual" if given_chi2 is None else "given",
-                         residual, abscissa, measured, predicted, notes)
+        float(np.max(honest / np.maximum(white, tiny))),
+        used,
+    )
+    how = method or (
+        f"Newey-West, {used} lags by Andrews' rule; {residual.inflation:.1f} times those of a white residual"
+    )
+    information = Information(
+        tuple(parameters),
+        theta,
+        tuple(parameters.values()),
+        np.einsum("nrp,nrq->pq", J, J) / level,
+        np.where(theta == 0, 1.0, np.abs(theta)),
+    )
+    chi2 = float(np.sum(e**2)) / level if given_chi2 is None else given_chi2
+    return SingleAxisFit(
+        model,
+        information,
+        covariance,
+        how,
+        chi2,
+        dof,
+        "residual" if given_chi2 is None else "given",
+        residual,
+        abscissa,
+        measured,
+        predicted,
+        notes,
+    )
 
 
-def regression(model: str, parameters: Mapping[str, str], X: np.ndarray, y: np.ndarray, time: np.ndarray,
-               instruments: np.ndarray | None = None) -> SingleAxisFit:
+def regression(
+    model: str,
+    parameters: Mapping[str, str],
+    X: np.ndarray,
+    y: np.ndarray,
+    time: np.ndarray,
+    instruments: np.ndarray | None = None,
+) -> SingleAxisFit:
     """Regression y = X theta + e for time series, by least squares or instrumental variables.
 
     parameters : unit by name. X, instruments : (n, p); y : (n,). Instruments Z of the same shape give the estimate
@@ -221,13 +266,19 @@ def regression(model: str, parameters: Mapping[str, str], X: np.ndarray, y: np.n
     Z = X if instruments is None else instruments
     n, p = X.shape
     if y.shape != (n,) or Z.shape != (n, p) or n <= 4 * p:
-        raise InputError(f"expected {p} columns and more than {4 * p} samples of equal length", field="samples",
-                         value=(X.shape, y.shape, Z.shape))
+        raise InputError(
+            f"expected {p} columns and more than {4 * p} samples of equal length",
+            field="samples",
+            value=(X.shape, y.shape, Z.shape),
+        )
     if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(Z))):
         raise InputError("expected finite numbers", field="samples")
     if lost := [name for name, x, z in zip(parameters, X.T, Z.T, strict=True) if not (np.any(x) and np.any(z))]:
-        raise ComputationError(f"the data hold nothing of {lost[0]}", measured="its column is zero throughout",
-                               cause="an axis that never moved, or a channel that was mapped wrongly",
-                               next_step="look at the columns, or leave the parameter out")
+        raise ComputationError(
+            f"the data hold nothing of {lost[0]}",
+            measured="its column is zero throughout",
+            cause="an axis that never moved, or a channel that was mapped wrongly",
+            next_step="look at the columns, or leave the parameter out",
+        )
     theta = inverse_product(Z, X) @ (Z.T @ y)
     return concluded(model, parameters, theta, y - X @ theta, X, p, (time, y, X @ theta), instruments=Z)

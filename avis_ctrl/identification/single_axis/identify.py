@@ -1,9 +1,9 @@
 """Identification of a single-axis model from files.
 
-    identify_single_axis("seismometer", folder, {"drive": "FuncGen", "coil": "Current", "displacement": "Laser",
-                         "t": "Seconds"}, scale={"coil": 0.9425e-6, ...})
-    identify_single_axis("drive", file, {"force": "vir", "position": "qm", "reference": "qg", "t": "t"},
-                         scale={"force": 35.15})
+identify_single_axis("seismometer", folder, {"drive": "FuncGen", "coil": "Current", "displacement": "Laser",
+                     "t": "Seconds"}, scale={"coil": 0.9425e-6, ...})
+identify_single_axis("drive", file, {"force": "vir", "position": "qm", "reference": "qg", "t": "t"},
+                     scale={"force": 35.15})
 """
 
 from __future__ import annotations
@@ -32,8 +32,13 @@ ROLES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "drive": ("force", ("position",), ("reference",)),
     "oscillator": ("u", ("y",), ()),
 }
-TRUTH, WORD, NUMBER, WHOLE, PAIR = ("true or false", "a word", "a number", "a whole number",
-                                    "two numbers, low and high")
+TRUTH, WORD, NUMBER, WHOLE, PAIR = (
+    "true or false",
+    "a word",
+    "a number",
+    "a whole number",
+    "two numbers, low and high",
+)
 OPTIONS: dict[str, dict[str, str]] = {
     "seismometer": {"delay": TRUTH},
     "drive": {"cutoff_Hz": NUMBER, "coulomb": WORD, "offset": TRUTH},
@@ -42,9 +47,15 @@ OPTIONS: dict[str, dict[str, str]] = {
 }
 
 
-def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str], *,
-                         scale: Mapping[str, float] | None = None, sample_rate_Hz: float | None = None,
-                         **options: Any) -> SingleAxisFit:
+def identify_single_axis(
+    kind: str,
+    path: str | Path,
+    columns: Mapping[str, str],
+    *,
+    scale: Mapping[str, float] | None = None,
+    sample_rate_Hz: float | None = None,
+    **options: Any,
+) -> SingleAxisFit:
     """Read measurements of one axis and fit a model to them.
 
     Parameters
@@ -94,8 +105,9 @@ def identify_single_axis(kind: str, path: str | Path, columns: Mapping[str, str]
     return fit_oscillator(channel["u"], channel["y"], rate, **{"band_Hz": (0.005 * rate, 0.4 * rate)} | options)
 
 
-def sine_records(campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
-                 ) -> tuple[list[SineRecord], list[str]]:
+def sine_records(
+    campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
+) -> tuple[list[SineRecord], list[str]]:
     """The sine of each record, in order of frequency, and the reasons why the others were refused.
 
     driven, measured : roles, in the order of the campaign's u and y.
@@ -115,8 +127,9 @@ def sine_records(campaign: Campaign, driven: str, measured: Sequence[str], scale
     return sorted(found, key=lambda record: record.frequency_Hz), refused
 
 
-def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
-                 ) -> tuple[Responses, list[str]]:
+def stepped_sine(
+    campaign: Campaign, driven: str, measured: Sequence[str], scale: Mapping[str, float] | None = None
+) -> tuple[Responses, list[str]]:
     """Responses to the drive from sine records, and the reasons why the others were omitted.
 
     Raises
@@ -126,39 +139,55 @@ def stepped_sine(campaign: Campaign, driven: str, measured: Sequence[str], scale
     records, refused = sine_records(campaign, driven, measured, scale)
     records = distinct(records)
     if len(records) < 4:
-        raise ComputationError("too few sine records", measured=f"{len(records)} usable of {len(campaign.records)}",
-                               cause=refused[0] if refused else "repeated frequencies",
-                               next_step="map the columns, and give at least four frequencies about the corner")
+        raise ComputationError(
+            "too few sine records",
+            measured=f"{len(records)} usable of {len(campaign.records)}",
+            cause=refused[0] if refused else "repeated frequencies",
+            next_step="map the columns, and give at least four frequencies about the corner",
+        )
     return responses_of(records, driven, measured), refused
 
 
 def distinct(records: Sequence[SineRecord]) -> list[SineRecord]:
     """Records in order of frequency, without repeated frequencies."""
-    return [record for k, record in enumerate(records)
-            if k == 0 or record.frequency_Hz > 1.001 * records[k - 1].frequency_Hz]
+    return [
+        record
+        for k, record in enumerate(records)
+        if k == 0 or record.frequency_Hz > 1.001 * records[k - 1].frequency_Hz
+    ]
 
 
 def responses_of(records: Sequence[SineRecord], driven: str, measured: Sequence[str]) -> Responses:
     """Responses to the drive with their variances."""
     pairs = {role: [record.ratio(role, driven) for record in records] for role in measured}
-    return Responses(np.array([record.frequency_Hz for record in records]),
-                     {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
-                     {role: np.array([v for _, v in pair]) for role, pair in pairs.items()})
+    return Responses(
+        np.array([record.frequency_Hz for record in records]),
+        {role: np.array([H for H, _ in pair]) for role, pair in pairs.items()},
+        {role: np.array([v for _, v in pair]) for role, pair in pairs.items()},
+    )
 
 
 def _check_option(kind: str, name: str, value: Any) -> None:
     if name not in OPTIONS[kind]:
         raise InputError(f"expected one of {', '.join(sorted(OPTIONS[kind]))}", field=f"option of {kind}", value=name)
+
     def number(x: Any) -> bool:
         return isinstance(x, (int, float)) and not isinstance(x, bool) and not np.isnan(x)
+
     wanted, pair = OPTIONS[kind][name], isinstance(value, (tuple, list)) and len(value) == 2 and all(map(number, value))
-    if not {TRUTH: isinstance(value, bool), WORD: isinstance(value, str), NUMBER: number(value),
-            WHOLE: isinstance(value, int) and number(value), PAIR: pair}[wanted]:
+    if not {
+        TRUTH: isinstance(value, bool),
+        WORD: isinstance(value, str),
+        NUMBER: number(value),
+        WHOLE: isinstance(value, int) and number(value),
+        PAIR: pair,
+    }[wanted]:
         raise InputError(f"expected {wanted}", field=name, value=value)
 
 
-def roles_of(kind: str, columns: Mapping[str, str], scale: Mapping[str, float], without: Sequence[str] = ()
-             ) -> tuple[str, list[str]]:
+def roles_of(
+    kind: str, columns: Mapping[str, str], scale: Mapping[str, float], without: Sequence[str] = ()
+) -> tuple[str, list[str]]:
     """Role of the input (empty if there is none) and roles of the outputs that are mapped; `without` some of the
     optional ones.
 
@@ -177,16 +206,18 @@ def roles_of(kind: str, columns: Mapping[str, str], scale: Mapping[str, float], 
             raise InputError(f"expected a column for {role}", field="columns", value=dict(columns))
     for role, factor in scale.items():
         if role not in columns or not (np.isfinite(factor) and factor != 0):
-            raise InputError("expected a finite factor, not zero, of a role that is mapped", field=f"scale of {role}",
-                             value=factor)
+            raise InputError(
+                "expected a finite factor, not zero, of a role that is mapped", field=f"scale of {role}", value=factor
+            )
     measured = [role for role in (*needed, *optional) if role in columns]
     if not measured:
         raise InputError(f"expected a column for {' or '.join(optional)}", field="columns", value=dict(columns))
     return driven, measured
 
 
-def read_columns(path: str | Path, columns: Mapping[str, str], driven: str, measured: Sequence[str],
-                 sample_rate_Hz: float | None) -> Campaign:
+def read_columns(
+    path: str | Path, columns: Mapping[str, str], driven: str, measured: Sequence[str], sample_rate_Hz: float | None
+) -> Campaign:
     """Records of a file, with the columns of these roles. Raises InputError."""
     mapping = {"y": [columns[role] for role in measured]}
     hints: dict[str, Any] = {} if sample_rate_Hz is None else {"sample_rate_Hz": sample_rate_Hz}
@@ -208,8 +239,9 @@ def _single(campaign: Campaign, path: str | Path) -> RecordSource:
     return campaign.records[0]
 
 
-def _channels(source: RecordSource, driven: str, measured: Sequence[str], scale: Mapping[str, float]
-              ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _channels(
+    source: RecordSource, driven: str, measured: Sequence[str], scale: Mapping[str, float]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     record = source.load()
     found = {driven: record.u[:, 0]} if driven else {}
     found |= {role: record.y[:, k] for k, role in enumerate(measured)}
@@ -217,10 +249,20 @@ def _channels(source: RecordSource, driven: str, measured: Sequence[str], scale:
     return time, {role: scale.get(role, 1.0) * values for role, values in found.items()}
 
 
-def _decay(time: np.ndarray, y: np.ndarray, corner_Hz: float = 1.0, damping: float = 0.1, start_s: float = 0.0,
-           end_s: float = np.inf, drift: int = 1) -> SingleAxisFit:
+def _decay(
+    time: np.ndarray,
+    y: np.ndarray,
+    corner_Hz: float = 1.0,
+    damping: float = 0.1,
+    start_s: float = 0.0,
+    end_s: float = np.inf,
+    drift: int = 1,
+) -> SingleAxisFit:
     keep = (time >= start_s) & (time <= end_s)
     if np.count_nonzero(keep) < 32:
-        raise InputError(f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
-                         field="start_s, end_s", value=(start_s, end_s))
+        raise InputError(
+            f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
+            field="start_s, end_s",
+            value=(start_s, end_s),
+        )
     return fit_decay(time[keep], y[keep], corner_Hz, damping, drift)

@@ -57,29 +57,42 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
         found = least_squares(lambda z, w=weight, a=scale: left(z * a, w), x / scale, xtol=1e-13, ftol=1e-13)
         x = found.x * scale
         e = left(x, weight)
-        error = (e[:len(f)] + 1j * e[len(f):]) / weight
+        error = (e[: len(f)] + 1j * e[len(f) :]) / weight
         power = np.abs(error) ** 2
         level = uniform_filter1d(power, 2 * SMOOTHED + 1, mode="nearest")
         weight = np.sqrt(2 / np.maximum(level, 1e-12 * power.mean() + np.finfo(float).tiny))
-    to_units = np.array([1 / s0 ** 2, 1 / s0, 1.0])
+    to_units = np.array([1 / s0**2, 1 / s0, 1.0])
     if not (x[0] > 0 and x[2] > 0):
-        raise ComputationError("no oscillator with positive mass and stiffness fits the record",
-                               measured=f"m {x[0] * to_units[0]:.3g}, k {x[2]:.3g}",
-                               cause="input and output exchanged, or a band without the resonance",
-                               next_step="check the columns and widen the band")
+        raise ComputationError(
+            "no oscillator with positive mass and stiffness fits the record",
+            measured=f"m {x[0] * to_units[0]:.3g}, k {x[2]:.3g}",
+            cause="input and output exchanged, or a band without the resonance",
+            next_step="check the columns and widen the band",
+        )
     J = slopes(lambda x: left(x, weight), x, np.abs(x)) / to_units
     n, e, spent = len(f), left(x, weight), len(x) + TRANSIENT
     # The damping is determined by the few lines of the resonance, to which the fit adapts.
-    return concluded("m y'' + d y' + k y = u", PARAMETERS, x * to_units, e.reshape(2, n).T,
-                     J.reshape(2, n, -1).swapaxes(0, 1), spent, (f, Y, Y - error), lags=CORRELATED_LINES,
-                     method=f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
-                     notes=("of the best linear oscillator at the level of this record; another level has another, "
-                            "which the deviations do not hold",
-                            "figure data: spectrum of the output and of the model's, transient included"))
+    return concluded(
+        "m y'' + d y' + k y = u",
+        PARAMETERS,
+        x * to_units,
+        e.reshape(2, n).T,
+        J.reshape(2, n, -1).swapaxes(0, 1),
+        spent,
+        (f, Y, Y - error),
+        lags=CORRELATED_LINES,
+        method=f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
+        notes=(
+            "of the best linear oscillator at the level of this record; another level has another, "
+            "which the deviations do not hold",
+            "figure data: spectrum of the output and of the model's, transient included",
+        ),
+    )
 
 
-def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, float]
-           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _lines(
+    u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     u, y = np.asarray(u, float).ravel(), np.asarray(y, float).ravel()
     if u.shape != y.shape or not (np.all(np.isfinite(u)) and np.all(np.isfinite(y))):
         raise InputError("expected finite samples, as many of u as of y", field="u, y", value=(u.shape, y.shape))
@@ -89,8 +102,9 @@ def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, floa
     f = np.fft.rfftfreq(len(u), 1 / rate)
     keep = (f >= low) & (f <= high) & (f > 0)
     if np.count_nonzero(keep) < 40:
-        raise InputError("expected at least 40 lines in the band; a longer stretch has more", field="band_Hz",
-                         value=(low, high))
+        raise InputError(
+            "expected at least 40 lines in the band; a longer stretch has more", field="band_Hz", value=(low, high)
+        )
     U, Y = np.fft.rfft(u)[keep], np.fft.rfft(y)[keep]
     if not (np.any(U) and np.any(Y)):
         raise InputError("expected an input and an output that move in the band", field="u, y")
@@ -99,7 +113,7 @@ def _lines(u: np.ndarray, y: np.ndarray, rate: float, band_Hz: tuple[float, floa
 
 def _linear(U: np.ndarray, Y: np.ndarray, s: np.ndarray, powers: np.ndarray) -> np.ndarray:
     """Initial values: Y (m s^2 + d s + k) - T = U is linear in the unknowns."""
-    A = np.column_stack([Y * s ** 2, Y * s, Y, -powers])
+    A = np.column_stack([Y * s**2, Y * s, Y, -powers])
     return np.linalg.lstsq(_parts(A), _parts(U), rcond=None)[0][:3]
 
 

@@ -25,8 +25,15 @@ CORRELATED_LINES = 2
 # A mount mode with more damping has the phase of a delay to fourth order, so that the two cannot be distinguished.
 LARGEST_MODE_DAMPING = 0.2
 POWER = {"coil": 1, "displacement": 0, "ground": 2}
-UNITS = {"corner_Hz": "Hz", "damping": "", "force_gain": "m/s^2 a unit of drive", "sensitivity": "V s/m",
-         "gain": "V/s a unit of drive", "drive_delay_s": "s", "delay_s": "s"}
+UNITS = {
+    "corner_Hz": "Hz",
+    "damping": "",
+    "force_gain": "m/s^2 a unit of drive",
+    "sensitivity": "V s/m",
+    "gain": "V/s a unit of drive",
+    "drive_delay_s": "s",
+    "delay_s": "s",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,33 +51,46 @@ class Responses:
     def __post_init__(self) -> None:
         n = len(self.frequency_Hz)
         if not self.value or not set(self.value) <= set(POWER) or ("ground" in self.value and len(self.value) > 1):
-            raise InputError("expected coil, displacement or both (driven by a force), or ground alone",
-                             field="responses", value=sorted(self.value))
+            raise InputError(
+                "expected coil, displacement or both (driven by a force), or ground alone",
+                field="responses",
+                value=sorted(self.value),
+            )
         for kind, H in self.value.items():
             V = self.variance.get(kind)
-            if V is None or np.shape(H) != (n,) or np.shape(V) != (n,) or not np.all(np.isfinite(H)) \
-                    or not np.all(np.isfinite(V)) or not np.all(V > 0) or not np.all(np.abs(H) > 0):
+            if (
+                V is None
+                or np.shape(H) != (n,)
+                or np.shape(V) != (n,)
+                or not np.all(np.isfinite(H))
+                or not np.all(np.isfinite(V))
+                or not np.all(V > 0)
+                or not np.all(np.abs(H) > 0)
+            ):
                 raise InputError(f"expected {n} finite values with positive variances, none zero", field=kind)
         if n < 4 or not np.all(np.diff(self.frequency_Hz) > 0) or self.frequency_Hz[0] <= 0:
             raise InputError("expected at least four increasing, positive frequencies", field="frequency_Hz", value=n)
 
     def at(self, keep: np.ndarray) -> Responses:
         """The responses at some of the frequencies."""
-        return Responses(self.frequency_Hz[keep], {kind: H[keep] for kind, H in self.value.items()},
-                         {kind: V[keep] for kind, V in self.variance.items()})
+        return Responses(
+            self.frequency_Hz[keep],
+            {kind: H[keep] for kind, H in self.value.items()},
+            {kind: V[keep] for kind, V in self.variance.items()},
+        )
 
 
 def response(frequency_Hz: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
     """The model's responses by kind, (n,) each, for parameters named as in a fit."""
     p = dict(zip(names, values, strict=True))
     s, w0 = 2j * np.pi * np.asarray(frequency_Hz, float), 2 * np.pi * p["corner_Hz"]
-    D = s ** 2 + 2 * p["damping"] * w0 * s + w0 ** 2
+    D = s**2 + 2 * p["damping"] * w0 * s + w0**2
     late, driven = np.exp(-s * p.get("delay_s", 0.0)), np.exp(-s * p.get("drive_delay_s", 0.0))
     if "force_gain" in p:
         moved = p["force_gain"] / D * driven
         coil = {"coil": p["sensitivity"] * s * moved} if "sensitivity" in p else {}
         return {"displacement": moved * late} | coil
-    return {"coil": p["gain"] * s / D * late} if "gain" in p else {"ground": p["sensitivity"] * s ** 2 / D * late}
+    return {"coil": p["gain"] * s / D * late} if "gain" in p else {"ground": p["sensitivity"] * s**2 / D * late}
 
 
 def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
@@ -95,41 +115,60 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
 
     def misses(theta: np.ndarray, r: float) -> np.ndarray:
         model = response(data.frequency_Hz, names, theta)
-        columns = [(data.value[kind] - model[kind])
-                   / np.sqrt((data.variance[kind] + r ** 2 * np.abs(data.value[kind]) ** 2) / 2) for kind in kinds]
+        columns = [
+            (data.value[kind] - model[kind]) / np.sqrt((data.variance[kind] + r**2 * np.abs(data.value[kind]) ** 2) / 2)
+            for kind in kinds
+        ]
         return np.stack([part for c in columns for part in (c.real, c.imag)], axis=1)
 
     def solved(r: float, begin: np.ndarray) -> np.ndarray:
-        found = least_squares(lambda x: misses(x * scale, r).ravel(), begin / scale, x_scale="jac", xtol=1e-12,
-                              ftol=1e-12)
+        found = least_squares(
+            lambda x: misses(x * scale, r).ravel(), begin / scale, x_scale="jac", xtol=1e-12, ftol=1e-12
+        )
         return found.x * scale
 
     theta, r = _with_misfit(misses, solved, start)
     if not np.all(theta[:2] > 0):
-        raise ComputationError("no oscillator fits the responses", measured=f"corner {theta[0]:.3g} Hz, damping "
-                               f"{theta[1]:.3g}", cause="channels that were exchanged, or frequencies on one side of "
-                               "the corner only", next_step="check which column is the drive and which the coil")
+        raise ComputationError(
+            "no oscillator fits the responses",
+            measured=f"corner {theta[0]:.3g} Hz, damping {theta[1]:.3g}",
+            cause="channels that were exchanged, or frequencies on one side of the corner only",
+            next_step="check which column is the drive and which the coil",
+        )
     model = response(data.frequency_Hz, names, theta)
     measured, predicted = (np.column_stack([values[kind] for kind in kinds]) for values in (data.value, model))
     e = misses(theta, r)
     # With few frequencies the misfits may cancel in a parameter by chance, which must not reduce its variance.
     return concluded(
-        f"second-order seismometer, {' and '.join(kinds)}", {name: UNITS[name] for name in names}, theta, e,
-        slopes(lambda x: misses(x, r), theta, scale), len(names), (data.frequency_Hz, measured, predicted),
-        lags=CORRELATED_LINES, relative=(measured - predicted) / np.abs(measured),
+        f"second-order seismometer, {' and '.join(kinds)}",
+        {name: UNITS[name] for name in names},
+        theta,
+        e,
+        slopes(lambda x: misses(x, r), theta, scale),
+        len(names),
+        (data.frequency_Hz, measured, predicted),
+        lags=CORRELATED_LINES,
+        relative=(measured - predicted) / np.abs(measured),
         method=f"misfit of {100 * r:.2g} % a frequency added to the noise, neighbouring frequencies correlated "
-        f"(Newey-West, {min(CORRELATED_LINES, len(e) // 4)} lags)", given_chi2=float(np.sum(misses(theta, 0.0) ** 2)),
-        notes=(f"columns of the figure data: {', '.join(kinds)}",))
+        f"(Newey-West, {min(CORRELATED_LINES, len(e) // 4)} lags)",
+        given_chi2=float(np.sum(misses(theta, 0.0) ** 2)),
+        notes=(f"columns of the figure data: {', '.join(kinds)}",),
+    )
 
 
-def _with_misfit(misses: Callable[[np.ndarray, float], np.ndarray], solved: Callable[[float, np.ndarray], np.ndarray],
-                 start: np.ndarray) -> tuple[np.ndarray, float]:
+def _with_misfit(
+    misses: Callable[[np.ndarray, float], np.ndarray],
+    solved: Callable[[float, np.ndarray], np.ndarray],
+    start: np.ndarray,
+) -> tuple[np.ndarray, float]:
     """Estimate and relative misfit r for chi2/dof = 1; r = 0 if the noise alone explains the data."""
     theta = solved(0.03, start)
     dof = misses(theta, 0.0).size - len(theta)
     for _ in range(20):
+
         def excess(log_r: float, at: np.ndarray = theta) -> float:
             return float(np.log(np.sum(misses(at, np.exp(log_r)) ** 2) / dof))
+
         if excess(np.log(1e-9)) <= 0:
             return solved(0.0, theta), 0.0
         r = float(np.exp(brentq(excess, np.log(1e-9), np.log(1e3))))
@@ -146,12 +185,14 @@ def _start(data: Responses, delay: bool) -> dict[str, float]:
     kind = next(iter(data.value))
     H, s = data.value[kind], 2j * np.pi * data.frequency_Hz
     s0 = float(np.sqrt(np.abs(s[0] * s[-1])))
-    A = np.column_stack([H * s * s0, H * s0 ** 2, -s ** POWER[kind] * s0 ** (2 - POWER[kind])])
-    weight = 1 / (np.abs(H) * (np.abs(s) ** 2 + s0 ** 2))
-    A, y = A * weight[:, None], -H * s ** 2 * weight
+    A = np.column_stack([H * s * s0, H * s0**2, -(s ** POWER[kind]) * s0 ** (2 - POWER[kind])])
+    weight = 1 / (np.abs(H) * (np.abs(s) ** 2 + s0**2))
+    A, y = A * weight[:, None], -H * s**2 * weight
     size = np.maximum(np.linalg.norm(A, axis=0), np.finfo(float).tiny)
-    a1, a0, b = np.linalg.lstsq(np.vstack([(A / size).real, (A / size).imag]), np.concatenate([y.real, y.imag]),
-                                rcond=None)[0] / size
+    a1, a0, b = (
+        np.linalg.lstsq(np.vstack([(A / size).real, (A / size).imag]), np.concatenate([y.real, y.imag]), rcond=None)[0]
+        / size
+    )
     w0 = s0 * np.sqrt(a0) if a0 > 0 else s0
     zeta = a1 * s0 / (2 * w0) if a1 > 0 else 0.5
     b *= s0 ** (2 - POWER[kind])
@@ -159,7 +200,7 @@ def _start(data: Responses, delay: bool) -> dict[str, float]:
     if "ground" in data.value:
         start["sensitivity"] = b
     elif "displacement" in data.value:
-        D = s ** 2 + 2 * zeta * w0 * s + w0 ** 2
+        D = s**2 + 2 * zeta * w0 * s + w0**2
         start["force_gain"] = float(np.median((data.value["displacement"] * D).real))
         if "coil" in data.value:
             start["sensitivity"] = float(np.median((data.value["coil"] / data.value["displacement"] / s).real))

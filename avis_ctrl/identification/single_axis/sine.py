@@ -48,8 +48,14 @@ class SineRecord:
         if self.unexplained[i] <= LARGEST_SHARE:
             return ""
         # A sine stays within 0.1 % of its range from one end for 2 % of its period.
-        stuck = (f"; it stays at one end of its range for {100 * self.held[i]:.0f} % of a period, where a sine does "
-                 "for 2 %: out of range") if self.held[i] > 0.04 else ""
+        stuck = (
+            (
+                f"; it stays at one end of its range for {100 * self.held[i]:.0f} % of a period, where a sine does "
+                "for 2 %: out of range"
+            )
+            if self.held[i] > 0.04
+            else ""
+        )
         return f"record {self.name}, {channel}: a sine leaves {100 * self.unexplained[i]:.0f} % unexplained{stuck}"
 
     def _index(self, channel: str) -> int:
@@ -72,20 +78,29 @@ def fit_sine(name: str, time: np.ndarray, channels: dict[str, np.ndarray], refer
     y = np.column_stack([np.asarray(channel, float) for channel in channels.values()])
     n = len(time)
     if y.shape[0] != n or n < 64 or not np.all(np.isfinite(y)):
-        raise InputError("expected at least 64 samples of each channel, all finite", field=f"record {name}",
-                         value=(n, y.shape[0]))
+        raise InputError(
+            "expected at least 64 samples of each channel, all finite", field=f"record {name}", value=(n, y.shape[0])
+        )
     period = float(time[-1] - time[0]) / (n - 1)
     t = np.arange(n) * period
     frequency = _frequency(name, t, y[:, list(channels).index(reference)])
     count = max(1, min(HARMONICS, int(0.45 / period / frequency)))
     X = _columns(t, frequency, count)
     b = np.linalg.lstsq(X, y, rcond=None)[0]
-    phasors = b[0:2 * count:2] - 1j * b[1:2 * count:2]
+    phasors = b[0 : 2 * count : 2] - 1j * b[1 : 2 * count : 2]
     e = y - X @ b
     amplitude = np.maximum(np.abs(phasors[0]), np.finfo(float).tiny)
     held = np.array([_longest_hold(channel) for channel in y.T]) * period * frequency
-    return SineRecord(name, frequency, tuple(channels), phasors[0], _line_noise(e, frequency * period),
-                      np.abs(phasors[1:]).T / amplitude[:, None], e.std(0) * np.sqrt(2) / amplitude, held)
+    return SineRecord(
+        name,
+        frequency,
+        tuple(channels),
+        phasors[0],
+        _line_noise(e, frequency * period),
+        np.abs(phasors[1:]).T / amplitude[:, None],
+        e.std(0) * np.sqrt(2) / amplitude,
+        held,
+    )
 
 
 def _frequency(name: str, t: np.ndarray, u: np.ndarray) -> float:
@@ -94,16 +109,20 @@ def _frequency(name: str, t: np.ndarray, u: np.ndarray) -> float:
     peak = int(np.argmax(spectrum))
     f = peak / (4 * duration)
     if spectrum[peak] == 0 or f * duration < 3:
-        raise ComputationError(f"record {name}: no sine found in the reference",
-                               measured=f"strongest line at {f:.3g} Hz, {f * duration:.2g} periods",
-                               cause="a channel that is not the drive, or a record shorter than three periods",
-                               next_step="map the drive's channel as the reference")
+        raise ComputationError(
+            f"record {name}: no sine found in the reference",
+            measured=f"strongest line at {f:.3g} Hz, {f * duration:.2g} periods",
+            cause="a channel that is not the drive, or a record shorter than three periods",
+            next_step="map the drive's channel as the reference",
+        )
 
     def left(frequency: float) -> float:
         X = _columns(t, frequency, 1)
         return float(np.sum((u - X @ np.linalg.lstsq(X, u, rcond=None)[0]) ** 2))
-    found = minimize_scalar(left, bounds=(f - 0.5 / duration, f + 0.5 / duration), method="bounded",
-                            options={"xatol": 1e-7 / duration})
+
+    found = minimize_scalar(
+        left, bounds=(f - 0.5 / duration, f + 0.5 / duration), method="bounded", options={"xatol": 1e-7 / duration}
+    )
     return float(found.x)
 
 
@@ -122,10 +141,15 @@ def _line_noise(e: np.ndarray, cycles_per_sample: float) -> np.ndarray:
     """
     n = len(e)
     centre = round(cycles_per_sample * n)
-    lines = np.array([k for k in range(max(1, centre - NEIGHBOURS), min(n // 2, centre + NEIGHBOURS + 1))
-                      if abs(k - cycles_per_sample * n) > 1])
+    lines = np.array(
+        [
+            k
+            for k in range(max(1, centre - NEIGHBOURS), min(n // 2, centre + NEIGHBOURS + 1))
+            if abs(k - cycles_per_sample * n) > 1
+        ]
+    )
     E = np.fft.rfft(e, axis=0)[lines]
-    return 4 / n ** 2 * (E.T @ E.conj()) / len(lines)
+    return 4 / n**2 * (E.T @ E.conj()) / len(lines)
 
 
 def _longest_hold(y: np.ndarray) -> int:

@@ -12,5 +12,14 @@ from avis_ctrl.measurement.excitation.design import (
 )
 from avis_ctrl.measurement.excitation.files import write_signals
 
-__all__ = ["ExcitationSignals", "MultisineSettings", "NoiseSettings", "band_limited", "choose_lines", "multisine",
-           "noise", "orthogonal_matrix", "write_signals"]
+__all__ = [
+    "ExcitationSignals",
+    "MultisineSettings",
+    "NoiseSettings",
+    "band_limited",
+    "choose_lines",
+    "multisine",
+    "noise",
+    "orthogonal_matrix",
+    "write_signals",
+]

@@ -32,8 +32,9 @@ def synthesise(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samp
     return np.fft.irfft(spectrum, samples)
 
 
-def low_crest_phases(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int,
-                     rotations: np.ndarray | None = None) -> np.ndarray:
+def low_crest_phases(
+    lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int, rotations: np.ndarray | None = None
+) -> np.ndarray:
     """Phases (n_lines,) near a local minimum of the peak, starting from `phase`.
 
     rotations : constants [rad] added to all phases in turn. The highest peak of the resulting signals is minimised, so

@@ -35,7 +35,7 @@ from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_cres
 Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]
 # Maximum of samples times drives times records: 1 GiB.
-MOST_VOLTAGES = 2 ** 27
+MOST_VOLTAGES = 2**27
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class ExcitationSignals:
     @property
     def rms_V(self) -> np.ndarray:
         """(records, n_u) r.m.s. voltage."""
-        return np.sqrt(np.mean(self.u ** 2, axis=1))
+        return np.sqrt(np.mean(self.u**2, axis=1))
 
     @property
     def peak_V(self) -> np.ndarray:
@@ -91,9 +91,12 @@ class ExcitationSignals:
         rms_V = largest if rms_V is None else rms_V
         require_positive(rms_V, "rms_V")
         if rms_V > largest * (1 + 1e-12):
-            raise InputError(f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
-                             f"{self.limit_V / largest:.3f} more would exceed the limit of {self.limit_V:g} V",
-                             field="rms_V", value=rms_V)
+            raise InputError(
+                f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
+                f"{self.limit_V / largest:.3f} more would exceed the limit of {self.limit_V:g} V",
+                field="rms_V",
+                value=rms_V,
+            )
         # Round-off must not push the peak beyond the limit.
         u = np.clip(self.u * (rms_V / self.rms_V[:, None, :]), -self.limit_V, self.limit_V)
         return replace(self, u=u, settings=self.settings | {"rms_V": float(rms_V)})
@@ -148,8 +151,11 @@ class MultisineSettings:
         require_positive(self.period_s, "period_s")
         samples = self.period_s * self.sample_rate_Hz
         if abs(samples - round(samples)) > 1e-6 * samples or round(samples) < 4:
-            raise InputError(f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is "
-                             f"{samples:.6g}", field="period_s", value=self.period_s)
+            raise InputError(
+                f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is {samples:.6g}",
+                field="period_s",
+                value=self.period_s,
+            )
         for name, known in (("lines", get_args(Lines)), ("scheme", get_args(Scheme))):
             if getattr(self, name) not in known:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
@@ -192,21 +198,32 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
         u.append(record)
         before.append(drawn)
     return ExcitationSignals(
-        "multisine", settings.inputs, settings.sample_rate_Hz, np.concatenate(u), settings.period_s,
-        lines / settings.period_s, detection / settings.period_s, settings.limit_V,
-        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)), _plain(settings)).scaled_to(settings.rms_V)
+        "multisine",
+        settings.inputs,
+        settings.sample_rate_Hz,
+        np.concatenate(u),
+        settings.period_s,
+        lines / settings.period_s,
+        detection / settings.period_s,
+        settings.limit_V,
+        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)),
+        _plain(settings),
+    ).scaled_to(settings.rms_V)
 
 
-def _one_input(lines: np.ndarray, amplitude: np.ndarray, turns: np.ndarray, samples: int, low_crest: bool,
-               rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _one_input(
+    lines: np.ndarray, amplitude: np.ndarray, turns: np.ndarray, samples: int, low_crest: bool, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """(experiments, samples) of one input of unit r.m.s., with low crest factor and with the initial random phases."""
-    amplitude = amplitude / np.sqrt(np.sum(amplitude ** 2) / 2)
+    amplitude = amplitude / np.sqrt(np.sum(amplitude**2) / 2)
     drawn = rng.uniform(0, 2 * np.pi, lines.size)
     # A rotation by pi only changes the sign, not the peak.
     different = np.unique(np.round(turns % np.pi, 9) % np.round(np.pi, 9))
     phase = low_crest_phases(lines, amplitude, drawn, samples, different) if low_crest else drawn
-    return (synthesise(lines, amplitude, phase + turns[:, None], samples),
-            synthesise(lines, amplitude, drawn + turns[:, None], samples))
+    return (
+        synthesise(lines, amplitude, phase + turns[:, None], samples),
+        synthesise(lines, amplitude, drawn + turns[:, None], samples),
+    )
 
 
 def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -220,8 +237,12 @@ def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple
     lines = grid[~left_out]
     least = len(settings.inputs) if settings.scheme == "zippered" else 1
     if lines.size < least:
-        raise InputError(f"expected a band with at least {least} lines {settings.spacing / settings.period_s:g} Hz "
-                         f"apart ({settings.lines}); it has {lines.size}", field="band_Hz", value=settings.band_Hz)
+        raise InputError(
+            f"expected a band with at least {least} lines {settings.spacing / settings.period_s:g} Hz "
+            f"apart ({settings.lines}); it has {lines.size}",
+            field="band_Hz",
+            value=settings.band_Hz,
+        )
     return lines, grid[left_out]
 
 
@@ -264,23 +285,40 @@ def noise(settings: NoiseSettings) -> ExcitationSignals:
     rng, N = np.random.default_rng(settings.seed), round(settings.duration_s * settings.sample_rate_Hz)
     if N < 4:
         raise InputError("expected at least 4 samples", field="duration_s", value=settings.duration_s)
-    u = np.array([band_limited(N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs), rng)
-                  for _ in range(settings.records)])
-    u = u / np.sqrt(np.mean(u ** 2, axis=1, keepdims=True))
-    return ExcitationSignals("noise", settings.inputs, settings.sample_rate_Hz, u, None, np.zeros(0), np.zeros(0),
-                             settings.limit_V, crest_factor(np.moveaxis(u, 1, -1)),
-                             _plain(settings)).scaled_to(settings.rms_V)
+    u = np.array(
+        [
+            band_limited(N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs), rng)
+            for _ in range(settings.records)
+        ]
+    )
+    u = u / np.sqrt(np.mean(u**2, axis=1, keepdims=True))
+    return ExcitationSignals(
+        "noise",
+        settings.inputs,
+        settings.sample_rate_Hz,
+        u,
+        None,
+        np.zeros(0),
+        np.zeros(0),
+        settings.limit_V,
+        crest_factor(np.moveaxis(u, 1, -1)),
+        _plain(settings),
+    ).scaled_to(settings.rms_V)
 
 
-def band_limited(samples: int, sample_rate_Hz: float, band_Hz: tuple[float, float], channels: int,
-                 rng: np.random.Generator) -> np.ndarray:
+def band_limited(
+    samples: int, sample_rate_Hz: float, band_Hz: tuple[float, float], channels: int, rng: np.random.Generator
+) -> np.ndarray:
     """(samples, channels) independent Gaussian noise of unit variance, flat inside the band, zero outside it."""
     frequency = np.fft.rfftfreq(samples, 1 / sample_rate_Hz)
     inside = (frequency >= band_Hz[0] * (1 - 1e-9)) & (frequency <= band_Hz[1] * (1 + 1e-9)) & (frequency > 0)
     inside &= 2 * np.arange(frequency.size) < samples
     if not np.any(inside):
-        raise InputError(f"expected a band with a multiple of 1/duration = {sample_rate_Hz / samples:.4g} Hz inside",
-                         field="band_Hz", value=band_Hz)
+        raise InputError(
+            f"expected a band with a multiple of 1/duration = {sample_rate_Hz / samples:.4g} Hz inside",
+            field="band_Hz",
+            value=band_Hz,
+        )
     spectrum = np.zeros((frequency.size, channels), complex)
     draw = rng.standard_normal((2, np.count_nonzero(inside), channels))
     spectrum[inside] = (draw[0] + 1j * draw[1]) * samples / (2 * np.sqrt(np.count_nonzero(inside)))
@@ -305,11 +343,17 @@ def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
         require_positive(settings.rms_V, "rms_V")
     require_whole(settings.seed, "seed", 0)
     if len(band_Hz) != 2 or not (np.all(np.isfinite(band_Hz)) and 0 < band_Hz[0] <= band_Hz[1] < rate / 2):
-        raise InputError(f"expected two frequencies above 0 and below half the sample rate ({rate / 2:g} Hz), the "
-                         "lower one first", field="band_Hz", value=tuple(band_Hz))
+        raise InputError(
+            f"expected two frequencies above 0 and below half the sample rate ({rate / 2:g} Hz), the lower one first",
+            field="band_Hz",
+            value=tuple(band_Hz),
+        )
 
 
 def _check_size(voltages: float, field: str) -> None:
     if voltages > MOST_VOLTAGES:
-        raise InputError(f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory; "
-                         f"there would be {voltages:.3g}", field=field)
+        raise InputError(
+            f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory; "
+            f"there would be {voltages:.3g}",
+            field=field,
+        )

@@ -15,7 +15,7 @@ from avis_ctrl.measurement.formats.hdf5_writing import replacing
 
 SUFFIXES = (".h5", ".hdf5", ".csv", ".mat")
 # Size limit of a variable in a version 5 .mat file.
-MAT5_BYTES = 2 ** 31
+MAT5_BYTES = 2**31
 
 
 def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1, rig: str = "") -> None:
@@ -36,22 +36,35 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"expected a file name that ends in {', '.join(SUFFIXES)}", file=path)
     if not isinstance(periods, (int, np.integer)) or periods < 1 or (periods > 1 and signals.period_s is None):
-        raise InputError("expected a whole number, 1 or more (noise is not periodic: 1)", field="periods",
-                         value=periods)
+        raise InputError(
+            "expected a whole number, 1 or more (noise is not periodic: 1)", field="periods", value=periods
+        )
     writer = {".csv": _write_csv, ".mat": _write_mat}.get(path.suffix.lower(), _write_hdf5)
     writer(signals, int(periods), path, rig)
 
 
 def _write_hdf5(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
     with replacing(path) as file:
-        file.attrs.update({"format": "avis-excitation", "version": 1, "rig": rig,
-                           "seed": signals.settings.get("seed", 0), "settings": json.dumps(signals.settings)})
+        file.attrs.update(
+            {
+                "format": "avis-excitation",
+                "version": 1,
+                "rig": rig,
+                "seed": signals.settings.get("seed", 0),
+                "settings": json.dumps(signals.settings),
+            }
+        )
         for k, (one, level) in enumerate(zip(signals.u, signals.rms_V, strict=True)):
             record = np.tile(one, (periods, 1))
             group = file.create_group(f"records/{k:02d}")
-            group.attrs.update({"sample_rate_Hz": signals.sample_rate_Hz, "excitation": signals.kind,
-                                "level_V": float(np.sqrt(np.mean(level ** 2))),
-                                "start_s": k * len(record) / signals.sample_rate_Hz})
+            group.attrs.update(
+                {
+                    "sample_rate_Hz": signals.sample_rate_Hz,
+                    "excitation": signals.kind,
+                    "level_V": float(np.sqrt(np.mean(level**2))),
+                    "start_s": k * len(record) / signals.sample_rate_Hz,
+                }
+            )
             if signals.period_s is not None:
                 group.attrs["period_s"] = signals.period_s
             volts = group.create_dataset("u", data=record)
@@ -71,12 +84,22 @@ def _write_csv(signals: ExcitationSignals, periods: int, path: Path, rig: str) -
 
 def _write_mat(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
     if (total := signals.u.nbytes * periods) >= MAT5_BYTES:
-        raise InputError(f"expected less than {MAT5_BYTES / 2 ** 30:g} GiB in a .mat file; write .h5 instead",
-                         file=path, field="u", value=f"{total / 2 ** 30:.1f} GiB")
-    content = {"u": np.moveaxis(np.tile(signals.u, (1, periods, 1)), 0, -1),
-               "names": np.array(signals.inputs, object), "rig": rig, "sample_rate_Hz": signals.sample_rate_Hz,
-               "period_s": np.nan if signals.period_s is None else signals.period_s, "excitation": signals.kind,
-               "level_V": signals.rms_V, "seed": signals.settings.get("seed", 0),
-               "settings": json.dumps(signals.settings)}
+        raise InputError(
+            f"expected less than {MAT5_BYTES / 2**30:g} GiB in a .mat file; write .h5 instead",
+            file=path,
+            field="u",
+            value=f"{total / 2**30:.1f} GiB",
+        )
+    content = {
+        "u": np.moveaxis(np.tile(signals.u, (1, periods, 1)), 0, -1),
+        "names": np.array(signals.inputs, object),
+        "rig": rig,
+        "sample_rate_Hz": signals.sample_rate_Hz,
+        "period_s": np.nan if signals.period_s is None else signals.period_s,
+        "excitation": signals.kind,
+        "level_V": signals.rms_V,
+        "seed": signals.settings.get("seed", 0),
+        "settings": json.dumps(signals.settings),
+    }
     with whole_file(path) as file:
         savemat(file, content, do_compression=True, appendmat=False)

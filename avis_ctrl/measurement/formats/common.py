@@ -15,8 +15,8 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3
 PREFIXES = {"": 1.0, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "k": 1e3}
 # Label -> (SI unit, factor to it).
 UNITS: dict[str, tuple[str, float]] = {
-    f"{prefix}{unit}": (unit, factor)
-    for unit in ("V", "m", "m/s", "m/s^2", "N") for prefix, factor in PREFIXES.items()}
+    f"{prefix}{unit}": (unit, factor) for unit in ("V", "m", "m/s", "m/s^2", "N") for prefix, factor in PREFIXES.items()
+}
 UNITS |= {f"in{per}": (f"m{per}", 0.0254) for per in ("", "/s", "/s^2")}
 UNITS |= dict.fromkeys(("Volt", "Volts"), ("V", 1.0)) | dict.fromkeys(("g", "gn"), ("m/s^2", STANDARD_GRAVITY))
 UNITS["lbf"] = ("N", 4.4482216152605)
@@ -51,8 +51,9 @@ def reading(path: object, what: str = "the file") -> Iterator[None]:
             raise
         raise error.in_file(path) from None
     except MemoryError:
-        raise InputError("the stated sizes do not fit in memory: the file is damaged, or too large to be read whole",
-                         file=path) from None
+        raise InputError(
+            "the stated sizes do not fit in memory: the file is damaged, or too large to be read whole", file=path
+        ) from None
     except OSError as error:
         raise InputError(f"{what} cannot be read ({short(error)})", file=path) from error
 
@@ -65,8 +66,9 @@ def within(where: str) -> Iterator[None]:
     except InputError as error:
         if error.file is not None or f"{error.field}:".startswith(f"{where}:"):
             raise
-        raise InputError(error.expected, field=f"{where}: {error.field}" if error.field else where,
-                         value=error.value) from None
+        raise InputError(
+            error.expected, field=f"{where}: {error.field}" if error.field else where, value=error.value
+        ) from None
 
 
 def existing_file(path: str | Path) -> Path:
@@ -101,9 +103,11 @@ def require_small(path: Path, size: int | None = None) -> int:
     """
     size = path.stat().st_size if size is None else size
     if size > LARGEST_IN_MEMORY:
-        raise InputError(f"has {size / 1e9:.3g} GB; this format is read whole, up to {LARGEST_IN_MEMORY / 1e9:.3g} GB: "
-                         "convert the file to an HDF5 campaign (/records/00/u and y), which is read in pieces",
-                         file=path)
+        raise InputError(
+            f"has {size / 1e9:.3g} GB; this format is read whole, up to {LARGEST_IN_MEMORY / 1e9:.3g} GB: "
+            "convert the file to an HDF5 campaign (/records/00/u and y), which is read in pieces",
+            file=path,
+        )
     return size
 
 
@@ -168,8 +172,11 @@ def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...
     if not all(name and name.isprintable() for name in names):
         raise InputError("expected printable names that are not empty", field=field, value=brief(names))
     if count is not None and len(names) != count:
-        raise InputError(f"expected one name for each channel; there are {count} channels and {len(names)} "
-                         "names", field=field, value=brief(names))
+        raise InputError(
+            f"expected one name for each channel; there are {count} channels and {len(names)} names",
+            field=field,
+            value=brief(names),
+        )
     if len(set(names)) != len(names):
         raise InputError("expected different names", field=field, value=brief(names))
     return names
@@ -194,8 +201,9 @@ def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Uni
     text = text[:-1] + "^2" if text.endswith("s2") else text
     known = UNITS.get(text)
     if known is None or (allowed is not None and known[0] not in allowed):
-        raise InputError(f"expected a unit of {', '.join(allowed or OUTPUT_UNITS)} (or mV, mm/s, g, ...)",
-                         field=field, value=label)
+        raise InputError(
+            f"expected a unit of {', '.join(allowed or OUTPUT_UNITS)} (or mV, mm/s, g, ...)", field=field, value=label
+        )
     return Unit(*known)
 
 
@@ -207,8 +215,9 @@ def units_of(value: Any, role: str, count: int) -> tuple[str, tuple[float, ...]]
         raise InputError(f"expected one unit, or one for each of {count} channels", field=field, value=brief(value))
     units = [unit_of(as_text(item, field), field, ALLOWED[role]) for item in array]
     if len({unit.si for unit in units}) > 1:
-        raise InputError("expected one physical quantity for all channels", field=field,
-                         value=[unit.si for unit in units])
+        raise InputError(
+            "expected one physical quantity for all channels", field=field, value=[unit.si for unit in units]
+        )
     factors = tuple(unit.factor for unit in units)
     return units[0].si, factors * count if len(factors) == 1 else factors
 
@@ -225,8 +234,9 @@ def stated_period(value: Any, field: str) -> float | None:
     if isinstance(value, np.ndarray) and value.size == 0:
         return None
     single = _single(value)
-    if single is None or (isinstance(single, (int, float)) and not isinstance(single, bool)
-                          and (single == 0 or np.isnan(single))):
+    if single is None or (
+        isinstance(single, (int, float)) and not isinstance(single, bool) and (single == 0 or np.isnan(single))
+    ):
         return None
     return as_number(single, field)
 

@@ -45,8 +45,9 @@ class Layout:
     lines: int  # number of lines before the first line of numbers
 
 
-def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
-         hints: Hints | None = None) -> Campaign:
+def read(
+    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
+) -> Campaign:
     """A CSV file (one record) or a directory of CSV files (one record each, in the order of their names).
 
     columns : roles t, u, y, floor to names of columns; hints : what the file does not state.
@@ -58,8 +59,11 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
     path, hints = Path(path), hints or Hints()
     files = [path]
     if path.is_dir():
-        files = sorted(file for file in path.iterdir()
-                       if file.suffix.lower() == ".csv" and file.is_file() and not file.name.startswith("."))
+        files = sorted(
+            file
+            for file in path.iterdir()
+            if file.suffix.lower() == ".csv" and file.is_file() and not file.name.startswith(".")
+        )
         if not files:
             raise InputError("expected CSV files (*.csv) in the directory; there is none", file=path)
     with reading(path):
@@ -126,8 +130,11 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
         if numbered:  # no header line; the columns are given by number
             names = [str(k + 1) for k in range(len(titles))]
             return Layout(names, [None] * len(names), separator, stated, count - 1)
-        raise InputError("expected a header line with the names of the columns, found numbers", field=f"line {count}",
-                         value=line[:60])
+        raise InputError(
+            "expected a header line with the names of the columns, found numbers",
+            field=f"line {count}",
+            value=line[:60],
+        )
     names, units = [], []
     for title in titles:
         match = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", title)
@@ -156,16 +163,25 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
             pick(names, layout.names, role)
             roles[role] = names
     else:
-        roles = {role: [name for name in layout.names if re.fullmatch(pattern, name, re.IGNORECASE)]
-                 for role, pattern in USUAL.items()}
+        roles = {
+            role: [name for name in layout.names if re.fullmatch(pattern, name, re.IGNORECASE)]
+            for role, pattern in USUAL.items()
+        }
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(layout.names) else []
     for role, wanted in (("t", "at most one column"), ("y", "at least one column")):
         if len(roles[role]) > 1 if role == "t" else not roles[role]:
             if not roles["t"] and not _followed_by_numbers(path, layout):
-                raise InputError("not a measurement file: a text without a header line followed by lines of numbers",
-                                 field=f"line {layout.lines}", value=", ".join(layout.names)[:60])
-            raise InputError(f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns "
-                             "(roles t, u, y, floor)", field=role, value=roles[role])
+                raise InputError(
+                    "not a measurement file: a text without a header line followed by lines of numbers",
+                    field=f"line {layout.lines}",
+                    value=", ".join(layout.names)[:60],
+                )
+            raise InputError(
+                f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns "
+                "(roles t, u, y, floor)",
+                field=role,
+                value=roles[role],
+            )
     return roles
 
 
@@ -189,8 +205,11 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
         table = _table(lines, layout, use)
     at = {layout.names[k]: i for i, k in enumerate(use)}
     unit = dict(zip(layout.names, layout.units, strict=True))
-    parts = {role: Part(names, [unit[name] for name in names], table[:, [at[name] for name in names]])
-             for role, names in roles.items() if role != "t" and (names or role != "floor")}
+    parts = {
+        role: Part(names, [unit[name] for name in names], table[:, [at[name] for name in names]])
+        for role, names in roles.items()
+        if role != "t" and (names or role != "floor")
+    }
     hints = _with_stated(hints, layout.stated)
     time = roles["t"][0] if roles["t"] else ""
     rate, start, note = _clock(table[:, at[time]] if time else None, unit.get(time), hints)
@@ -214,8 +233,9 @@ def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[flo
         rate, start, note = sample_rate_from(time * factor, lambda sample: f"data row {sample + 1}")
         return rate if hints.sample_rate_Hz is None else agreed_rate(hints.sample_rate_Hz, rate), start, note
     if hints.sample_rate_Hz is None:
-        raise InputError("expected a column t (time in s) or a comment line such as '# sample_rate_Hz = 1000'",
-                         field="t")
+        raise InputError(
+            "expected a column t (time in s) or a comment line such as '# sample_rate_Hz = 1000'", field="t"
+        )
     return hints.sample_rate_Hz, 0.0, ""
 
 
@@ -230,11 +250,17 @@ def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> np.ndarray:
             chunk = [line.replace(",", ".") for line in chunk]
         for number, line in enumerate(chunk, row + 1):
             count = line.count(layout.separator)
-            if count != separators and line.strip() and (count, line.rstrip()[-1:]) != (separators + 1,
-                                                                                      layout.separator.strip()):
-                raise InputError(f"expected {separators + 1} columns, as in the header; there are {count + 1}"
-                                 + ("; with decimal commas, separate columns by ;" * (layout.separator == ",")),
-                                 field=f"line {number}", value=line[:60])
+            if (
+                count != separators
+                and line.strip()
+                and (count, line.rstrip()[-1:]) != (separators + 1, layout.separator.strip())
+            ):
+                raise InputError(
+                    f"expected {separators + 1} columns, as in the header; there are {count + 1}"
+                    + ("; with decimal commas, separate columns by ;" * (layout.separator == ",")),
+                    field=f"line {number}",
+                    value=line[:60],
+                )
         filled = [line for line in chunk if line.strip()]
         try:
             if filled:
@@ -255,6 +281,9 @@ def _misfit(chunk: list[str], row: int, layout: Layout, use: list[int]) -> Input
         for column in use if line.strip() else ():
             if not is_number(entries[column]) or "_" in entries[column]:
                 found = entries[column].strip()
-                return InputError("expected a number" if found else "expected a number, found nothing",
-                                  field=f"line {number}, column {layout.names[column]}", value=found[:40])
+                return InputError(
+                    "expected a number" if found else "expected a number, found nothing",
+                    field=f"line {number}, column {layout.names[column]}",
+                    value=found[:40],
+                )
     return InputError("expected numbers", field=f"lines {row + 1} to {row + len(chunk)}")

@@ -52,18 +52,32 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 FORMAT, VERSION = "avis-campaign", 1
 ROLES = ("u", "y", "floor")
 # Required attributes of each record.
-STATED = {"sample_rate_Hz": "the sample rate in Hz", "excitation": f"one of {', '.join(EXCITATIONS)}",
-          "level_V": "the r.m.s. of the driven voltages", "start_s": "the time of the first sample in s"}
+STATED = {
+    "sample_rate_Hz": "the sample rate in Hz",
+    "excitation": f"one of {', '.join(EXCITATIONS)}",
+    "level_V": "the r.m.s. of the driven voltages",
+    "start_s": "the time of the first sample in s",
+}
 # Required attributes of a response, and its data sets with the allowed kinds of numbers.
-NAMED = {"inputs": "the channels' names", "outputs": "the channels' names", "input_unit": "such as 'V'",
-         "output_unit": "such as 'V'"}
-DATASETS = {"frequency_Hz": "fiu", "value": "fiuc", "coherence": "fiu", "variance": "fiu",
-            **dict.fromkeys(COVARIANCES, "fiuc")}
+NAMED = {
+    "inputs": "the channels' names",
+    "outputs": "the channels' names",
+    "input_unit": "such as 'V'",
+    "output_unit": "such as 'V'",
+}
+DATASETS = {
+    "frequency_Hz": "fiu",
+    "value": "fiuc",
+    "coherence": "fiu",
+    "variance": "fiu",
+    **dict.fromkeys(COVARIANCES, "fiuc"),
+}
 CHUNK = 1 << 14  # samples per chunk on disk
 
 
-def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
-         hints: Hints | None = None) -> Campaign | FrequencyResponse:
+def read(
+    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
+) -> Campaign | FrequencyResponse:
     """An HDF5 campaign, whose samples stay in the file until they are loaded, or its frequency response.
 
     columns, hints : none that apply to records, because the file states them itself; rig : replaces the name in the
@@ -84,8 +98,11 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         stated = _check_root(file)
         group = member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
-            words = ("missing; expected a group with one group per record" if group is None else
-                     "expected a group, found a data set")
+            words = (
+                "missing; expected a group with one group per record"
+                if group is None
+                else "expected a group, found a data set"
+            )
             raise InputError(f"{words}; the file holds {_listed(file)}", field="/frf" if response else "/records")
         if response:
             with within("/frf"):
@@ -128,8 +145,12 @@ def _in_order(group: h5py.Group) -> list[str]:
         in_order = group.id.get_create_plist().get_link_creation_order()
     if in_order:
         return members(group)
-    return sorted(members(group), key=lambda name: [(part.isdigit(), int(part) if part.isdecimal() else 0, part)
-                                           for part in re.split(r"(\d+)", name)])
+    return sorted(
+        members(group),
+        key=lambda name: [
+            (part.isdigit(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)
+        ],
+    )
 
 
 def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
@@ -142,11 +163,13 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
         if dataset is not None:
             parts[role] = _part(dataset, role)
         elif role != "floor":
-            raise InputError(f"missing; expected a data set (samples, channels); the record holds {_listed(record)}",
-                             field=role)
+            raise InputError(
+                f"missing; expected a data set (samples, channels); the record holds {_listed(record)}", field=role
+            )
     if "floor" in parts and tuple(parts["floor"].names) != FLOOR_NAMES:
-        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names",
-                         value=parts["floor"].names)
+        raise InputError(
+            f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names", value=parts["floor"].names
+        )
     found = attributes(record, *STATED, "period_s")
     for field, expected in STATED.items():
         require(found, field, expected)
@@ -162,8 +185,12 @@ def _part(dataset: Any, role: str) -> Part:
         raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
-        raise InputError(f"expected (samples, channels) with more samples than channels; {samples} samples of "
-                         f"{count} channels look transposed", field=role, value=shape)
+        raise InputError(
+            f"expected (samples, channels) with more samples than channels; {samples} samples of "
+            f"{count} channels look transposed",
+            field=role,
+            value=shape,
+        )
     stated = attributes(dataset, "names", "unit")
     with within(role):
         names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
@@ -176,8 +203,11 @@ def _layout(dataset: Any, field: str, kinds: str) -> tuple[tuple[int, ...] | Non
         raise InputError("expected a data set, found a group", field=field)
     shape, dtype = layout(dataset)
     if dtype.kind not in kinds:
-        raise InputError("expected numbers" if "c" in kinds else "expected real numbers", field=field,
-                         value=f"data set of {kind_of(dtype)}")
+        raise InputError(
+            "expected numbers" if "c" in kinds else "expected real numbers",
+            field=field,
+            value=f"data set of {kind_of(dtype)}",
+        )
     return shape, dtype
 
 
@@ -226,8 +256,14 @@ def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20)
 
 def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None:
     header = record.header
-    group.attrs.update({"sample_rate_Hz": header.sample_rate_Hz, "excitation": header.excitation,
-                        "level_V": header.level_V, "start_s": header.start_s})
+    group.attrs.update(
+        {
+            "sample_rate_Hz": header.sample_rate_Hz,
+            "excitation": header.excitation,
+            "level_V": header.level_V,
+            "start_s": header.start_s,
+        }
+    )
     if header.period_s is not None:
         group.attrs["period_s"] = header.period_s
     datasets = {}

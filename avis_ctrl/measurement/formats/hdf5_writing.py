@@ -50,11 +50,11 @@ class PatientFile:
         """Bytes on the disk, with those that were kept in memory."""
         found = bytearray(size)
         of_disk = os.pread(self.descriptor, size, self.at)
-        found[:len(of_disk)] = of_disk
+        found[: len(of_disk)] = of_disk
         for start, piece in self.kept.items():
             low, high = max(start, self.at), min(start + len(piece), self.at + size)
             if low < high:
-                found[low - self.at:high - self.at] = piece[low - start:high - start]
+                found[low - self.at : high - self.at] = piece[low - start : high - start]
         self.at += size
         return bytes(found)
 

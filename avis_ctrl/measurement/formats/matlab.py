@@ -35,8 +35,9 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 MATRICES_V4 = {1000 * order + 10 * number + kind for order in (0, 1) for number in range(6) for kind in range(3)}
 
 
-def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
-         hints: Hints | None = None) -> Campaign | FrequencyResponse:
+def read(
+    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
+) -> Campaign | FrequencyResponse:
     """A .mat file: records, or a frequency response (variables frequency_Hz and H).
 
     Raises
@@ -76,7 +77,7 @@ def is_version_4(head: bytes) -> bool:
     """Whether a file starts with the header of a v4 matrix: type, rows, columns, imaginary, length of name, name."""
     for order in "<>" if len(head) > 20 else "":
         kind, rows, columns, imaginary, length = struct.unpack(order + "5i", head[:20])
-        name = head[20:20 + length] if 1 < length <= 64 else b""
+        name = head[20 : 20 + length] if 1 < length <= 64 else b""
         if kind in MATRICES_V4 and min(rows, columns) >= 0 and imaginary in (0, 1) and name.endswith(b"\0"):
             return name[:-1].decode("latin-1").isidentifier()
     return False
@@ -94,13 +95,20 @@ def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
     """
     frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
     n_y, n_u = _sizes(tree, H, len(frequency))
-    fields = {"input_unit": "V", "output_unit": "V", "outputs": [f"y{i + 1}" for i in range(n_y)],
-              "inputs": [f"u{i + 1}" for i in range(n_u)]}
+    fields = {
+        "input_unit": "V",
+        "output_unit": "V",
+        "outputs": [f"y{i + 1}" for i in range(n_y)],
+        "inputs": [f"u{i + 1}" for i in range(n_u)],
+    }
     fields |= {field: tree[field] for field in fields if field in tree}
     for field, count in (("outputs", n_y), ("inputs", n_u)):
         as_names(fields[field], field, count)
-    shaped = {field: _lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
-              for field in ("H", "variance", "coherence") if field in tree}
+    shaped = {
+        field: _lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
+        for field in ("H", "variance", "coherence")
+        if field in tree
+    }
     averages = {"averages": _array(tree, "averages")} if "averages" in tree else {}
     return stated_response({"frequency_Hz": frequency, "value": shaped.pop("H"), **fields, **shaped, **averages}, hints)
 
@@ -131,14 +139,19 @@ def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> 
         while len(shape) > 2 and shape[-1] == 1:
             shape = shape[:-1]
         return shape
+
     first = padded(array.shape) == padded((n, n_y, n_u))
     last = padded(array.shape) == padded((n_y, n_u, n))
     if n_y == n_u == 1 and array.size == n:
         return array.reshape(sizes)
     if first and last:
-        raise InputError(f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})",
-                         field=field, value=array.shape)
+        raise InputError(
+            f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})",
+            field=field,
+            value=array.shape,
+        )
     if not first and not last:
-        raise InputError(f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field,
-                         value=array.shape)
+        raise InputError(
+            f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field, value=array.shape
+        )
     return array.reshape(sizes) if first else np.moveaxis(array.reshape(n_y, n_u, n), 2, 0)

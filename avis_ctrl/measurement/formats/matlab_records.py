@@ -15,14 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
-from avis_ctrl.measurement.formats.common import (
-    as_names,
-    as_number,
-    as_text,
-    numbers,
-    require_small,
-    within,
-)
+from avis_ctrl.measurement.formats.common import as_names, as_number, as_text, numbers, require_small, within
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
@@ -33,15 +26,22 @@ from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_fro
 @dataclass(frozen=True)
 class MatlabSettings:
     """much_longer : minimum ratio of samples to channels if no names distinguish them [1]: an array closer to a square
-        can be read either way.
+    can be read either way.
     """
 
     much_longer: float = 10.0
 
 
 SETTINGS = MatlabSettings()
-USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output"), "t": ("t", "time"), "floor": ("floor",),
-         "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"), "u_names": ("u_names",), "y_names": ("y_names",)}
+USUAL = {
+    "u": ("u", "U", "input"),
+    "y": ("y", "Y", "output"),
+    "t": ("t", "time"),
+    "floor": ("floor",),
+    "sample_rate_Hz": ("sample_rate_Hz", "fs", "Fs", "FS"),
+    "u_names": ("u_names",),
+    "y_names": ("y_names",),
+}
 PERIODS = ("Ts", "dt")
 # Variables next to `records` that apply to all of them.
 SHARED = ("u_names", "y_names", "u_unit", "y_unit", "floor_unit", *USUAL["sample_rate_Hz"], *PERIODS)
@@ -59,8 +59,10 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
     """
     check_version(tree.get("format", FORMAT), _plain(tree.get("version", VERSION)))
     records = _structs(tree)
-    names = [as_text(record["name"], f"records({i + 1}).name") if not _empty(record.get("name")) else f"{i:02d}"
-             for i, record in enumerate(records)]
+    names = [
+        as_text(record["name"], f"records({i + 1}).name") if not _empty(record.get("name")) else f"{i:02d}"
+        for i, record in enumerate(records)
+    ]
     for name in names:
         if names.count(name) > 1:
             raise InputError("expected different names of records", field="records: name", value=name)
@@ -80,8 +82,9 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
     return Campaign(_rig(rig, tree), harmonised, str(path), (*notes, *assumed))
 
 
-def flat_campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None,
-                  hints: Hints) -> Campaign:
+def flat_campaign(
+    path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: str | None, hints: Hints
+) -> Campaign:
     """Campaign of one record, whose fields are the variables of the file; columns : roles to variables."""
     record, notes = _record(path, "00", tree, tree, columns, _with_stated(hints, tree), None)
     return Campaign(_rig(rig, tree), (record,), str(path), tuple(notes))
@@ -95,30 +98,34 @@ def _structs(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
     records = tree["records"]
     records = [records] if isinstance(records, dict) else records
     if not isinstance(records, list) or not records or not all(isinstance(record, dict) for record in records):
-        raise InputError("expected a struct array or a cell array of structs", field="records",
-                         value=describe(tree["records"]))
+        raise InputError(
+            "expected a struct array or a cell array of structs", field="records", value=describe(tree["records"])
+        )
     return records
 
 
 def _require(records: Mapping[str, Mapping[str, Any]], hints: Hints) -> None:
-    """Raise InputError for fields that cannot be assumed, all in one message so that the file can be repaired at once.
-    """
+    """Raise InputError for fields that cannot be assumed, all in one message so that the file can be repaired
+    at once."""
     missing: dict[str, list[str]] = {}
     for name, fields in records.items():
         excitation = hints.excitation or (fields.get("excitation") if isinstance(fields.get("excitation"), str) else "")
         with within(f"record {name}"):
             period = _with_stated(hints, {"period_s": fields.get("period_s")}).period_s
         timed = hints.sample_rate_Hz or any(key in fields for key in (*USUAL["t"], *USUAL["sample_rate_Hz"], *PERIODS))
-        for what, there in (("u, the commanded voltages (zeros at rest)", _usual(fields, "u")),
-                            ("y, the sensor signals", _usual(fields, "y")),
-                            ("sample_rate_Hz, fs or a time vector t", timed),
-                            ("period_s, the period in s of a multisine (not 0 or NaN)",
-                             period or excitation != "multisine")):
+        for what, there in (
+            ("u, the commanded voltages (zeros at rest)", _usual(fields, "u")),
+            ("y, the sensor signals", _usual(fields, "y")),
+            ("sample_rate_Hz, fs or a time vector t", timed),
+            ("period_s, the period in s of a multisine (not 0 or NaN)", period or excitation != "multisine"),
+        ):
             if not there:
                 missing.setdefault(what, []).append(name)
     if missing:
-        words = [what if len(names) == len(records) else f"{what} (record{'s' if len(names) > 1 else ''} "
-                 f"{', '.join(names)})" for what, names in missing.items()]
+        words = [
+            what if len(names) == len(records) else f"{what} (record{'s' if len(names) > 1 else ''} {', '.join(names)})"
+            for what, names in missing.items()
+        ]
         held = overview({key: 0 for fields in records.values() for key in fields})
         raise InputError(f"missing: {'; '.join(words)}; the records have {held}", field="records")
 
@@ -130,8 +137,15 @@ def _own_hints(hints: Hints, fields: Mapping[str, Any]) -> Hints:
     return replace(stated, period_s=stated.period_s if given is None else given)
 
 
-def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str, Any], columns: Mapped | None,
-            hints: Hints, end_s: float | None) -> tuple[RecordSource, list[str]]:
+def _record(
+    path: Path,
+    name: str,
+    tree: Mapping[str, Any],
+    fields: Mapping[str, Any],
+    columns: Mapped | None,
+    hints: Hints,
+    end_s: float | None,
+) -> tuple[RecordSource, list[str]]:
     """A record, on disk if the file is v7.3 and each role has one variable, otherwise in memory.
 
     tree : where names of channels are looked up; end_s : end of the previous record, None for the first.
@@ -140,17 +154,24 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
     flat = fields is tree
     for role in ("u", "y"):
         if not chosen[role] and (role == "y" or hints.excitation not in ("rest", "floor")):
-            raise InputError(f"no variable has a usual name; the file has {overview(fields)}; assign the variables "
-                             "with columns (such as u=vir, y=qm, t=t)", field=role)
-    matrices = {role: [_matrix(fields[variable], variable) for variable in chosen[role]]
-                for role in ("u", "y", "floor") if chosen[role] or role == "u"}
+            raise InputError(
+                f"no variable has a usual name; the file has {overview(fields)}; assign the variables "
+                "with columns (such as u=vir, y=qm, t=t)",
+                field=role,
+            )
+    matrices = {
+        role: [_matrix(fields[variable], variable) for variable in chosen[role]]
+        for role in ("u", "y", "floor")
+        if chosen[role] or role == "u"
+    }
     rate, start, note, known = _clock(fields, chosen, hints)
     notes += [note] if note else []
     if not chosen["sample_rate_Hz"] and hints.sample_rate_Hz is None and chosen["t"]:
         notes.append(f"sample rate not stated; {rate:.9g} Hz by {chosen['t'][0]}")
     stated = _stated_names(matrices, chosen, tree)
-    samples = _sample_count(matrices, {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1},
-                           known)
+    samples = _sample_count(
+        matrices, {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1}, known
+    )
     if hints.start_s is None and end_s is not None and (not chosen["t"] or start < end_s):
         start = end_s
         notes.append("start_s not stated; it follows the record before it")
@@ -163,15 +184,24 @@ def _record(path: Path, name: str, tree: Mapping[str, Any], fields: Mapping[str,
         names = stated.get(role)
         if names is None:
             # Variables with one channel give their names to the channels; the columns of a matrix are numbered.
-            names = tuple(variable if flat and count == 1 else f"{variable if flat else role}{i + 1}"
-                          for variable, count in zip(chosen[role], counts, strict=True) for i in range(count))
+            names = tuple(
+                variable if flat and count == 1 else f"{variable if flat else role}{i + 1}"
+                for variable, count in zip(chosen[role], counts, strict=True)
+                for i in range(count)
+            )
             notes += [] if flat else [f"{role}_names not stated; numbered {names[0]} to {names[-1]}"]
         elif len(names) != sum(counts):
-            raise InputError(f"expected {sum(counts)} names, one per channel; there are {len(names)}",
-                             field=f"{role}_names", value=names)
+            raise InputError(
+                f"expected {sum(counts)} names, one per channel; there are {len(names)}",
+                field=f"{role}_names",
+                value=names,
+            )
         label = _plain(fields.get(f"{role}_unit"))
-        place = Columns(str(items[0].dataset), samples, items[0].shape[0] == samples) if stored else np.hstack(
-            [np.zeros((samples, 0)), *(_oriented(item, samples, role) for item in items)])
+        place = (
+            Columns(str(items[0].dataset), samples, items[0].shape[0] == samples)
+            if stored
+            else np.hstack([np.zeros((samples, 0)), *(_oriented(item, samples, role) for item in items)])
+        )
         parts[role] = Part(names, None if _empty(label) else label, place)
     record, assumed = record_from(name, parts, rate, start, hints, str(path) if stored else "")
     return record, [*(f"record {name}: {note}" for note in notes), *assumed]
@@ -190,8 +220,9 @@ def _chosen(fields: Mapping[str, Any], columns: Mapped | None) -> dict[str, list
     return chosen
 
 
-def _stated_names(matrices: Mapping[str, Sequence[Matrix]], chosen: Mapping[str, list[str]],
-                  tree: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+def _stated_names(
+    matrices: Mapping[str, Sequence[Matrix]], chosen: Mapping[str, list[str]], tree: Mapping[str, Any]
+) -> dict[str, tuple[str, ...]]:
     """Names of the channels of each role, if stated."""
     stated: dict[str, tuple[str, ...]] = {"floor": FLOOR_NAMES} if "floor" in matrices else {}
     for role in ("u", "y"):
@@ -229,8 +260,9 @@ def _matrix(value: Any, field: str) -> Matrix:
     return value
 
 
-def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[str, int],
-                 known: int | None = None) -> int:
+def _sample_count(
+    matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[str, int], known: int | None = None
+) -> int:
     """Number of samples common to all matrices, in either orientation.
 
     channels : number of channels of a role, if known from names; known : length of the time vector.
@@ -240,8 +272,9 @@ def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[st
     InputError : no common length; square matrices; rows and columns that could both be the samples.
     """
     shapes = {role: [item.shape for item in items] for role, items in matrices.items()}
-    shown = ", ".join(f"{role} is {' and '.join('x'.join(map(str, shape)) for shape in some)}"
-                      for role, some in shapes.items())
+    shown = ", ".join(
+        f"{role} is {' and '.join('x'.join(map(str, shape)) for shape in some)}" for role, some in shapes.items()
+    )
     possible = None if known is None else {known}
     for role, some in shapes.items():
         for rows, columns in some:
@@ -249,8 +282,9 @@ def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[st
             if role in channels:
                 lengths = {length for length, others in ((rows, columns), (columns, rows)) if others == channels[role]}
                 if not lengths:
-                    raise InputError(f"expected {channels[role]} channels, as many as names; it is {rows}x{columns}",
-                                     field=role)
+                    raise InputError(
+                        f"expected {channels[role]} channels, as many as names; it is {rows}x{columns}", field=role
+                    )
             possible = lengths if possible is None else possible & lengths
     if not possible:
         also = "" if known is None else f", t has {known}"
@@ -258,8 +292,10 @@ def _sample_count(matrices: Mapping[str, Sequence[Matrix]], channels: Mapping[st
     samples = max(possible)
     square = any(rows == columns and rows > 1 for some in shapes.values() for rows, columns in some)
     if square or (len(possible) > 1 and samples < SETTINGS.much_longer * min(possible)):
-        raise InputError(f"rows and columns could both be the samples: {shown}; expected channel names or a time "
-                         "vector, which distinguish them")
+        raise InputError(
+            f"rows and columns could both be the samples: {shown}; expected channel names or a time "
+            "vector, which distinguish them"
+        )
     return samples
 
 
@@ -271,8 +307,13 @@ def _oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
 
 def _with_stated(hints: Hints, tree: Mapping[str, Any]) -> Hints:
     """Hints completed with variables or fields of the same names."""
-    return hints.completed({field: _plain(tree[field]) for field in ("level_V", "start_s", "period_s", "excitation")
-                            if not _empty(tree.get(field))})
+    return hints.completed(
+        {
+            field: _plain(tree[field])
+            for field in ("level_V", "start_s", "period_s", "excitation")
+            if not _empty(tree.get(field))
+        }
+    )
 
 
 def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int | None) -> tuple[str, ...]:
@@ -280,13 +321,17 @@ def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int
     if len(value) == 1 and value[0] in tree:
         return as_names(_plain(tree[value[0]]), field, count)
     if len(value) == 1 and count is None:
-        raise InputError("neither a variable nor a list of channel names (A+B+...); the file has "
-                         f"{overview(tree)}", field=field, value=value[0])
+        raise InputError(
+            f"neither a variable nor a list of channel names (A+B+...); the file has {overview(tree)}",
+            field=field,
+            value=value[0],
+        )
     return as_names(list(value), field, count)
 
 
-def _clock(tree: Mapping[str, Any], chosen: Mapping[str, list[str]],
-           hints: Hints) -> tuple[float, float, str, int | None]:
+def _clock(
+    tree: Mapping[str, Any], chosen: Mapping[str, list[str]], hints: Hints
+) -> tuple[float, float, str, int | None]:
     """Sample rate [Hz], first time [s], note, number of samples (None without a time vector)."""
     start, note, known, rate = 0.0, "", None, None
     if chosen["t"]:

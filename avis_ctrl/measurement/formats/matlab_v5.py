@@ -80,8 +80,11 @@ def _order(header: bytes) -> str:
     """Byte order of the file, as a format character of struct and numpy."""
     order = {b"IM": "<", b"MI": ">"}.get(header[126:128])
     if order is None or struct.unpack(order + "H", header[124:126])[0] != 0x0100:
-        raise InputError("expected version 0x0100 and the mark MI in bytes 124 to 127 of the header; damaged?",
-                         value=header[124:128].hex(), field="header")
+        raise InputError(
+            "expected version 0x0100 and the mark MI in bytes 124 to 127 of the header; damaged?",
+            value=header[124:128].hex(),
+            field="header",
+        )
     return order
 
 
@@ -137,7 +140,7 @@ class Elements:
         if kind not in kinds:
             raise _damaged(f"{what}: of type {kind}, not {' or '.join(map(str, kinds))}")
         self.at = min(start + (size + 7) // 8 * 8 if start == self.at + TAG else self.at + TAG, len(self.body))
-        return kind, self.body[start:start + size]
+        return kind, self.body[start : start + size]
 
     def integers(self, what: str, kind: int) -> list[int]:
         """Values of an element of 32-bit integers."""
@@ -215,6 +218,7 @@ def _numbers(elements: Elements, shape: tuple[int, ...], dtype: np.dtype, is_com
             else:
                 array[:] = parts[0]
         return array.reshape(shape, order="F")
+
     return Matrix(shape, "c" if is_complex else dtype.kind, read)
 
 
@@ -250,8 +254,10 @@ def _text(elements: Elements, shape: tuple[int, ...]) -> str | list[str]:
     if count == 0:
         return ""
     coding = f"utf-{8 * units.itemsize}-le"
-    rows = [row.tobytes().decode(coding, "replace").strip()
-            for row in units.reshape(shape, order="F").reshape(-1, shape[-1])]
+    rows = [
+        row.tobytes().decode(coding, "replace").strip()
+        for row in units.reshape(shape, order="F").reshape(-1, shape[-1])
+    ]
     return rows[0] if len(rows) == 1 else rows
 
 
@@ -270,15 +276,18 @@ def _structs(elements: Elements, shape: tuple[int, ...], depth: int) -> Any:
     content = bytes(elements.next("field names", *NAME)[1])
     if len(width) != 1 or width[0] < 1 or len(content) % width[0]:
         raise _damaged(f"field names: {len(content)} bytes in names of {str(width)[:40]}")
-    names = [_printable(content[at:at + width[0]].split(b"\0")[0], "field names")
-             for at in range(0, len(content), width[0])]
+    names = [
+        _printable(content[at : at + width[0]].split(b"\0")[0], "field names")
+        for at in range(0, len(content), width[0])
+    ]
     if len(set(names)) != len(names) or not all(names):
         raise _damaged("field names: empty or equal ones")
     count = math.prod(shape)
     _require_room(elements, count * len(names))
     if count != 1 and (count > MOST_CELLS or not names):
-        return Unreadable("struct array without fields" if not names
-                          else f"struct array of more than {MOST_CELLS} structs")
+        return Unreadable(
+            "struct array without fields" if not names else f"struct array of more than {MOST_CELLS} structs"
+        )
     items = [{name: _inner(elements, f"field {name}", depth) for name in names} for _ in range(count)]
     return items[0] if count == 1 else items
 

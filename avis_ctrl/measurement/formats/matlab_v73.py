@@ -38,8 +38,9 @@ def variables(path: Path) -> dict[str, Any]:
     """
     with reading(path, "the .mat file (v7.3)"), open_hdf5(path) as file:
         tree = Tree(file, path)
-        return {printable(name): tree.value(member(file, name), 0)
-                for name in members(file) if not name.startswith("#")}
+        return {
+            printable(name): tree.value(member(file, name), 0) for name in members(file) if not name.startswith("#")
+        }
 
 
 class Tree:
@@ -94,8 +95,9 @@ class Tree:
 
     def _references(self, item: h5py.Dataset, shape: tuple[int, ...]) -> list[Any]:
         if math.prod(shape) > MOST_CELLS:
-            raise InputError(f"expected at most {MOST_CELLS} cells", field=printable(full_name(item)),
-                             value=math.prod(shape))
+            raise InputError(
+                f"expected at most {MOST_CELLS} cells", field=printable(full_name(item)), value=math.prod(shape)
+            )
         return list(values(item).reshape(-1))  # dimensions are stored reversed: this is MATLAB's linear order
 
     def _behind(self, reference: Any, depth: int) -> Any:
@@ -113,8 +115,10 @@ class Tree:
         if not fields or len(arrays) < len(fields):
             return {printable(name): self.value(field, depth + 1) for name, field in fields.items()}
         count = min(len(references) for references in arrays.values())
-        return [{printable(name): self._behind(references[i], depth) for name, references in arrays.items()}
-                for i in range(count)]
+        return [
+            {printable(name): self._behind(references[i], depth) for name, references in arrays.items()}
+            for i in range(count)
+        ]
 
     def _matrix(self, item: h5py.Dataset, stored: tuple[int, ...], dtype: np.dtype) -> Matrix:
         name, path = full_name(item), self.path
@@ -130,5 +134,6 @@ class Tree:
                 if array["real"].dtype.kind in "fiu" and array["imag"].dtype.kind in "fiu":
                     return array["real"] + 1j * array["imag"]
             raise InputError("changed since it was opened, or holds no numbers", file=path, field=printable(name))
+
         shape = stored[::-1] if len(stored) != 1 else (stored[0], 1)
         return Matrix(shape, "c" if complex_parts else dtype.kind, read, None if complex_parts else name)

@@ -37,15 +37,18 @@ def parse_columns(text: str) -> dict[str, list[str]]:
     for part in text.split(","):
         role, equals, names = (word.strip() for word in part.partition("="))
         if not equals or role not in ROLES or role in columns or not all(name.strip() for name in names.split("+")):
-            raise InputError("expected role=name, each role once, such as u=A1+A2,y=S1,t=time; the roles are "
-                             f"{', '.join(ROLES)}",
-                             field="columns", value=part.strip())
+            raise InputError(
+                f"expected role=name, each role once, such as u=A1+A2,y=S1,t=time; the roles are {', '.join(ROLES)}",
+                field="columns",
+                value=part.strip(),
+            )
         columns[role] = [name.strip() for name in names.split("+")]
     return columns
 
 
-def read_measurements(path: str | Path, columns: Mapping[str, Any] | None = None, rig: str | None = None,
-                      **hints: Any) -> Campaign | FrequencyResponse:
+def read_measurements(
+    path: str | Path, columns: Mapping[str, Any] | None = None, rig: str | None = None, **hints: Any
+) -> Campaign | FrequencyResponse:
     """Read measurements in any supported format: a campaign of records, or a frequency response.
 
     columns : roles (t, u, y, floor, ...) to names, for files of flat columns; u_names and y_names to the name of a
@@ -89,7 +92,8 @@ def _format(path: Path, head: bytes) -> str:
             # A v7.3 file that lost its text header.
             found = not attributes(file, "format") and any(
                 item is not None and attributes(item, "MATLAB_class")
-                for item in (member(file, name) for name in members(file)))  # None: a broken link
+                for item in (member(file, name) for name in members(file))
+            )  # None: a broken link
         return "matlab" if found else "hdf5"
     lines = head.lstrip().splitlines()
     if len(lines) > 1 and lines[0].strip() == b"-1" and lines[1][:6].strip().rstrip(b"bB").isdigit():
@@ -122,8 +126,11 @@ def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[st
     for role, names in naming.items():
         old = getattr(measured, fields[role])
         if len(names) != len(old):
-            raise InputError(f"expected {len(old)} names, for the channels {', '.join(old)}; there are {len(names)}",
-                             field=f"columns: {role}", value="+".join(names))
+            raise InputError(
+                f"expected {len(old)} names, for the channels {', '.join(old)}; there are {len(names)}",
+                field=f"columns: {role}",
+                value="+".join(names),
+            )
         changes[fields[role]] = tuple(names)
     if not changes:
         return measured

@@ -23,7 +23,7 @@ Mapped = Mapping[str, Any]
 @dataclass(frozen=True)
 class RecordSettings:
     """same_rate : relative difference of two sample rates below which they are from the same clock [1]: rounding of
-        time stamps causes smaller differences, and the quartz clocks of two instruments differ by more.
+    time stamps causes smaller differences, and the quartz clocks of two instruments differ by more.
     """
 
     same_rate: float = 1e-6
@@ -65,8 +65,14 @@ class Hints:
         Raises InputError if one of these has the wrong type.
         """
         kinds: dict[str, Any] = {"excitation": as_text, "period_s": stated_period}
-        return replace(self, **{field: kinds.get(field, as_number)(value, field) for field, value in stated.items()
-                                if value is not None and getattr(self, field) is None})
+        return replace(
+            self,
+            **{
+                field: kinds.get(field, as_number)(value, field)
+                for field, value in stated.items()
+                if value is not None and getattr(self, field) is None
+            },
+        )
 
 
 def hints_from(given: Mapping[str, Any]) -> Hints:
@@ -110,8 +116,9 @@ def pick(names: Sequence[str], available: Sequence[str], role: str) -> None:
     """Raise InputError for names that are not available."""
     for name in names:
         if name not in available:
-            raise InputError(f"not found; the file has {', '.join(available) or 'nothing'}", field=f"columns: {role}",
-                             value=name)
+            raise InputError(
+                f"not found; the file has {', '.join(available) or 'nothing'}", field=f"columns: {role}", value=name
+            )
 
 
 class Part(NamedTuple):
@@ -126,8 +133,9 @@ class Part(NamedTuple):
     samples: np.ndarray | Columns
 
 
-def record_from(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float, hints: Hints,
-                path: str = "") -> tuple[RecordSource, list[str]]:
+def record_from(
+    name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float, hints: Hints, path: str = ""
+) -> tuple[RecordSource, list[str]]:
     """A record of u, y and, if measured, floor, and a note for each assumption.
 
     path : HDF5 file in which the samples of all parts stay.
@@ -140,8 +148,9 @@ def record_from(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: f
         return _record(name, parts, rate_Hz, start_s, hints, path)
 
 
-def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float, hints: Hints,
-            path: str) -> tuple[RecordSource, list[str]]:
+def _record(
+    name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float, hints: Hints, path: str
+) -> tuple[RecordSource, list[str]]:
     channels = {role: tuple(part.names) for role, part in parts.items()}
     if "floor" in channels:
         if len(channels["floor"]) != len(FLOOR_NAMES):
@@ -152,17 +161,22 @@ def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float
         text = ", ".join(f"{role} has {count}" for role, count in lengths.items())
         raise InputError(f"expected equally many samples; {text}")
     if not channels["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError("expected at least one input, such as a column u or u_...; assign a column of another name "
-                         "with columns (u=NAME); only records with excitation 'rest' or 'floor' need no input",
-                         field="u")
+        raise InputError(
+            "expected at least one input, such as a column u or u_...; assign a column of another name "
+            "with columns (u=NAME); only records with excitation 'rest' or 'floor' need no input",
+            field="u",
+        )
     notes: list[str] = []
     units: dict[str, str] = {}
     samples: dict[str, Any] = {}
     for role, part in parts.items():
         units[role], factors, assumed = _units(role, part, hints)
         notes += assumed
-        samples[role] = (replace(part.samples, factors=factors) if isinstance(part.samples, Columns)
-                         else part.samples * np.array(factors))
+        samples[role] = (
+            replace(part.samples, factors=factors)
+            if isinstance(part.samples, Columns)
+            else part.samples * np.array(factors)
+        )
     excitation, period, level = hints.excitation, hints.period_s, hints.level_V
     stated = level is not None and (excitation is not None or period is not None)
     rms = None if stated or not channels["u"] else _root_mean_square(samples["u"], channels["u"], path)
@@ -177,9 +191,21 @@ def _record(name: str, parts: Mapping[str, Part], rate_Hz: float, start_s: float
         notes += [] if rms is None else [f"level_V not stated; taken as the r.m.s. of u, {level:.4g}"]
     if level < 0:
         raise InputError("expected 0 or more", field="level_V", value=level)
-    header = RecordHeader(name, rate_Hz, lengths["y"], channels["u"], channels["y"], excitation, level,
-                          start_s if hints.start_s is None else hints.start_s, period, units["u"], units["y"],
-                          channels.get("floor", ()), units.get("floor", "m/s"))
+    header = RecordHeader(
+        name,
+        rate_Hz,
+        lengths["y"],
+        channels["u"],
+        channels["y"],
+        excitation,
+        level,
+        start_s if hints.start_s is None else hints.start_s,
+        period,
+        units["u"],
+        units["y"],
+        channels.get("floor", ()),
+        units.get("floor", "m/s"),
+    )
     record = StoredRecord(header, path, samples) if path else Record(header, **samples)
     return record, [f"record {name}: {note}" for note in notes]
 

@@ -21,7 +21,7 @@ from avis_ctrl.measurement.formats.records import Hints
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
-SINGLE_PRECISION = 2.0 ** -24
+SINGLE_PRECISION = 2.0**-24
 ROUNDING = 1e-5  # a printed coherence may exceed 1 by this much
 
 
@@ -56,29 +56,55 @@ def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyRespons
     over = unit_of(hints.y_unit or as_text(fields["output_unit"], "output_unit"), "output_unit", OUTPUT_UNITS)
     under = unit_of(hints.u_unit or as_text(fields["input_unit"], "input_unit"), "input_unit", INPUT_UNITS)
     factor = over.factor / under.factor
-    common: dict[str, Any] = {"input_unit": under.si, "output_unit": over.si,
-                              "method": as_text(fields.get("method", ""), "method")}
+    common: dict[str, Any] = {
+        "input_unit": under.si,
+        "output_unit": over.si,
+        "method": as_text(fields.get("method", ""), "method"),
+    }
     coherence, variance = fields.get("coherence"), fields.get("variance")
     if fields.get("noise") is not None and fields.get("gram") is not None:
         if factor != 1.0:
-            raise InputError("expected SI units for noise and gram", field="units",
-                             value=str(fields["output_unit"]))
+            raise InputError("expected SI units for noise and gram", field="units", value=str(fields["output_unit"]))
         dof = fields.get("dof", np.inf)
         common |= {field: fields.get(field) for field in COVARIANCES}
-        return FrequencyResponse(frequency, value, inputs=inputs, outputs=outputs, **common,
-                                 dof=np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof"))
+        return FrequencyResponse(
+            frequency,
+            value,
+            inputs=inputs,
+            outputs=outputs,
+            **common,
+            dof=np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof"),
+        )
     averages = hints.averages
     if averages is None and fields.get("averages") is not None:
         averages = as_number(fields["averages"], "averages")
-    return response_from(frequency, value * factor, inputs, outputs, coherence=coherence, averages=averages,
-                         variance=None if variance is None else variance * factor ** 2,
-                         relative_standard_deviation=hints.relative_standard_deviation, **common)
+    return response_from(
+        frequency,
+        value * factor,
+        inputs,
+        outputs,
+        coherence=coherence,
+        averages=averages,
+        variance=None if variance is None else variance * factor**2,
+        relative_standard_deviation=hints.relative_standard_deviation,
+        **common,
+    )
 
 
-def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[str], outputs: Sequence[str], *,
-                  variance: np.ndarray | None = None, coherence: np.ndarray | None = None,
-                  averages: float | None = None, relative_standard_deviation: float | None = None,
-                  input_unit: str = "V", output_unit: str = "V", method: str = "") -> FrequencyResponse:
+def response_from(
+    frequency_Hz: np.ndarray,
+    value: np.ndarray,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    variance: np.ndarray | None = None,
+    coherence: np.ndarray | None = None,
+    averages: float | None = None,
+    relative_standard_deviation: float | None = None,
+    input_unit: str = "V",
+    output_unit: str = "V",
+    method: str = "",
+) -> FrequencyResponse:
     """A frequency response whose entries count as independent.
 
     frequency_Hz : (n,); value : (n, n_y, n_u) complex; variance : (n, n_y, n_u) E|error|^2; coherence : (n, n_y, n_u)
@@ -98,8 +124,9 @@ def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[
     if variance is not None:
         variance = _plain(variance, "variance", "fiu")
         if variance.shape != shape or not np.all(variance >= 0):
-            raise InputError(f"expected shape {shape} and no negative or missing value", field="variance",
-                             value=variance.shape)
+            raise InputError(
+                f"expected shape {shape} and no negative or missing value", field="variance", value=variance.shape
+            )
     elif coherence is not None:
         coherence = _coherence(coherence, value.shape, averages)
         keep = np.all(coherence > 0, axis=(1, 2))
@@ -111,18 +138,32 @@ def response_from(frequency_Hz: np.ndarray, value: np.ndarray, inputs: Sequence[
         method = f"{method}; variance from coherence, {averages:g} averages".lstrip("; ")
     elif relative_standard_deviation is not None:
         if not (np.isfinite(relative_standard_deviation) and relative_standard_deviation > 0):
-            raise InputError("expected a positive number", field="relative_standard_deviation",
-                             value=relative_standard_deviation)
+            raise InputError(
+                "expected a positive number", field="relative_standard_deviation", value=relative_standard_deviation
+            )
         variance = (relative_standard_deviation * np.abs(value)) ** 2
         method = f"{method}; stated relative standard deviation {relative_standard_deviation:g}".lstrip("; ")
     else:
-        raise InputError("the file has neither variance nor coherence; pass relative_standard_deviation (such as 0.05) "
-                         "to state the errors", field="uncertainty of the frequency response")
+        raise InputError(
+            "the file has neither variance nor coherence; pass relative_standard_deviation (such as 0.05) "
+            "to state the errors",
+            field="uncertainty of the frequency response",
+        )
     if not keep.all():
         lost = frequency_Hz[~keep]
         method += f"; {len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz"
-    return FrequencyResponse(frequency_Hz[keep], value[keep], None, None, tuple(inputs), tuple(outputs), input_unit,
-                             output_unit, entry_variance=variance[keep], method=method)
+    return FrequencyResponse(
+        frequency_Hz[keep],
+        value[keep],
+        None,
+        None,
+        tuple(inputs),
+        tuple(outputs),
+        input_unit,
+        output_unit,
+        entry_variance=variance[keep],
+        method=method,
+    )
 
 
 def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
@@ -130,8 +171,11 @@ def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
     if array.dtype.kind not in kinds:
         raise InputError("expected numbers", field=field, value=f"array of {kind_of(array.dtype)}")
     if not np.all(np.isfinite(array)):
-        raise InputError(f"expected finite numbers; NaN or infinite: {np.count_nonzero(~np.isfinite(array))}, the "
-                         f"first at line {np.argwhere(~np.isfinite(array))[0][0]}", field=field)
+        raise InputError(
+            f"expected finite numbers; NaN or infinite: {np.count_nonzero(~np.isfinite(array))}, the "
+            f"first at line {np.argwhere(~np.isfinite(array))[0][0]}",
+            field=field,
+        )
     return array
 
 
@@ -140,9 +184,12 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
     if coherence.shape == shape[:2] and shape[2] == 1:
         coherence = coherence[:, :, None]
     if coherence.shape == shape[:2]:
-        raise InputError(f"multiple coherence of {shape[2]} inputs does not determine the errors of single entries; "
-                         "expected the ordinary coherence of each entry, or variance", field="coherence",
-                         value=coherence.shape)
+        raise InputError(
+            f"multiple coherence of {shape[2]} inputs does not determine the errors of single entries; "
+            "expected the ordinary coherence of each entry, or variance",
+            field="coherence",
+            value=coherence.shape,
+        )
     if coherence.shape != shape:
         raise InputError(f"expected shape {shape}", field="coherence", value=coherence.shape)
     if np.any(coherence < 0) or np.any(coherence > 1 + ROUNDING):
@@ -151,6 +198,7 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
     if averages is None:
         raise InputError("missing; the errors follow from coherence and the number of averages", field="averages")
     if not (np.isfinite(averages) and averages >= 2):
-        raise InputError("expected 2 or more; with one average the coherence is always 1", field="averages",
-                         value=averages)
+        raise InputError(
+            "expected 2 or more; with one average the coherence is always 1", field="averages", value=averages
+        )
     return np.minimum(coherence, 1.0)

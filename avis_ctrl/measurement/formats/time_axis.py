@@ -12,8 +12,9 @@ SILENT, JITTER, GAP = 1e-3, 0.1, 1.5  # in samples: limits for rounding, for jit
 SAME_RATE = 1e-3  # relative difference up to which a stated sample rate agrees with the time stamps
 
 
-def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {}".format,
-                     field: str = "t") -> tuple[float, float, str]:
+def sample_rate_from(
+    time_s: np.ndarray, place: Callable[[int], str] = "sample {}".format, field: str = "t"
+) -> tuple[float, float, str]:
     """Sample rate [Hz], time of the first sample [s], and a note ("" if the stamps are even).
 
     The clock is the straight line through the first and the last stamp. Stamps within a tenth of a sample of it count
@@ -31,27 +32,37 @@ def sample_rate_from(time_s: np.ndarray, place: Callable[[int], str] = "sample {
         raise InputError("expected at least two time stamps", field=field, value=time_s.shape)
     if not np.all(np.isfinite(time_s)):
         bad = np.flatnonzero(~np.isfinite(time_s))
-        raise InputError(f"expected finite time stamps; NaN or infinite: {len(bad)}, the first at {place(int(bad[0]))}",
-                         field=field)
+        raise InputError(
+            f"expected finite time stamps; NaN or infinite: {len(bad)}, the first at {place(int(bad[0]))}", field=field
+        )
     step = np.diff(time_s)
     if np.any(step <= 0):
         bad = np.flatnonzero(step <= 0)
         first = int(bad[0]) + 1
-        raise InputError(f"expected increasing time stamps; not later than the one before: {len(bad)}, the first at "
-                         f"{place(first)}: {time_s[first]:.9g} s after {time_s[first - 1]:.9g} s", field=field)
+        raise InputError(
+            f"expected increasing time stamps; not later than the one before: {len(bad)}, the first at "
+            f"{place(first)}: {time_s[first]:.9g} s after {time_s[first - 1]:.9g} s",
+            field=field,
+        )
     usual = float(np.median(step))
     if np.any(step > GAP * usual):
         bad = np.flatnonzero(step > GAP * usual)
         first = int(bad[0]) + 1
-        raise InputError(f"expected evenly spaced time stamps; gaps: {len(bad)}, the first before {place(first)}: "
-                         f"{step[first - 1]:.6g} s instead of {usual:.6g} s", field=field)
+        raise InputError(
+            f"expected evenly spaced time stamps; gaps: {len(bad)}, the first before {place(first)}: "
+            f"{step[first - 1]:.6g} s instead of {usual:.6g} s",
+            field=field,
+        )
     mean = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
     off = np.abs(time_s - time_s[0] - mean * np.arange(len(time_s))) / mean
     worst = int(np.argmax(off))
     if off[worst] > JITTER:
-        raise InputError(f"expected evenly spaced time stamps; {np.count_nonzero(off > JITTER)} are more than "
-                         f"{JITTER:g} of a sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of "
-                         f"{mean:.6g} s", field=field)
+        raise InputError(
+            f"expected evenly spaced time stamps; {np.count_nonzero(off > JITTER)} are more than "
+            f"{JITTER:g} of a sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of "
+            f"{mean:.6g} s",
+            field=field,
+        )
     note = f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even" if off[worst] > SILENT else ""
     return rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
 

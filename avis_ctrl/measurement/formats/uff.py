@@ -33,8 +33,17 @@ from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, f
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 TIME, RESPONSE, COHERENCE, MULTIPLE_COHERENCE = 1, 4, 6, 26
-WORDS = {0: "unknown", 2: "auto spectrum", 3: "cross spectrum", 5: "transmissibility", 7: "auto correlation",
-         8: "cross correlation", 9: "power spectral density", 10: "energy spectral density", 12: "spectrum"}
+WORDS = {
+    0: "unknown",
+    2: "auto spectrum",
+    3: "cross spectrum",
+    5: "transmissibility",
+    7: "auto correlation",
+    8: "cross correlation",
+    9: "power spectral density",
+    10: "energy spectral density",
+    12: "spectrum",
+}
 # Specific data type -> SI unit; displacement, velocity and acceleration are scaled by the unit of length.
 LENGTHS, FORCE = {8: "m", 11: "m/s", 12: "m/s^2"}, 13
 HERTZ = {"": 1.0, "Hz": 1.0, "kHz": 1e3, "rad/s": 1 / (2 * np.pi)}
@@ -44,8 +53,9 @@ AVERAGES = (r"(\d+)\s*averages?\b", r"\baverages?\s*[:=]?\s*(\d+)")
 Entry = tuple[Point, Point]
 
 
-def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None,
-         hints: Hints | None = None) -> Campaign | FrequencyResponse:
+def read(
+    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
+) -> Campaign | FrequencyResponse:
     """A universal file: a campaign if it contains time responses, otherwise its frequency responses.
 
     columns : roles u, y, floor to names of channels. Without it, excitation forces, references of other functions and
@@ -65,16 +75,20 @@ def read(path: str | Path, columns: Mapped | None = None, rig: str | None = None
         if RESPONSE in kinds:
             return _response(found, hints)
         held = ", ".join(f"{kind} ({WORDS.get(kind, 'other')})" for kind in kinds) or "no data set 58"
-        raise InputError(f"expected functions of type 1 (time response) or 4 (frequency response); the file has {held}",
-                         field="function type")
+        raise InputError(
+            f"expected functions of type 1 (time response) or 4 (frequency response); the file has {held}",
+            field="function type",
+        )
 
 
 def channel_names(points: Sequence[Point]) -> dict[Point, str]:
     """Name of each channel; an entity name that several channels have is completed with node and direction."""
     names = {point: point.channel() for point in points}
     shared = [name for name in names.values() if list(names.values()).count(name) > 1]
-    return {point: f"{name} {point._replace(name='').channel()}" if name in shared else name
-            for point, name in names.items()}
+    return {
+        point: f"{name} {point._replace(name='').channel()}" if name in shared else name
+        for point, name in names.items()
+    }
 
 
 def axis_unit(axis: Axis, point: Point, function: Function, role: str, hint: str | None) -> Unit:
@@ -96,22 +110,32 @@ def axis_unit(axis: Axis, point: Point, function: Function, role: str, hint: str
     if axis.unit:
         labelled = unit_of(axis.unit, field, ALLOWED[role])
         scaled = by_type is not None and by_type.factor != 1.0
-        if scaled and by_type is not None and (labelled.si != by_type.si
-                                               or abs(labelled.factor / by_type.factor - 1) > 1e-6):
-            raise InputError(f"by data set 164 it is {by_type.factor:g} {by_type.si}; state the right one with "
-                             f"{role}_unit", field=field, value=axis.unit)
+        if (
+            scaled
+            and by_type is not None
+            and (labelled.si != by_type.si or abs(labelled.factor / by_type.factor - 1) > 1e-6)
+        ):
+            raise InputError(
+                f"by data set 164 it is {by_type.factor:g} {by_type.si}; state the right one with {role}_unit",
+                field=field,
+                value=axis.unit,
+            )
         return labelled
     if by_type is None or by_type.si not in ALLOWED[role]:
-        raise InputError(f"not stated (no label, specific data type {axis.kind}); pass {role}_unit, one of "
-                         f"{', '.join(ALLOWED[role])}", field=field)
+        raise InputError(
+            f"not stated (no label, specific data type {axis.kind}); pass {role}_unit, one of "
+            f"{', '.join(ALLOWED[role])}",
+            field=field,
+        )
     return by_type
 
 
 def _abscissa(function: Function, units: Mapping[str, float]) -> np.ndarray:
     unit = function.axes[0].unit
     if unit not in units:
-        raise InputError(f"expected one of {', '.join(filter(None, units))}", field=f"{function.place}: abscissa unit",
-                         value=unit)
+        raise InputError(
+            f"expected one of {', '.join(filter(None, units))}", field=f"{function.place}: abscissa unit", value=unit
+        )
     return function.abscissa * units[unit]
 
 
@@ -132,14 +156,17 @@ def _clock(function: Function) -> tuple[float, float, str]:
 
 def _inputs(first: Mapping[Point, Function], names: Mapping[Point, str]) -> list[str]:
     """Channels that the file identifies as inputs."""
-    references = {function.reference for function in first.values() if function.reference.node > 0
-                  or function.reference.name}
-    return [names[point] for point, function in first.items()
-            if function.axes[1].kind == FORCE or point in references or re.fullmatch(INPUT_NAME, names[point], re.I)]
+    references = {
+        function.reference for function in first.values() if function.reference.node > 0 or function.reference.name
+    }
+    return [
+        names[point]
+        for point, function in first.items()
+        if function.axes[1].kind == FORCE or point in references or re.fullmatch(INPUT_NAME, names[point], re.I)
+    ]
 
 
-def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig: str | None,
-              hints: Hints) -> Campaign:
+def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign:
     takes: dict[Point, list[Function]] = defaultdict(list)
     for function in found:
         if function.kind == TIME:
@@ -156,8 +183,9 @@ def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig
         for role, wanted in roles.items():
             for name in wanted:
                 if len(takes[points[name]]) <= k:
-                    raise InputError(f"missing in record {k:02d}; other channels have {count} records",
-                                     field=f"channel {name}")
+                    raise InputError(
+                        f"missing in record {k:02d}; other channels have {count} records", field=f"channel {name}"
+                    )
             chosen[role] = [takes[points[name]][k] for name in wanted]
         record, assumed = _record(f"{k:02d}", chosen, roles, hints)
         records.append(record)
@@ -166,8 +194,9 @@ def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig
     return Campaign(rig or UNNAMED, harmonised, str(path), tuple([*notes, *assumed]))
 
 
-def _roles(takes: Mapping[Point, list[Function]], names: Mapping[Point, str], columns: Mapped | None,
-           hints: Hints) -> dict[str, list[str]]:
+def _roles(
+    takes: Mapping[Point, list[Function]], names: Mapping[Point, str], columns: Mapped | None, hints: Hints
+) -> dict[str, list[str]]:
     available = list(names.values())
     roles = {role: mapped(columns, role) or [] for role in ("u", "y", "floor")}
     for role, wanted in roles.items():
@@ -177,32 +206,44 @@ def _roles(takes: Mapping[Point, list[Function]], names: Mapping[Point, str], co
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(available) else []
         roles["y"] = [name for name in available if name not in roles["u"] and name not in roles["floor"]]
     if not roles["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError(f"no channel is recognised as an input; the file has {', '.join(available)}; assign the "
-                         "channels with columns (such as u=A1, y=S1), or state excitation rest or floor", field="u")
+        raise InputError(
+            f"no channel is recognised as an input; the file has {', '.join(available)}; assign the "
+            "channels with columns (such as u=A1, y=S1), or state excitation rest or floor",
+            field="u",
+        )
     if not roles["y"]:
         raise InputError(f"expected at least one output; the file has {', '.join(available)}", field="y")
     return roles if roles["floor"] else {role: roles[role] for role in ("u", "y")}
 
 
-def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str, list[str]],
-            hints: Hints) -> tuple[RecordSource, list[str]]:
+def _record(
+    name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str, list[str]], hints: Hints
+) -> tuple[RecordSource, list[str]]:
     every = [function for some in chosen.values() for function in some]
     rate, start, note = _clock(every[0])
     for function in every[1:]:
         if len(function.value) != len(every[0].value):
-            raise InputError(f"expected {len(every[0].value)} samples, as {every[0].response.channel()} has",
-                             field=f"record {name}, channel {function.response.channel()}", value=len(function.value))
+            raise InputError(
+                f"expected {len(every[0].value)} samples, as {every[0].response.channel()} has",
+                field=f"record {name}, channel {function.response.channel()}",
+                value=len(function.value),
+            )
         if not np.allclose(function.abscissa, every[0].abscissa, rtol=0, atol=0.1 / rate):
-            raise InputError(f"expected the times of {every[0].response.channel()}",
-                             field=f"record {name}, channel {function.response.channel()}")
+            raise InputError(
+                f"expected the times of {every[0].response.channel()}",
+                field=f"record {name}, channel {function.response.channel()}",
+            )
     parts = {}
     for role, some in chosen.items():
         hint = {"u": hints.u_unit, "y": hints.y_unit}.get(role)
         if any(np.iscomplexobj(function.value) for function in some):
             raise InputError("expected real samples of a time response", field=f"record {name}: {role}")
         units = [axis_unit(function.axes[1], function.response, function, role, hint) for function in some]
-        array = np.stack([function.value * unit.factor for function, unit in zip(some, units, strict=True)], axis=1) \
-            if some else np.zeros((len(every[0].value), 0))
+        array = (
+            np.stack([function.value * unit.factor for function, unit in zip(some, units, strict=True)], axis=1)
+            if some
+            else np.zeros((len(every[0].value), 0))
+        )
         parts[role] = Part(roles[role], [unit.si for unit in units], array)
     # The units have already been applied.
     hints = replace(hints, u_unit=None, y_unit=None)
@@ -210,9 +251,12 @@ def _record(name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str,
         rate, note = agreed_rate(hints.sample_rate_Hz, rate, f"record {name}: sample_rate_Hz"), ""
     record, notes = record_from(name, parts, rate, start, hints)
     notes += [f"record {name}: {note}"] if note else []
-    notes += [f"record {name}: channel {function.response.name} is measured along "
-              f"{function.response._replace(name='').channel().split()[-1]}; its sign is kept"
-              for function in every if function.response.direction < 0 and function.response.name]
+    notes += [
+        f"record {name}: channel {function.response.name} is measured along "
+        f"{function.response._replace(name='').channel().split()[-1]}; its sign is kept"
+        for function in every
+        if function.response.direction < 0 and function.response.name
+    ]
     return record, notes
 
 
@@ -223,8 +267,10 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
     output_names, input_names = channel_names(outputs), channel_names(inputs)
     missing = [f"{output_names[y]} from {input_names[u]}" for y in outputs for u in inputs if (y, u) not in entries]
     if missing:
-        raise InputError(f"expected every output for every input; {len(missing)} are missing, the first is "
-                         f"{missing[0]}", field="frequency responses")
+        raise InputError(
+            f"expected every output for every input; {len(missing)} are missing, the first is {missing[0]}",
+            field="frequency responses",
+        )
     first = next(iter(entries.values()))
     frequency = _abscissa(first, HERTZ)
     value = np.zeros((len(frequency), len(outputs), len(inputs)), complex)
@@ -245,9 +291,17 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
         raise InputError("expected one unit of all frequency responses", field="units", value=sorted(units))
     output_unit, input_unit = units.pop()
     averages = hints.averages if hints.averages is not None else _averages(found)
-    return response_from(frequency, value, [input_names[u] for u in inputs], [output_names[y] for y in outputs],
-                         coherence=coherence if complete else None, averages=averages, input_unit=input_unit,
-                         output_unit=output_unit, relative_standard_deviation=hints.relative_standard_deviation)
+    return response_from(
+        frequency,
+        value,
+        [input_names[u] for u in inputs],
+        [output_names[y] for y in outputs],
+        coherence=coherence if complete else None,
+        averages=averages,
+        input_unit=input_unit,
+        output_unit=output_unit,
+        relative_standard_deviation=hints.relative_standard_deviation,
+    )
 
 
 def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Function]:
@@ -257,8 +311,11 @@ def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Fun
         if function.kind in kinds:
             entry = (function.response, function.reference)
             if entry in entries:
-                raise InputError("expected each pair of response and reference once", field=function.place,
-                                 value=f"{entry[0].channel()} from {entry[1].channel()}")
+                raise InputError(
+                    "expected each pair of response and reference once",
+                    field=function.place,
+                    value=f"{entry[0].channel()} from {entry[1].channel()}",
+                )
             entries[entry] = function
     return entries
 
@@ -267,9 +324,11 @@ def _on(function: Function, frequency: np.ndarray) -> np.ndarray:
     """Values of the function, if it has the frequencies of the first frequency response."""
     own = _abscissa(function, HERTZ)
     if own.shape != frequency.shape or not np.allclose(own, frequency, rtol=1e-5, atol=1e-9):
-        raise InputError(f"expected the {len(frequency)} frequencies of the first frequency response",
-                         field=f"{function.place}, {function.response.channel()} from {function.reference.channel()}",
-                         value=f"{len(own)} from {own[0]:g} to {own[-1]:g} Hz")
+        raise InputError(
+            f"expected the {len(frequency)} frequencies of the first frequency response",
+            field=f"{function.place}, {function.response.channel()} from {function.reference.channel()}",
+            value=f"{len(own)} from {own[0]:g} to {own[-1]:g} Hz",
+        )
     return function.value
 
 

@@ -48,8 +48,14 @@ class _Experiments:
     dof: int
 
 
-def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
-                              transient: Transient = "auto", smooth_lines: int | None = None) -> FrequencyResponse:
+def best_linear_approximation(
+    campaign: Campaign,
+    *,
+    band_Hz: Band | None = None,
+    level_V: float | None = None,
+    transient: Transient = "auto",
+    smooth_lines: int | None = None,
+) -> FrequencyResponse:
     """G from the drives on the excited lines, with total, noise and distortion covariances.
 
     The floor motion is not periodic and counts as noise.
@@ -71,18 +77,27 @@ def best_linear_approximation(campaign: Campaign, *, band_Hz: Band | None = None
         `best_linear_approximations`), neither repeated periods nor several realisations.
     ComputationError : experiments that cannot separate the inputs.
     """
-    found = best_linear_approximations(campaign, band_Hz=band_Hz, level_V=level_V, transient=transient,
-                                       smooth_lines=smooth_lines)
+    found = best_linear_approximations(
+        campaign, band_Hz=band_Hz, level_V=level_V, transient=transient, smooth_lines=smooth_lines
+    )
     if len(found) > 1:
         sets = "; ".join(f"{', '.join(r.inputs)} on {r.frequency_Hz.size} lines" for r in found)
-        raise InputError(f"different lines excite different inputs ({sets}): use best_linear_approximations, which "
-                         "gives one response for each set", field="records")
+        raise InputError(
+            f"different lines excite different inputs ({sets}): use best_linear_approximations, which "
+            "gives one response for each set",
+            field="records",
+        )
     return found[0]
 
 
-def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None,
-                               transient: Transient = "auto",
-                               smooth_lines: int | None = None) -> tuple[FrequencyResponse, ...]:
+def best_linear_approximations(
+    campaign: Campaign,
+    *,
+    band_Hz: Band | None = None,
+    level_V: float | None = None,
+    transient: Transient = "auto",
+    smooth_lines: int | None = None,
+) -> tuple[FrequencyResponse, ...]:
     """One response for each set of inputs that are excited on the same lines (several sets for zippered multisines).
 
     Parameters and errors as in `best_linear_approximation`.
@@ -99,12 +114,15 @@ def best_linear_approximations(campaign: Campaign, *, band_Hz: Band | None = Non
     frequency = np.arange(keep.start, keep.stop) * rate / n
     treatment = f"{dropped} periods dropped" + (", transient removed" if remove else "")
     words = f"best linear approximation, {len(data.U)} experiments of {means[0].periods} periods, {treatment}"
-    return tuple(_response(data, frequency, line, active, used, smooth_lines, words)
-                 for active, line in _excited_sets(data, used))
+    return tuple(
+        _response(data, frequency, line, active, used, smooth_lines, words)
+        for active, line in _excited_sets(data, used)
+    )
 
 
-def chosen_treatment(records: Sequence[RecordSource], used: Channels, keep: slice,
-                     transient: Transient) -> tuple[int, bool]:
+def chosen_treatment(
+    records: Sequence[RecordSource], used: Channels, keep: slice, transient: Transient
+) -> tuple[int, bool]:
     """Number of periods to drop, and whether to remove a transient from the others."""
     if transient not in ("auto", "drop", "remove", "none"):
         raise InputError("expected auto, drop, remove or none", field="transient", value=transient)
@@ -154,8 +172,11 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
     on = (power > SETTINGS.excited_power * power.max(axis=0)) & (power > SETTINGS.excited_over_noise * noise)
     if not np.any(on):
         if np.any(power > 0):
-            raise InputError("expected inputs that repeat in each period; these differ from period to period by as "
-                             "much as their size: check the period", field="period_s")
+            raise InputError(
+                "expected inputs that repeat in each period; these differ from period to period by as "
+                "much as their size: check the period",
+                field="period_s",
+            )
         raise InputError("expected at least one excited line in the band", field="inputs", value=used.inputs)
     sets: dict[tuple[int, ...], list[int]] = {}
     for line in np.flatnonzero(on.any(axis=1)):
@@ -163,8 +184,15 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
     return [(list(active), np.array(where)) for active, where in sets.items()]
 
 
-def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, active: list[int], used: Channels,
-              smooth_lines: int | None, words: str) -> FrequencyResponse:
+def _response(
+    data: _Experiments,
+    frequency_Hz: np.ndarray,
+    line: np.ndarray,
+    active: list[int],
+    used: Channels,
+    smooth_lines: int | None,
+    words: str,
+) -> FrequencyResponse:
     names = tuple(used.inputs[j] for j in active)
     U, Y = np.moveaxis(data.U[:, line][:, :, active], 0, 1), np.moveaxis(data.Y[:, line], 0, 1)
     gram = np.swapaxes(U, 1, 2) @ U.conj()
@@ -177,8 +205,11 @@ def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, ac
         both = np.concatenate([-G, np.broadcast_to(np.eye(n_y), (line.size, n_y, n_y))], axis=2)
         noise = both @ data.covariance[line][:, columns][:, :, columns] @ np.swapaxes(both.conj(), 1, 2)
     if dof == 0 and noise is None:
-        raise InputError(f"expected repeated periods or more than {len(active)} experiments, to estimate the noise",
-                         field="records", value=len(data.U))
+        raise InputError(
+            f"expected repeated periods or more than {len(active)} experiments, to estimate the noise",
+            field="records",
+            value=len(data.U),
+        )
     per_line = dof or data.dof
     half = _smoothing(smooth_lines, per_line, n_y, line.size)
     total = None
@@ -187,12 +218,27 @@ def _response(data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, ac
         total = _running_mean(np.swapaxes(E, 1, 2) @ E.conj() / dof, half)
     noise = None if noise is None else _running_mean(noise, half)
     separated = total is not None and noise is not None
-    said = f"C over {2 * half + 1} lines" + ("" if separated else "; noise only, distortion not separated"
-                                             if total is None else "; noise and distortion together")
+    said = f"C over {2 * half + 1} lines" + (
+        ""
+        if separated
+        else "; noise only, distortion not separated"
+        if total is None
+        else "; noise and distortion together"
+    )
     return FrequencyResponse(
-        frequency_Hz[line], G, total if total is not None else noise, gram, names, used.outputs, used.input_unit,
-        used.output_unit, float(per_line * (2 * half + 1)), noise,
-        total - noise if total is not None and noise is not None else None, method=f"{words}, {said}")
+        frequency_Hz[line],
+        G,
+        total if total is not None else noise,
+        gram,
+        names,
+        used.outputs,
+        used.input_unit,
+        used.output_unit,
+        float(per_line * (2 * half + 1)),
+        noise,
+        total - noise if total is not None and noise is not None else None,
+        method=f"{words}, {said}",
+    )
 
 
 def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, frequency_Hz: np.ndarray) -> None:
@@ -204,10 +250,11 @@ def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, freq
         raise ComputationError(
             f"the responses to {', '.join(which)} cannot be distinguished",
             measured=f"{experiments} different experiments on {bad.size} of {frequency_Hz.size} lines from "
-                     f"{frequency_Hz[bad[0]]:.6g} Hz",
+            f"{frequency_Hz[bad[0]]:.6g} Hz",
             cause=f"{len(names)} inputs need as many experiments with independent phases on each line",
             next_step="measure further realisations, choose fewer inputs, or use local_polynomial, which takes "
-                      "neighbouring lines together")
+            "neighbouring lines together",
+        )
 
 
 def _smoothing(asked: int | None, dof: int, n_y: int, count: int) -> int:

@@ -63,8 +63,9 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
     header = source.header
     field = f"record {header.name}"
     if not header.period_samples or header.periods < 2:
-        raise InputError("expected a periodic record of at least two periods", field=f"{field}: period_s",
-                         value=header.period_s)
+        raise InputError(
+            "expected a periodic record of at least two periods", field=f"{field}: period_s", value=header.period_s
+        )
     n, rate = header.period_samples, header.sample_rate_Hz
     used = channels(campaign, (source,), False)
     keep = lines(n, rate, checked_band(None, rate))
@@ -76,8 +77,11 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
     if not np.any(on):
         raise InputError("expected an excited line in the band", field=field)
     if np.any(harmonic[on] % 2 == 0):
-        raise InputError("expected an odd multisine; it excites even harmonics, the first at "
-                         f"{harmonic[on & (harmonic % 2 == 0)][0] * rate / n:g} Hz", field=field)
+        raise InputError(
+            "expected an odd multisine; it excites even harmonics, the first at "
+            f"{harmonic[on & (harmonic % 2 == 0)][0] * rate / n:g} Hz",
+            field=field,
+        )
     between = (harmonic >= harmonic[on][0]) & (harmonic <= harmonic[on][-1])
     kind = np.where(on, "excited", np.where(harmonic % 2 == 1, "odd", "even"))
     if not np.any(between & (kind == "odd")):

@@ -100,8 +100,11 @@ class LocalFit:
         if order not in range(7):
             raise InputError("expected a whole order from 0 to 6", field="order", value=order)
         if 2 * half_width <= order:
-            raise InputError(f"expected more than {order / 2:g} lines for polynomials of order {order}",
-                             field="half_width", value=half_width)
+            raise InputError(
+                f"expected more than {order / 2:g} lines for polynomials of order {order}",
+                field="half_width",
+                value=half_width,
+            )
         self.frequency_Hz = np.asarray(frequency_Hz, float)
         self.n_u, self.n_y, self.order, self.half_width, self.scale_Hz = n_u, n_y, order, half_width, scale_Hz
         # Columns: [U d^R .. U d], U, Y: the part needed for G(f) is in the lower right corner.
@@ -112,7 +115,7 @@ class LocalFit:
         self.records = 0
         # Orthonormal basis of the complement of the transient's polynomials over a window.
         span = np.vander(np.linspace(-1, 1, 2 * half_width + 1), order + 1)
-        self._free = np.linalg.qr(span, mode="complete")[0][:, order + 1:].T
+        self._free = np.linalg.qr(span, mode="complete")[0][:, order + 1 :].T
 
     @property
     def dof(self) -> int:
@@ -151,7 +154,7 @@ class LocalFit:
             if self.records:
                 rows = np.concatenate([self._factor[keep], rows], axis=1)
             factor = np.asarray(np.linalg.qr(rows, mode="r"))
-            self._factor[keep, :factor.shape[1]] = factor
+            self._factor[keep, : factor.shape[1]] = factor
         self.records += U.shape[0]
 
     def _columns(self, U: np.ndarray, Y: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -161,12 +164,18 @@ class LocalFit:
     def _check(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
         shape = (U.shape[0], line_Hz.size)
         if U.shape != (*shape, self.n_u) or Y.shape != (*shape, self.n_y):
-            raise InputError(f"expected {shape} records and lines with {self.n_u} inputs and {self.n_y} outputs",
-                             field="U, Y", value=(U.shape, Y.shape))
+            raise InputError(
+                f"expected {shape} records and lines with {self.n_u} inputs and {self.n_y} outputs",
+                field="U, Y",
+                value=(U.shape, Y.shape),
+            )
         if line_Hz.size < 2 * self.half_width + 1:
-            raise InputError(f"expected at least {2 * self.half_width + 1} lines, the window of the local model: a "
-                             "longer record, a wider band or fewer inputs", field="lines in the band",
-                             value=line_Hz.size)
+            raise InputError(
+                f"expected at least {2 * self.half_width + 1} lines, the window of the local model: a "
+                "longer record, a wider band or fewer inputs",
+                field="lines in the band",
+                value=line_Hz.size,
+            )
 
     def estimate(self, names: tuple[str, ...] | None = None, partial: bool = False) -> LocalEstimate:
         """G, C and S on all lines.
@@ -180,14 +189,18 @@ class LocalFit:
         ComputationError : inputs that cannot be distinguished, with their names, unless `partial`.
         """
         if self.dof < 1 or self._unit is None:
-            raise InputError(f"expected a wider window or more records: {self.dof} degrees of freedom remain on "
-                             f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
-                             field="half_width", value=self.half_width)
+            raise InputError(
+                f"expected a wider window or more records: {self.dof} degrees of freedom remain on "
+                f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
+                field="half_width",
+                value=self.half_width,
+            )
         lead, first = self._lead, self._lead + self.n_u
         slopes, own, outputs = self._factor[:, :, :lead], self._factor[:, :, lead:first], self._factor[:, :, first:]
         # Size of each input in the window, at least that of a silent input.
-        size = np.maximum(np.linalg.norm(own, axis=1), SETTINGS.silent * np.sqrt(
-            self.records * (2 * self.half_width - self.order)))
+        size = np.maximum(
+            np.linalg.norm(own, axis=1), SETTINGS.silent * np.sqrt(self.records * (2 * self.half_width - self.order))
+        )
         # The rows of the triangular factor below the slopes are the part of the inputs that the slopes do not explain.
         # This is wrong if the slopes are linearly dependent; they are then projected out with an orthonormal basis of
         # their span.
@@ -210,13 +223,18 @@ class LocalFit:
         noise = _covariance(outputs - left @ along) / dof[:, None, None]
         gram = _covariance((s * known)[:, :, None] * right * size[:, None, :])
         unit_u, unit_y = self._unit
-        return LocalEstimate(self.frequency_Hz, np.swapaxes(value, 1, 2) * unit_y[:, None] / unit_u,
-                             noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u, int(dof.min()),
-                             self.half_width)
+        return LocalEstimate(
+            self.frequency_Hz,
+            np.swapaxes(value, 1, 2) * unit_y[:, None] / unit_u,
+            noise * unit_y[:, None] * unit_y,
+            gram * unit_u[:, None] * unit_u,
+            int(dof.min()),
+            self.half_width,
+        )
 
     def _refuse(self, bad: np.ndarray, s: np.ndarray, right: np.ndarray, names: tuple[str, ...] | None) -> None:
-        """Raise the error for indistinguishable inputs; s, right : SVD of the part of each input that is not explained.
-        """
+        """Raise the error for indistinguishable inputs; s, right : SVD of the part of each input that is not
+        explained."""
         names = tuple(f"u{j}" for j in range(self.n_u)) if names is None else names
         null = np.abs(right[np.flatnonzero(bad)[0], -1])
         f = self.frequency_Hz[bad]
@@ -224,11 +242,12 @@ class LocalFit:
             f"the responses to {', '.join(n for n, part in zip(names, null, strict=True) if part > 0.03)} cannot be "
             "distinguished or are not excited",
             measured=f"{f.size} of {self.frequency_Hz.size} lines from {f[0]:.6g} to {f[-1]:.6g} Hz, relative size of "
-                     f"their own part {s[bad, -1].min():.1e}",
+            f"their own part {s[bad, -1].min():.1e}",
             cause="inputs that are silent there, or driven by the same signal, or too few excited lines in a window "
-                  f"of {2 * self.half_width + 1}",
+            f"of {2 * self.half_width + 1}",
             next_step="keep to the excited band, leave out the inputs that no record excites, take in records that "
-                      "drive them differently, or widen the window")
+            "drive them differently, or widen the window",
+        )
 
 
 def _scale(x: np.ndarray) -> np.ndarray:

@@ -40,9 +40,17 @@ class NoiseCovariance:
     dof: np.ndarray
 
 
-def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequency_Hz: np.ndarray | None = None,
-                     order: int = 2, half_width: int | None = None, floor: bool | None = None,
-                     longest_piece: int | None = None, partial: bool = False) -> FrequencyResponse:
+def local_polynomial(
+    campaign: Campaign,
+    *,
+    band_Hz: Band | None = None,
+    frequency_Hz: np.ndarray | None = None,
+    order: int = 2,
+    half_width: int | None = None,
+    floor: bool | None = None,
+    longest_piece: int | None = None,
+    partial: bool = False,
+) -> FrequencyResponse:
     """Local polynomial estimate, all records pooled (Pintelon and Schoukens 2012, section 7.2).
 
     The bias grows with the half width and the curvature of G: (half width / record length)^(order + 1). Nonlinear
@@ -71,18 +79,30 @@ def local_polynomial(campaign: Campaign, *, band_Hz: Band | None = None, frequen
     data = _Data.of(campaign, taking_part(campaign, floor), floor, band_Hz, longest_piece)
     names = data.names
     if not names:
-        raise InputError("expected at least one input that is not zero in the band", field="inputs",
-                         value=data.used.inputs)
+        raise InputError(
+            "expected at least one input that is not zero in the band", field="inputs", value=data.used.inputs
+        )
     width = data.width(order) if half_width is None else half_width
     where = data.grid(frequency_Hz, width)
     fit = data.fit(where, order, width)
     found = fit.estimate(names, partial)
     left_out = [name for name in data.used.inputs if name not in names]
-    method = (f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
-              + (f"; not excited and left out: {', '.join(left_out)}" if left_out else ""))
-    return FrequencyResponse(found.frequency_Hz, found.value, found.noise, found.gram, names, data.used.outputs,
-                             data.used.input_unit, data.used.output_unit, float(found.dof), method=method,
-                             shared=_shared(where, width, order, data.step_Hz))
+    method = f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces" + (
+        f"; not excited and left out: {', '.join(left_out)}" if left_out else ""
+    )
+    return FrequencyResponse(
+        found.frequency_Hz,
+        found.value,
+        found.noise,
+        found.gram,
+        names,
+        data.used.outputs,
+        data.used.input_unit,
+        data.used.output_unit,
+        float(found.dof),
+        method=method,
+        shared=_shared(where, width, order, data.step_Hz),
+    )
 
 
 def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -> float:
@@ -95,12 +115,20 @@ def _shared(where: np.ndarray, half_width: int, order: int, spacing_Hz: float) -
         return 1.0
     offsets = np.arange(-half_width, half_width + 1)
     h = np.linalg.pinv(np.vander(offsets / half_width, order + 1, increasing=True))[0]
-    return max(1.0, float(1 / np.sum(h ** 2) * spacing_Hz / np.median(np.diff(where))))
+    return max(1.0, float(1 / np.sum(h**2) * spacing_Hz / np.median(np.diff(where))))
 
 
-def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz: float | None = None,
-                     band_Hz: Band | None = None, order: int = 2, half_width: int | None = None,
-                     floor: bool | None = None, longest_piece: int | None = None) -> NoiseCovariance:
+def noise_covariance(
+    campaign: Campaign,
+    frequency_Hz: np.ndarray,
+    *,
+    smooth_Hz: float | None = None,
+    band_Hz: Band | None = None,
+    order: int = 2,
+    half_width: int | None = None,
+    floor: bool | None = None,
+    longest_piece: int | None = None,
+) -> NoiseCovariance:
     """Nonparametric noise covariance of the outputs: smoothed residuals of the local polynomial method.
 
     Windows that do not overlap give independent estimates. Those within +-smooth_Hz of a frequency are averaged, and at
@@ -125,28 +153,35 @@ def noise_covariance(campaign: Campaign, frequency_Hz: np.ndarray, *, smooth_Hz:
     if smooth_Hz is not None and not smooth_Hz > 0:
         raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
     asked, every = data.grid(frequency_Hz, width), data.grid(None, width)
-    centres = every[width:every.size - width:2 * width + 1]  # windows without a common line
+    centres = every[width : every.size - width : 2 * width + 1]  # windows without a common line
     # The residual of the outputs is known whether or not the inputs can be separated.
     found = data.fit(centres, order, width).estimate(data.names, partial=True)
     least = min(-(-(len(data.used.outputs) + 2) // found.dof), centres.size)
     return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * data.step_Hz, least)
 
 
-def _smoothed(centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float,
-              least: int) -> NoiseCovariance:
+def _smoothed(
+    centres: np.ndarray, noise: np.ndarray, dof: int, frequency_Hz: np.ndarray, smooth_Hz: float, least: int
+) -> NoiseCovariance:
     """Means over the centres near each frequency, at least `least` of them."""
     low = np.searchsorted(centres, frequency_Hz - smooth_Hz)
     high = np.searchsorted(centres, frequency_Hz + smooth_Hz, side="right")
-    middle = np.clip(np.rint(np.interp(frequency_Hz, centres, np.arange(centres.size))).astype(int) - least // 2, 0,
-                     centres.size - least)
+    middle = np.clip(
+        np.rint(np.interp(frequency_Hz, centres, np.arange(centres.size))).astype(int) - least // 2,
+        0,
+        centres.size - least,
+    )
     few = high - low < least
     low, high = np.where(few, middle, low), np.where(few, middle + least, high)
     count = high - low
     mean = np.stack([noise[a:b].mean(axis=0) for a, b in zip(low, high, strict=True)])
     mean = (mean + np.swapaxes(mean.conj(), 1, 2)) / 2
     if least * dof < noise.shape[1]:
-        raise InputError(f"expected longer records: {least * dof} degrees of freedom are too few for the covariance of "
-                         f"{noise.shape[1]} outputs", field="records")
+        raise InputError(
+            f"expected longer records: {least * dof} degrees of freedom are too few for the covariance of "
+            f"{noise.shape[1]} outputs",
+            field="records",
+        )
     return NoiseCovariance(mean, (count * dof).astype(float))
 
 
@@ -170,8 +205,13 @@ class _Data:
     rank: int
 
     @staticmethod
-    def of(campaign: Campaign, records: Sequence[RecordSource], floor: bool | None, band_Hz: Band | None,
-           longest: int | None) -> _Data:
+    def of(
+        campaign: Campaign,
+        records: Sequence[RecordSource],
+        floor: bool | None,
+        band_Hz: Band | None,
+        longest: int | None,
+    ) -> _Data:
         used, rate = channels(campaign, records, floor), campaign.sample_rate_Hz
         band = checked_band(band_Hz, rate)
         if longest is not None and longest < 16:
@@ -179,8 +219,14 @@ class _Data:
         cuts = [equal_pieces(record, longest) for record in records]
         shortest = min(stop - start for (start, stop), *_ in cuts)
         firsts = (record.load(*some[0]) for record, some in zip(records, cuts, strict=True))
-        return _Data([(record, *one) for record, some in zip(records, cuts, strict=True) for one in some], used, band,
-                     rate, rate / shortest, *_driven(firsts, used, band))
+        return _Data(
+            [(record, *one) for record, some in zip(records, cuts, strict=True) for one in some],
+            used,
+            band,
+            rate,
+            rate / shortest,
+            *_driven(firsts, used, band),
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -196,16 +242,26 @@ class _Data:
         keep = lines(round(self.rate / self.step_Hz), self.rate, self.band)
         every = np.arange(keep.start, keep.stop) * self.step_Hz
         if every.size < 2 * half_width + 1:
-            raise InputError(f"expected at least {2 * half_width + 1} lines for the local models; the band "
-                             f"{self.band[0]:g} to {self.band[1]:g} Hz has {every.size} at {self.step_Hz:g} Hz: longer "
-                             "records, a wider band or fewer inputs", field="band_Hz", value=self.band)
+            raise InputError(
+                f"expected at least {2 * half_width + 1} lines for the local models; the band "
+                f"{self.band[0]:g} to {self.band[1]:g} Hz has {every.size} at {self.step_Hz:g} Hz: longer "
+                "records, a wider band or fewer inputs",
+                field="band_Hz",
+                value=self.band,
+            )
         if frequency_Hz is None:
             return every
         asked = np.asarray(frequency_Hz, float)
-        if asked.ndim != 1 or not np.all(np.diff(asked) > 0) or not (
-                asked.size and every[0] * (1 - 1e-9) <= asked[0] and asked[-1] <= every[-1] * (1 + 1e-9)):
-            raise InputError(f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the "
-                             "band", field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
+        if (
+            asked.ndim != 1
+            or not np.all(np.diff(asked) > 0)
+            or not (asked.size and every[0] * (1 - 1e-9) <= asked[0] and asked[-1] <= every[-1] * (1 + 1e-9))
+        ):
+            raise InputError(
+                f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band",
+                field="frequency_Hz",
+                value=asked if asked.size < 4 else f"{asked.size} values",
+            )
         return asked
 
     def fit(self, where: np.ndarray, order: int, half_width: int) -> LocalFit:
@@ -232,8 +288,8 @@ class _Data:
 
 
 def _driven(records: Iterable[Record], used: Channels, band: Band) -> tuple[list[int], int, int]:
-    """`driven`, `spacing` and `rank` of `_Data`: driven inputs are not silent in the band, relative to their samples.
-    """
+    """`driven`, `spacing` and `rank` of `_Data`: driven inputs are not silent in the band, relative to their
+    samples."""
     moving, spacing = np.zeros(len(used.inputs), bool), 1
     gram = np.zeros((len(used.inputs),) * 2, complex)
     for record in records:
@@ -249,4 +305,4 @@ def _driven(records: Iterable[Record], used: Channels, band: Band) -> tuple[list
     kept = np.flatnonzero(moving)
     size = np.sqrt(np.real(np.diag(gram)))[kept]
     values = np.linalg.eigvalsh(gram[np.ix_(kept, kept)] / np.outer(size, size)) if kept.size else np.zeros(0)
-    return [int(j) for j in kept], spacing, int(np.count_nonzero(values > SETTINGS.span_tolerance ** 2))
+    return [int(j) for j in kept], spacing, int(np.count_nonzero(values > SETTINGS.span_tolerance**2))

@@ -80,8 +80,11 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
     """
     found = [r for r in campaign.records if r.header.excitation == "multisine" and r.header.periods >= 1]
     if not found:
-        raise InputError("expected multisine records of at least one period; use local_polynomial for other records",
-                         field="records", value=[r.header.excitation for r in campaign.records])
+        raise InputError(
+            "expected multisine records of at least one period; use local_polynomial for other records",
+            field="records",
+            value=[r.header.excitation for r in campaign.records],
+        )
     if level_V is not None:
         levels = sorted({r.header.level_V for r in found})
         found = [r for r in found if abs(r.header.level_V - level_V) <= SETTINGS.same_level * abs(level_V)]
@@ -89,12 +92,16 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
             raise InputError(f"expected one of the levels {levels}", field="level_V", value=level_V)
     levels = sorted({r.header.level_V for r in found})
     if levels[-1] - levels[0] > SETTINGS.same_level * levels[-1]:
-        raise InputError("the records have several levels, and the response of a nonlinear rig depends on the level: "
-                         "choose one", field="level_V", value=levels)
+        raise InputError(
+            "the records have several levels, and the response of a nonlinear rig depends on the level: choose one",
+            field="level_V",
+            value=levels,
+        )
     periods = sorted({r.header.period_s for r in found if r.header.period_s is not None})
     if len(periods) > 1:
-        raise InputError("expected records of one period; select them with Campaign.only", field="period_s",
-                         value=periods)
+        raise InputError(
+            "expected records of one period; select them with Campaign.only", field="period_s", value=periods
+        )
     return tuple(found)
 
 
@@ -141,9 +148,12 @@ def average(record: RecordSource, used: Channels, keep: slice, drop: int, remove
     x = periods_of(record, used)[drop:]
     count, n = x.shape[:2]
     if count < 1 or (remove and count < 2):
-        raise InputError(f"expected at least {drop + 1 + remove} periods: {drop} are dropped"
-                         + (" and the removal of a transient needs two" if remove else ""),
-                         field=f"record {record.header.name}: periods", value=record.header.periods)
+        raise InputError(
+            f"expected at least {drop + 1 + remove} periods: {drop} are dropped"
+            + (" and the removal of a transient needs two" if remove else ""),
+            field=f"record {record.header.name}: periods",
+            value=record.header.periods,
+        )
     if remove:
         return _without_transient(x.reshape(count * n, -1), count, keep, len(used.inputs), record.header.name)
     X = fft.rfft(x, axis=1)[:, keep] / np.sqrt(n)
@@ -163,8 +173,11 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
         side += 1
     harmonic = np.arange(keep.start, keep.stop)
     if 2 * side > last:
-        raise InputError(f"expected at least {2 * side} harmonics of the period below half the sample rate",
-                         field=f"record {name}: period_s", value=last)
+        raise InputError(
+            f"expected at least {2 * side} harmonics of the period below half the sample rate",
+            field=f"record {name}: period_s",
+            value=last,
+        )
     base = np.clip(harmonic, side, last - side)
     offset = np.array([j for j in range(-side * count + 1, side * count) if j % count])
     span = offset / (side * count)
@@ -181,13 +194,14 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
     rows = dof * (n_z - n_u)
     shrink = np.mean(np.abs(a) ** 2, axis=1) * np.where(np.all(a == 1, axis=1), 1.0, (rows - 2) / rows)
     E[:, :, n_u:] /= np.sqrt(shrink)[:, None, None]
-    leverage = 1 + np.sum(weight ** 2, axis=1)
+    leverage = 1 + np.sum(weight**2, axis=1)
     covariance = np.swapaxes(E, 1, 2) @ E.conj() * (leverage / (dof * count))[:, None, None]
     return PeriodMean((X[count * harmonic] - transient) / np.sqrt(count), covariance, dof, count)
 
 
-def _times_denominator(around: np.ndarray, span: np.ndarray, free: np.ndarray, n_u: int,
-                       centred: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _times_denominator(
+    around: np.ndarray, span: np.ndarray, free: np.ndarray, n_u: int, centred: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Outputs around each harmonic, multiplied by a(d) = 1 + a1 d + a2 d^2 where this makes the transient a polynomial.
 
     Near a sharp mode the transient is a rational function; all outputs have the same pole. The denominator is found by
@@ -200,7 +214,7 @@ def _times_denominator(around: np.ndarray, span: np.ndarray, free: np.ndarray, n
     plain = free @ Y
     size = np.sqrt(np.mean(np.abs(plain) ** 2, axis=1))
     size = np.where(size > 0, size, 1.0)[:, None, :]
-    first, second = (free @ (Y * (span ** s)[:, None]) / size for s in (1, 2))
+    first, second = (free @ (Y * (span**s)[:, None]) / size for s in (1, 2))
     n = len(Y)
     K = np.stack([first.reshape(n, -1), second.reshape(n, -1)], axis=2)
     right = (plain / size).reshape(n, -1, 1)
@@ -215,5 +229,5 @@ def _times_denominator(around: np.ndarray, span: np.ndarray, free: np.ndarray, n
         return around, np.ones((n, span.size), complex)
     limit = 4 / 9 / stats.f(2 * spare, 2 * spare).isf(0.01)
     use = centred & solvable & (left < limit * np.sum(np.abs(right) ** 2, axis=(1, 2)))
-    a = np.where(use[:, None], 1 + unknown[:, :1] * span + unknown[:, 1:] * span ** 2, 1.0 + 0j)
+    a = np.where(use[:, None], 1 + unknown[:, :1] * span + unknown[:, 1:] * span**2, 1.0 + 0j)
     return np.concatenate([around[:, :, :n_u], Y * a[:, :, None]], axis=2), a

@@ -77,9 +77,14 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
     reach = SETTINGS.search * near_Hz if width_Hz is None else width_Hz / 2
     inside = np.flatnonzero(np.abs(f - near_Hz) <= reach)
     if not (np.isfinite(near_Hz) and near_Hz > 0) or inside.size < 3 or f.size < SETTINGS.fewest_lines:
-        raise InputError(f"expected at least three lines within {reach:g} Hz and {SETTINGS.fewest_lines} in all; there "
-                         f"are lines from {f[0]:g} to {f[-1]:g} Hz" if f.size else "expected lines", field="near_Hz",
-                         value=near_Hz)
+        raise InputError(
+            f"expected at least three lines within {reach:g} Hz and {SETTINGS.fewest_lines} in all; there "
+            f"are lines from {f[0]:g} to {f[-1]:g} Hz"
+            if f.size
+            else "expected lines",
+            field="near_Hz",
+            value=near_Hz,
+        )
     size = np.sum(np.abs(response.value) ** 2 / np.mean(np.abs(response.value[inside]) ** 2, axis=0), axis=(1, 2))
     peak = f[inside[np.argmax(size[inside])]]
     half = reach if width_Hz is not None else max(reach / 2, SETTINGS.fewest_lines / 2 * float(np.median(np.diff(f))))
@@ -87,8 +92,9 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
     for width in SETTINGS.reach if width_Hz is None else ():
         wider = found
         for _ in range(4):
-            again = _fit(response, wider.frequency_Hz, width * 2 * wider.damping * wider.frequency_Hz, near_Hz, reach,
-                         wider)
+            again = _fit(
+                response, wider.frequency_Hz, width * 2 * wider.damping * wider.frequency_Hz, near_Hz, reach, wider
+            )
             settled, wider = again.band_Hz == wider.band_Hz, again
             if settled:
                 break
@@ -98,12 +104,18 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
     return found
 
 
-def _fit(response: FrequencyResponse, centre: float, half: float, near_Hz: float, reach: float,
-         start: Resonance | None = None) -> Resonance:
+def _fit(
+    response: FrequencyResponse,
+    centre: float,
+    half: float,
+    near_Hz: float,
+    reach: float,
+    start: Resonance | None = None,
+) -> Resonance:
     f = response.frequency_Hz
     use = np.flatnonzero(np.abs(f - centre) <= half)
     if use.size < SETTINGS.fewest_lines:
-        use = np.sort(np.argsort(np.abs(f - centre), kind="stable")[:SETTINGS.fewest_lines])
+        use = np.sort(np.argsort(np.abs(f - centre), kind="stable")[: SETTINGS.fewest_lines])
     w, w0 = 2 * np.pi * f[use], 2 * np.pi * centre
     scale = (w[-1] - w[0]) / 2
     G = response.value[use].reshape(use.size, -1)
@@ -125,8 +137,10 @@ def _fit(response: FrequencyResponse, centre: float, half: float, near_Hz: float
         return np.concatenate([left.real, left.imag])
 
     decays = (0.03, 0.3) if start is None else (2 * np.pi * start.damping * start.frequency_Hz / scale,)
-    fits = [least_squares(stacked, [0.0, np.clip(np.log(decay), -13.9, 2.9)], bounds=([-1.5, -14.0], [1.5, 3.0]))
-            for decay in decays]
+    fits = [
+        least_squares(stacked, [0.0, np.clip(np.log(decay), -13.9, 2.9)], bounds=([-1.5, -14.0], [1.5, 3.0]))
+        for decay in decays
+    ]
     best = min(fits, key=lambda s: s.cost)
     free = 2 * (use.size - 3) * G.shape[1] - 2
     _check_significant(best.cost, _without_pole(weight, G, w - w0), G.shape[1], free, near_Hz, f[use])
@@ -142,36 +156,62 @@ def _without_pole(weight: np.ndarray, G: np.ndarray, d: np.ndarray) -> float:
     return float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
 
 
-def _check_significant(with_pole: float, without: float, entries: int, free: int, near_Hz: float,
-                       f: np.ndarray) -> None:
+def _check_significant(
+    with_pole: float, without: float, entries: int, free: int, near_Hz: float, f: np.ndarray
+) -> None:
     """F test of the pole against the background alone."""
     added = 2 * entries + 2
     ratio = (without - with_pole) / added / max(with_pole / free, np.finfo(float).tiny)
     limit = float(stats.f(added, free).isf(SETTINGS.false_alarm))
     if ratio < limit:
-        raise ComputationError(f"no mode found near {near_Hz:g} Hz",
-                               measured=f"a pole explains {ratio:.3g} times as much as of pure noise, from {f[0]:.6g} "
-                                        f"to {f[-1]:.6g} Hz; {limit:.3g} is needed",
-                               cause="no resonance there, or one hidden by noise",
-                               next_step="look at the response, and give near_Hz and width_Hz around a peak")
+        raise ComputationError(
+            f"no mode found near {near_Hz:g} Hz",
+            measured=f"a pole explains {ratio:.3g} times as much as of pure noise, from {f[0]:.6g} "
+            f"to {f[-1]:.6g} Hz; {limit:.3g} is needed",
+            cause="no resonance there, or one hidden by noise",
+            next_step="look at the response, and give near_Hz and width_Hz around a peak",
+        )
 
 
-def _result(best: object, coefficients: np.ndarray, misfit: float, scale: float, w0: float, f: np.ndarray,
-            shape: tuple[int, ...], near_Hz: float, reach: float) -> Resonance:
+def _result(
+    best: object,
+    coefficients: np.ndarray,
+    misfit: float,
+    scale: float,
+    w0: float,
+    f: np.ndarray,
+    shape: tuple[int, ...],
+    near_Hz: float,
+    reach: float,
+) -> Resonance:
     x, J = np.asarray(best.x), np.asarray(best.jac)  # type: ignore[attr-defined]
     decay, turn = scale * np.exp(x[1]), w0 + scale * x[0]
     natural = np.hypot(decay, turn)
     if abs(natural / (2 * np.pi) - near_Hz) > 2 * reach or abs(x[0]) >= 1.5 or x[1] >= 3.0 or x[1] <= -14.0:
-        raise ComputationError(f"no mode found near {near_Hz:g} Hz",
-                               measured=f"the fit ended at {natural / (2 * np.pi):.6g} Hz with damping "
-                                        f"{decay / natural:.3g} over {f[0]:.6g} to {f[-1]:.6g} Hz",
-                               cause="no resonance there, or one too broad or too close to another for a local fit",
-                               next_step="look at the response, and give near_Hz and width_Hz around a single peak")
+        raise ComputationError(
+            f"no mode found near {near_Hz:g} Hz",
+            measured=f"the fit ended at {natural / (2 * np.pi):.6g} Hz with damping "
+            f"{decay / natural:.3g} over {f[0]:.6g} to {f[-1]:.6g} Hz",
+            cause="no resonance there, or one too broad or too close to another for a local fit",
+            next_step="look at the response, and give near_Hz and width_Hz around a single peak",
+        )
     # The rows of J are scaled to variance 1/2.
     covariance = np.linalg.inv(2 * J.T @ J) * max(misfit, 1.0)
     # Derivatives of natural and damping with respect to x: natural^2 = decay^2 + turn^2, damping = decay / natural.
-    by_x = np.array([[turn / natural * scale, decay / natural * decay],
-                     [-decay * turn / natural ** 3 * scale, decay / natural - decay ** 3 / natural ** 3]])
+    by_x = np.array(
+        [
+            [turn / natural * scale, decay / natural * decay],
+            [-decay * turn / natural**3 * scale, decay / natural - decay**3 / natural**3],
+        ]
+    )
     spread = np.sqrt(np.diag(by_x @ covariance @ by_x.T))
-    return Resonance(natural / (2 * np.pi), decay / natural, spread[0] / (2 * np.pi), spread[1],
-                     scale * coefficients[:, 0].reshape(shape), float(misfit), (float(f[0]), float(f[-1])), f.size)
+    return Resonance(
+        natural / (2 * np.pi),
+        decay / natural,
+        spread[0] / (2 * np.pi),
+        spread[1],
+        scale * coefficients[:, 0].reshape(shape),
+        float(misfit),
+        (float(f[0]), float(f[-1])),
+        f.size,
+    )

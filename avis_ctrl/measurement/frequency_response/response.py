@@ -57,8 +57,14 @@ class FrequencyResponse:
 
     def __post_init__(self) -> None:
         n, n_y, n_u = len(self.frequency_Hz), len(self.outputs), len(self.inputs)
-        shapes = {"value": (n, n_y, n_u), "noise": (n, n_y, n_y), "gram": (n, n_u, n_u),
-                  "measurement_noise": (n, n_y, n_y), "distortion": (n, n_y, n_y), "entry_variance": (n, n_y, n_u)}
+        shapes = {
+            "value": (n, n_y, n_u),
+            "noise": (n, n_y, n_y),
+            "gram": (n, n_u, n_u),
+            "measurement_noise": (n, n_y, n_y),
+            "distortion": (n, n_y, n_y),
+            "entry_variance": (n, n_y, n_u),
+        }
         for field, shape in shapes.items():
             array = getattr(self, field)
             if array is None:
@@ -68,8 +74,10 @@ class FrequencyResponse:
                 raise InputError(f"expected finite numbers of shape {shape}", field=field, value=array.shape)
             object.__setattr__(self, field, array)
         if (self.noise is None or self.gram is None) == (self.entry_variance is None):
-            raise InputError("expected the noise covariance with the inputs' Gram matrix, or variances of the entries",
-                             field="noise, gram, entry_variance")
+            raise InputError(
+                "expected the noise covariance with the inputs' Gram matrix, or variances of the entries",
+                field="noise, gram, entry_variance",
+            )
         frequency = np.asarray(self.frequency_Hz, float)
         if not np.all(np.diff(frequency) > 0):
             raise InputError("expected increasing frequencies", field="frequency_Hz")
@@ -104,8 +112,10 @@ class FrequencyResponse:
         known = values > GRAM_TOLERANCE * values[:, -1:]
         inverse = np.where(known, 1 / np.where(known, values, 1.0), 0.0)
         adjoint = np.swapaxes(vectors.conj(), 1, 2)
-        return ((vectors * inverse[:, None, :]) @ adjoint / (size[:, :, None] * size[:, None, :]),
-                (vectors * known[:, None, :]) @ adjoint)
+        return (
+            (vectors * inverse[:, None, :]) @ adjoint / (size[:, :, None] * size[:, None, :]),
+            (vectors * known[:, None, :]) @ adjoint,
+        )
 
     def spanned(self, V: np.ndarray) -> np.ndarray:
         """(n, k) bool: whether the response to inputs played in the proportions of V (n_u, k) is known on each line."""
@@ -128,16 +138,20 @@ class FrequencyResponse:
             raise InputError(f"expected records exciting {', '.join(names)}", field="inputs", value=list(self.inputs))
         one = self.at(keep)
         if one.entry_variance is not None:
-            return replace(one, value=one.value @ V, entry_variance=one.entry_variance @ np.abs(V) ** 2, inputs=names,
-                           input_unit=unit)
+            return replace(
+                one,
+                value=one.value @ V,
+                entry_variance=one.entry_variance @ np.abs(V) ** 2,
+                inputs=names,
+                input_unit=unit,
+            )
         inverse = V.T @ one.inverse_gram()[0] @ V
         size = np.sqrt(np.real(np.einsum("nii->ni", inverse)))
         scale = size[:, :, None] * size[:, None, :]
         try:
             gram = np.linalg.inv(inverse / scale) / scale
         except np.linalg.LinAlgError:
-            raise InputError("expected linearly independent columns", field="inputs",
-                             value=list(names)) from None
+            raise InputError("expected linearly independent columns", field="inputs", value=list(names)) from None
         return replace(one, value=one.value @ V, gram=gram, inputs=names, input_unit=unit)
 
     @property
@@ -151,6 +165,9 @@ class FrequencyResponse:
 
     def at(self, keep: np.ndarray) -> FrequencyResponse:
         """Selected lines, by mask or index."""
-        by_line = {field.name: array[keep] for field in fields(self)
-                   if isinstance(array := getattr(self, field.name), np.ndarray)}
+        by_line = {
+            field.name: array[keep]
+            for field in fields(self)
+            if isinstance(array := getattr(self, field.name), np.ndarray)
+        }
         return replace(self, **by_line)

@@ -107,12 +107,15 @@ class ModelComparison:
 
     def p_value(self, gain: float, agreement: float, alternatives: int) -> float:
         """Upper bound on the probability that one of this many alternatives reaches this gain and agreement."""
-        unrelated = max(1 - agreement ** 2, 0.0) ** max(self.N - 1, 1)
+        unrelated = max(1 - agreement**2, 0.0) ** max(self.N - 1, 1)
         return min(1.0, alternatives * max(float(np.exp(-gain)), unrelated))
 
 
-def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray], np.ndarray] | None = None,
-            settings: MapSettings = SETTINGS) -> ModelComparison | None:
+def compare(
+    pairs: list[tuple[Spectra, Spectra]],
+    response: Callable[[np.ndarray], np.ndarray] | None = None,
+    settings: MapSettings = SETTINGS,
+) -> ModelComparison | None:
     """Compare measured and expected spectra of records with the most common segment length; None if they are too few.
 
     response : (n,) Hz -> (n, n_y, n_u) of the model. It is used (without leakage) if the voltages do not span all
@@ -142,8 +145,9 @@ def compare(pairs: list[tuple[Spectra, Spectra]], response: Callable[[np.ndarray
     return ModelComparison(C, B, P, rows_M, delay_s, delays, N, measured, settings)
 
 
-def _delays(f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
-            ) -> tuple[np.ndarray, np.ndarray]:
+def _delays(
+    f: np.ndarray, w: np.ndarray, M: np.ndarray, E: np.ndarray, settings: MapSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """(n_y, n_y) s, best-fitting delay of measured row i behind expected row k for any signs of the columns, and
     w e^(j omega delay) (n, n_y, n_y).
     """
@@ -211,8 +215,9 @@ def explain(comparison: ModelComparison) -> Faults:
     return _judged(comparison, order["row"], order["column"], r, c, alternatives * comparison.delays)
 
 
-def _judged(comparison: ModelComparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray,
-            alternatives: int) -> Faults:
+def _judged(
+    comparison: ModelComparison, p: np.ndarray, q: np.ndarray, r: np.ndarray, c: np.ndarray, alternatives: int
+) -> Faults:
     """The faults, if the evidence for all of them is strong; otherwise no fault, and the doubtful channels."""
     n_y, n_u = len(p), len(q)
     rows, straight, ones = np.arange(n_y), np.arange(n_u), np.ones(n_y)
@@ -260,12 +265,18 @@ def _steps(n_y: int, n_u: int) -> list[tuple[str, int, int, tuple[float, float]]
     """All elementary faults (row or column, i, k, signs); flips have i = k."""
     signs = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
     steps = [(what, i, i, (-1.0, 1.0)) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)]
-    return steps + [(what, i, k, flips) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)
-                    for k in range(i) for flips in signs]
+    return steps + [
+        (what, i, k, flips)
+        for what, n in (("row", n_y), ("column", n_u))
+        for i in range(n)
+        for k in range(i)
+        for flips in signs
+    ]
 
 
-def _after(order: dict[str, np.ndarray], sign: dict[str, np.ndarray], what: str, i: int, k: int,
-           flips: tuple[float, float]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _after(
+    order: dict[str, np.ndarray], sign: dict[str, np.ndarray], what: str, i: int, k: int, flips: tuple[float, float]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Order and signs after a step."""
     p, s = order[what].copy(), sign[what].copy()
     p[[i, k]] = p[[k, i]]

@@ -11,16 +11,7 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_faults import Faults, ModelComparison, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Response,
-    Series,
-    Severity,
-    quoted,
-)
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, Severity, quoted
 from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
 
 ORDER, POLARITY = "channel order", "polarity"  # gate names of the findings
@@ -89,21 +80,34 @@ class ChannelMap(Gate):
         copied, comparison = list(_copied(kept, campaign)), compare(_pairs(kept), response)
         if comparison is None:
             known = expectation.response is not None
-            return _not_compared(kept, copied, campaign, "too few driven samples" if known else "no model was given",
-                                 "note" if known else "ok")
+            return _not_compared(
+                kept,
+                copied,
+                campaign,
+                "too few driven samples" if known else "no model was given",
+                "note" if known else "ok",
+            )
         faults = explain(comparison)
         exchanged = list(_exchanged(faults, campaign, comparison))
         order = copied + exchanged or [_right(faults, campaign, comparison)]
         return order + (list(_flipped(faults, campaign, comparison)) or [_signs_agree(faults, campaign, comparison)])
 
 
-def _not_compared(kept: list[_Kept], copied: list[Finding], campaign: Campaign, why: str,
-                  severity: Severity) -> list[Finding]:
+def _not_compared(
+    kept: list[_Kept], copied: list[Finding], campaign: Campaign, why: str, severity: Severity
+) -> list[Finding]:
     x = np.arange(len(campaign.y_names))
-    picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]",
-                      (Series("not known", x, 0.0 * x, "points"),))
-    order = copied or [Finding(ORDER, severity, "No channel is a copy of another; their order was not compared with a "
-                               f"model ({why}).", picture=_copy_picture(kept))]
+    picture = Picture(
+        "Polarity of each sensor", "sensor number", "correlation [-]", (Series("not known", x, 0.0 * x, "points"),)
+    )
+    order = copied or [
+        Finding(
+            ORDER,
+            severity,
+            f"No channel is a copy of another; their order was not compared with a model ({why}).",
+            picture=_copy_picture(kept),
+        )
+    ]
     return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).", picture=picture)]
 
 
@@ -115,13 +119,23 @@ def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
         if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
             continue
         alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike for of in kept)
-        cause = ("the model expects that of these records, so they do not show whether one signal was recorded twice. "
-                 "Excite other axes, too." if alike else
-                 "one signal was recorded twice. Check the wiring and the channel list; leave one of them out.")
-        yield Finding(ORDER, "note" if alike else "stop",
-                      f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. "
-                      f"in every record: {cause}", (names[i], names[k]), tuple(h[0] for h in hits), float(rest),
-                      COPIES.different, _copy_picture(kept))
+        cause = (
+            "the model expects that of these records, so they do not show whether one signal was recorded twice. "
+            "Excite other axes, too."
+            if alike
+            else "one signal was recorded twice. Check the wiring and the channel list; leave one of them out."
+        )
+        yield Finding(
+            ORDER,
+            "note" if alike else "stop",
+            f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. "
+            f"in every record: {cause}",
+            (names[i], names[k]),
+            tuple(h[0] for h in hits),
+            float(rest),
+            COPIES.different,
+            _copy_picture(kept),
+        )
 
 
 def _exchanged(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
@@ -133,20 +147,28 @@ def _exchanged(faults: Faults, campaign: Campaign, comparison: ModelComparison) 
                 continue
             if kind == "row":
                 gain = min(faults.other[j] - faults.own[j] for j in cycle)
-                listed = "; ".join(f"the correlation of {names[j]!r} with the model's {names[int(p[j])]!r} is "
-                                   f"{faults.other[j]:.2f}, with its own {faults.own[j]:.2f}" for j in cycle)
+                listed = "; ".join(
+                    f"the correlation of {names[j]!r} with the model's {names[int(p[j])]!r} is "
+                    f"{faults.other[j]:.2f}, with its own {faults.own[j]:.2f}"
+                    for j in cycle
+                )
             else:
                 of, before, after = faults.columns[i]
                 gain = after - before
                 listed = f"exchanging them raises the correlation of {sensors[of]!r} from {before:.2f} to {after:.2f}"
             pair = tuple(names[j] for j in cycle)
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
-            yield Finding(ORDER, "stop",
-                          f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
-                          f"fitted; p-value at most "
-                          f"{max(faults.p_value[kind, j] for j in cycle):.1g}). Exchange their names or their cables.",
-                          pair, value=float(gain), limit=comparison.settings.least_agreement,
-                          picture=_order_picture(faults, campaign, comparison))
+            yield Finding(
+                ORDER,
+                "stop",
+                f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
+                f"fitted; p-value at most "
+                f"{max(faults.p_value[kind, j] for j in cycle):.1g}). Exchange their names or their cables.",
+                pair,
+                value=float(gain),
+                limit=comparison.settings.least_agreement,
+                picture=_order_picture(faults, campaign, comparison),
+            )
 
 
 def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Finding:
@@ -158,19 +180,30 @@ def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> F
     if faults.doubtful:
         names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
         severity = "note"
-        sentence = (f"The agreement of model and records is too poor to check the order of the channels ({least}; "
-                    f"another order or sign of {quoted(names)} would agree better, but an inaccurate model can cause "
-                    "that, too). Check the channel list by hand.")
+        sentence = (
+            f"The agreement of model and records is too poor to check the order of the channels ({least}; "
+            f"another order or sign of {quoted(names)} would agree better, but an inaccurate model can cause "
+            "that, too). Check the channel list by hand."
+        )
     elif alone and 2 * len(alone) < len(faults.other):
         severity, channels = "warning", alone
         low, high = comparison.settings.delay_s
-        sentence = (f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as "
-                    f"{faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late "
-                    f"or {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there.")
+        sentence = (
+            f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as "
+            f"{faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late "
+            f"or {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there."
+        )
     else:
         sentence = f"No other order of the channels agrees better with the model ({least})."
-    return Finding(ORDER, severity, sentence, channels, value=float(faults.other[worst]), limit=enough,
-                   picture=_order_picture(faults, campaign, comparison))
+    return Finding(
+        ORDER,
+        severity,
+        sentence,
+        channels,
+        value=float(faults.other[worst]),
+        limit=enough,
+        picture=_order_picture(faults, campaign, comparison),
+    )
 
 
 def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Picture:
@@ -178,42 +211,81 @@ def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparis
     x = np.arange(len(a))
     others = np.max(np.where(np.eye(len(a), dtype=bool), -np.inf, a), axis=1) if len(a) > 1 else np.zeros(1)
     return Picture(
-        "Sensors against the model", "sensor", "correlation [-]",
+        "Sensors against the model",
+        "sensor",
+        "correlation [-]",
         (Series("own expected response", x, np.diag(a), "points"), Series("best other", x, others, "points")),
-        (Limit("least that counts as evidence", comparison.settings.least_agreement),), x_names=campaign.y_names)
+        (Limit("least that counts as evidence", comparison.settings.least_agreement),),
+        x_names=campaign.y_names,
+    )
 
 
 def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
     rows, columns = ([int(k) for k in np.flatnonzero(signs < 0)] for signs in (faults.r, faults.c))
-    doubt = (" It is equally possible that all other channels are reversed."
-             if 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving) else "")
-    said = [("Sensor", campaign.y_names[k], -float(faults.other[k]),
-             f"correlation {-faults.other[k]:.2f} where +1 is expected", faults.p_value["row", k]) for k in rows]
+    doubt = (
+        " It is equally possible that all other channels are reversed."
+        if 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving)
+        else ""
+    )
+    said = [
+        (
+            "Sensor",
+            campaign.y_names[k],
+            -float(faults.other[k]),
+            f"correlation {-faults.other[k]:.2f} where +1 is expected",
+            faults.p_value["row", k],
+        )
+        for k in rows
+    ]
     for k in columns:
         of, before, after = faults.columns[k]
-        said.append(("Drive", campaign.u_names[k], before - after, "reversing it raises the correlation of sensor "
-                     f"{campaign.y_names[of]!r} from {before:.2f} to {after:.2f}", faults.p_value["column", k]))
+        said.append(
+            (
+                "Drive",
+                campaign.u_names[k],
+                before - after,
+                "reversing it raises the correlation of sensor "
+                f"{campaign.y_names[of]!r} from {before:.2f} to {after:.2f}",
+                faults.p_value["column", k],
+            )
+        )
     for what, name, value, how, p_value in said:
-        yield Finding(POLARITY, "stop",
-                      f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {p_value:.1g}). Its "
-                      "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
-                      f"reverse the sign of the channel.{doubt}", (name,), value=value,
-                      limit=-comparison.settings.least_agreement, picture=_sign_picture(faults, campaign, comparison))
+        yield Finding(
+            POLARITY,
+            "stop",
+            f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {p_value:.1g}). Its "
+            "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
+            f"reverse the sign of the channel.{doubt}",
+            (name,),
+            value=value,
+            limit=-comparison.settings.least_agreement,
+            picture=_sign_picture(faults, campaign, comparison),
+        )
 
 
 def _signs_agree(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Finding:
     lowest = float(faults.other.min())
-    return Finding(POLARITY, "note" if faults.doubtful else "ok",
-                   "The signs could not be checked: the agreement of model and records is too poor."
-                   if faults.doubtful else
-                   f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f}).", value=lowest,
-                   limit=comparison.settings.least_agreement, picture=_sign_picture(faults, campaign, comparison))
+    return Finding(
+        POLARITY,
+        "note" if faults.doubtful else "ok",
+        "The signs could not be checked: the agreement of model and records is too poor."
+        if faults.doubtful
+        else f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f}).",
+        value=lowest,
+        limit=comparison.settings.least_agreement,
+        picture=_sign_picture(faults, campaign, comparison),
+    )
 
 
 def _sign_picture(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Picture:
-    return Picture("Signed correlation with the model", "sensor", "correlation [-]",
-                   (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
-                   (Limit("opposite sign", -comparison.settings.least_agreement),), x_names=campaign.y_names)
+    return Picture(
+        "Signed correlation with the model",
+        "sensor",
+        "correlation [-]",
+        (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
+        (Limit("opposite sign", -comparison.settings.least_agreement),),
+        x_names=campaign.y_names,
+    )
 
 
 def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str, ...], wrap: bool) -> np.ndarray:
@@ -263,8 +335,11 @@ def _copies(seen: Excerpt) -> list[tuple[int, int, float, float]]:
     if len(y) < FEWEST_ALIKE:
         return []
     power = np.sum(y**2, axis=0)
-    return [(i, k, float(y[:, i] @ y[:, k] / power[i]), rest) for i, k in combinations(range(y.shape[1]), 2)
-            if (rest := _difference(y[:, i], y[:, k])) < COPIES.different]
+    return [
+        (i, k, float(y[:, i] @ y[:, k] / power[i]), rest)
+        for i, k in combinations(range(y.shape[1]), 2)
+        if (rest := _difference(y[:, i], y[:, k])) < COPIES.different
+    ]
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:
@@ -275,5 +350,9 @@ def _difference(a: np.ndarray, b: np.ndarray) -> float:
 
 def _copy_picture(kept: list[_Kept]) -> Picture:
     count = np.array([len(k.copies) for k in kept])
-    return Picture("Pairs of channels that are copies", "record number", "pairs [-]",
-                   (Series("pairs", np.arange(len(count)), count, "points"),))
+    return Picture(
+        "Pairs of channels that are copies",
+        "record number",
+        "pairs [-]",
+        (Series("pairs", np.arange(len(count)), count, "points"),),
+    )

@@ -95,53 +95,100 @@ class Clipping(Gate):
         names = tuple(dict.fromkeys(row.channel for row in wrong))
         found = [self._unit(wrong, names, expectation, campaign)] if wrong else []
         bad = [row for row in rows if row.count and row.p < level and row.channel not in names]
-        found += [self._finding([row for row in bad if row.channel == channel])
-                  for channel in dict.fromkeys(row.channel for row in bad)]
+        found += [
+            self._finding([row for row in bad if row.channel == channel])
+            for channel in dict.fromkeys(row.channel for row in bad)
+        ]
         peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
         top = max(peaks, key=lambda n: peaks[n])
         limits = () if expectation.y_range_V is None else (Limit("converter", expectation.y_range_V[1]),)
-        picture = Picture("Largest absolute value of each channel", "channel", f"largest value [{campaign.y_unit}]",
-                          (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),), limits,
-                          x_names=tuple(peaks))
+        picture = Picture(
+            "Largest absolute value of each channel",
+            "channel",
+            f"largest value [{campaign.y_unit}]",
+            (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),),
+            limits,
+            x_names=tuple(peaks),
+        )
         return found or [
-            Finding(self.name, "ok", f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
-                    value=peaks[top], limit=None if not limits else limits[0].value, picture=picture)]
+            Finding(
+                self.name,
+                "ok",
+                f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
+                value=peaks[top],
+                limit=None if not limits else limits[0].value,
+                picture=picture,
+            )
+        ]
 
     def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
         """Finding for records with most samples at or beyond the range."""
         row = max(rows, key=lambda r: r.count)
         assert row.t is not None and row.x is not None and expectation.y_range_V is not None
         return Finding(
-            self.name, "stop",
+            self.name,
+            "stop",
             f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record} "
             f"are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit}; "
             f"the largest is {row.peak:.6g}. Channels concerned: {quoted(names)}. The unit or scale is probably wrong "
             f"(mV given as {campaign.y_unit}?), or the range in the rig file. Correct it first; only then can clipping "
-            "be checked.", names, tuple(dict.fromkeys(r.record for r in rows)), row.count / row.samples,
+            "be checked.",
+            names,
+            tuple(dict.fromkeys(r.record for r in rows)),
+            row.count / row.samples,
             SETTINGS.wrong_unit,
-            Picture(f"Record {row.record}, {row.channel}", "time [s]", f"{row.channel} [{campaign.y_unit}]",
-                    (Series(row.channel, row.t, row.x),), (Limit("converter", expectation.y_range_V[1]),)))
+            Picture(
+                f"Record {row.record}, {row.channel}",
+                "time [s]",
+                f"{row.channel} [{campaign.y_unit}]",
+                (Series(row.channel, row.t, row.x),),
+                (Limit("converter", expectation.y_range_V[1]),),
+            ),
+        )
 
     def _finding(self, of: list[_Ends]) -> Finding:
         """Finding for the records in which one channel is clipped."""
         row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
         assert row.t is not None and row.x is not None
-        picture = Picture(f"Record {row.record}, {row.channel}", "time [s]", row.channel,
-                          (Series(row.channel, row.t, row.x),), (Limit("clipped at", row.value),))
+        picture = Picture(
+            f"Record {row.record}, {row.channel}",
+            "time [s]",
+            row.channel,
+            (Series(row.channel, row.t, row.x),),
+            (Limit("clipped at", row.value),),
+        )
         bursts = f" in {row.bursts} bursts" if row.bursts > 1 else ""
         others = [f"{r.record} ({r.count} samples at {r.value:.4g})" for r in of if r is not row]
         also = f" Also in record {', '.join(others)}." if others else ""
-        sentence = (f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} "
-                    f"%){bursts} at {row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the "
-                    "record; until then leave the record out.")
+        sentence = (
+            f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} "
+            f"%){bursts} at {row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the "
+            "record; until then leave the record out."
+        )
         records = tuple(r.record for r in of)
-        return Finding(self.name, "stop" if part > 1e-3 else "warning", sentence, (row.channel,), records,
-                       float(row.count), 0.0, picture)
+        return Finding(
+            self.name,
+            "stop" if part > 1e-3 else "warning",
+            sentence,
+            (row.channel,),
+            records,
+            float(row.count),
+            0.0,
+            picture,
+        )
 
 
-def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple[float, float] | None,
-          lsb: float | None, free: bool, periods: int = 1) -> _Ends:
+def _ends(
+    record: str,
+    channel: str,
+    t: np.ndarray,
+    x: np.ndarray,
+    bounds: tuple[float, float] | None,
+    lsb: float | None,
+    free: bool,
+    periods: int = 1,
+) -> _Ends:
     """Check one channel; `free` also searches for repeated extremes, over-range levels and a wrong unit."""
     peak = float(np.max(np.abs(x)))
     best = _Ends(record, channel, len(x), peak)
@@ -170,9 +217,13 @@ def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple
         if mask.any():
             near = np.convolve(mask, np.ones(3), "same") > 0  # a sample may fall within a jump
             inside = sign * np.max(sign * x[~near]) if not near.all() else float("nan")
-            return made(mask, float(np.median(x[mask])),
-                        "a constant level outside the range of the signal, with jumps to and from it, as an instrument "
-                        f"outputs when it is out of range (the rest of the record reaches {inside:.6g})", 0.0)
+            return made(
+                mask,
+                float(np.median(x[mask])),
+                "a constant level outside the range of the signal, with jumps to and from it, as an instrument "
+                f"outputs when it is out of range (the rest of the record reaches {inside:.6g})",
+                0.0,
+            )
         top, p, width = repeated_extreme(sign * x, periods)
         if p < best.p:
             flat = sign * x >= top - width
@@ -181,10 +232,13 @@ def _ends(record: str, channel: str, t: np.ndarray, x: np.ndarray, bounds: tuple
             if both:
                 flat |= -sign * x >= opposite - width
             best = made(
-                flat, float(sign * top),
+                flat,
+                float(sign * top),
                 ("here and at the opposite value " if both else "")
                 + "the extreme value repeats far more often than the next ones, a flat top as from a saturated"
-                " converter or preamplifier" + (" below the end of the known range" if bounds is not None else ""), p)
+                " converter or preamplifier" + (" below the end of the known range" if bounds is not None else ""),
+                p,
+            )
     return best
 
 
@@ -236,8 +290,10 @@ def over_range(x: np.ndarray) -> np.ndarray:
             continue
         # One sample may fall within the jump itself.
         jump = min(run[0] - x[start - 2], run[-1] - x[min(stop + 1, len(x) - 1)])
-        if (np.ptp(run) < SETTINGS.level_spread * jump
+        if (
+            np.ptp(run) < SETTINGS.level_spread * jump
             and jump > max(0.2 * (top - low), SETTINGS.unusual * usual)
-            and np.ptp(x[start - 2 : start]) > 0):
+            and np.ptp(x[start - 2 : start]) > 0
+        ):
             mask[start:stop] = True
     return mask

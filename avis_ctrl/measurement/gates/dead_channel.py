@@ -65,21 +65,41 @@ class DeadChannel(Gate):
         traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
-        return _Kept(seen.header.name, seen.driven, np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0), spread, codes,
-                     stuck, _excess(seen), traces)
+        return _Kept(
+            seen.header.name,
+            seen.driven,
+            np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0),
+            spread,
+            codes,
+            stuck,
+            _excess(seen),
+            traces,
+        )
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         rms = np.array([k.rms for k in kept])
-        picture = Picture("R.m.s. of each channel by record", "record number", f"r.m.s. [{campaign.y_unit}]",
-                          tuple(Series(name, np.arange(len(kept)), rms[:, j], "points")
-                                for j, name in enumerate(campaign.y_names)), y_scale="log")
+        picture = Picture(
+            "R.m.s. of each channel by record",
+            "record number",
+            f"r.m.s. [{campaign.y_unit}]",
+            tuple(Series(name, np.arange(len(kept)), rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
+            y_scale="log",
+        )
         found = [*self._sensors(kept, campaign, rms, picture), *self._never_driven(kept, campaign, picture)]
         strongest = rms.max(axis=0)
         quietest = int(np.argmin(strongest))
         return found or [
-            Finding(self.name, "ok", f"All {len(strongest)} channels move; the quietest is "
-                    f"{campaign.y_names[quietest]!r} with {strongest[quietest]:.3g} {campaign.y_unit} r.m.s. in its "
-                    "strongest record.", value=float(strongest[quietest]), limit=0.0, picture=picture)]
+            Finding(
+                self.name,
+                "ok",
+                f"All {len(strongest)} channels move; the quietest is "
+                f"{campaign.y_names[quietest]!r} with {strongest[quietest]:.3g} {campaign.y_unit} r.m.s. in its "
+                "strongest record.",
+                value=float(strongest[quietest]),
+                limit=0.0,
+                picture=picture,
+            )
+        ]
 
     def _sensors(self, kept: list[_Kept], campaign: Campaign, rms: np.ndarray, picture: Picture) -> Iterator[Finding]:
         responses = [k.response for k in kept if k.response is not None]
@@ -90,40 +110,73 @@ class DeadChannel(Gate):
             dead = tuple(k.record for k in kept if k.rms[j] == 0)
             if dead:
                 where = "every record" if len(dead) == len(kept) else f"record {', '.join(dead[:5])}"
-                yield Finding(self.name, "stop",
-                              f"Channel {name!r} is constant in {where}: the sensor is not connected or not recorded. "
-                              "Check its cable and input, or leave the channel out.", (name,), dead, 0.0, 0.0, picture)
+                yield Finding(
+                    self.name,
+                    "stop",
+                    f"Channel {name!r} is constant in {where}: the sensor is not connected or not recorded. "
+                    "Check its cable and input, or leave the channel out.",
+                    (name,),
+                    dead,
+                    0.0,
+                    0.0,
+                    picture,
+                )
             for k in kept:
                 if j in k.stuck:
                     yield self._stuck(name, j, k, campaign)
             if not dead and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
-                yield Finding(self.name, "stop",
-                              f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
-                              f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
-                              "record while the other channels respond (its ratio of response to noise is "
-                              f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
-                              f"{np.median(excess):.3g} times it): not connected, or recorded under another name. "
-                              "Check its cable, or leave it out.", (name,),
-                              tuple(k.record for k in kept if k.response is not None), float(excess[j]), 1.0, picture)
+                yield Finding(
+                    self.name,
+                    "stop",
+                    f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
+                    f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
+                    "record while the other channels respond (its ratio of response to noise is "
+                    f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
+                    f"{np.median(excess):.3g} times it): not connected, or recorded under another name. "
+                    "Check its cable, or leave it out.",
+                    (name,),
+                    tuple(k.record for k in kept if k.response is not None),
+                    float(excess[j]),
+                    1.0,
+                    picture,
+                )
 
     def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> Iterator[Finding]:
         driven = [k.spread for k in kept if k.driven]
         idle = tuple(n for j, n in enumerate(campaign.u_names) if not any(spread[j] > 0 for spread in driven))
         if driven and idle:
-            yield Finding(self.name, "note",
-                          f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
-                          "Drive it in a further record, or leave it out.", idle, picture=picture)
+            yield Finding(
+                self.name,
+                "note",
+                f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
+                "Drive it in a further record, or leave it out.",
+                idle,
+                picture=picture,
+            )
 
     def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
         n, at = kept.stuck[j]
         rate = campaign.sample_rate_Hz
         t, x = kept.traces[j]
-        picture = Picture(f"Record {kept.record}, {name}", "time [s]", f"{name} [{campaign.y_unit}]",
-                          (Series(name, t, x),), (Limit("stuck from", at / rate, "x"),))
-        return Finding(self.name, "warning",
-                       f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
-                       f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
-                       "repeat the record.", (name,), (kept.record,), float(n), float(SETTINGS.stuck_samples), picture)
+        picture = Picture(
+            f"Record {kept.record}, {name}",
+            "time [s]",
+            f"{name} [{campaign.y_unit}]",
+            (Series(name, t, x),),
+            (Limit("stuck from", at / rate, "x"),),
+        )
+        return Finding(
+            self.name,
+            "warning",
+            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
+            f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
+            "repeat the record.",
+            (name,),
+            (kept.record,),
+            float(n),
+            float(SETTINGS.stuck_samples),
+            picture,
+        )
 
 
 def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:

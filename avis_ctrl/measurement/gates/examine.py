@@ -20,8 +20,19 @@ from avis_ctrl.measurement.gates.signal_quality import Coherence, SignalToNoise
 from avis_ctrl.measurement.gates.spikes import Spikes
 from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
 
-GATES: tuple[type[Gate], ...] = (Clipping, Spikes, DeadChannel, ChannelMap, SteppedSine, MissingSamples, Hum,
-                                 SignalToNoise, Coherence, Periodicity, Comparison)
+GATES: tuple[type[Gate], ...] = (
+    Clipping,
+    Spikes,
+    DeadChannel,
+    ChannelMap,
+    SteppedSine,
+    MissingSamples,
+    Hum,
+    SignalToNoise,
+    Coherence,
+    Periodicity,
+    Comparison,
+)
 # Gates that missing or doubled samples of any record affect.
 CONSEQUENCES = (SignalToNoise.name, Coherence.name, Periodicity.name, Comparison.name, LEVEL_DEPENDENCE, Spikes.name)
 # Gates that these affect only if every record has them.
@@ -55,8 +66,10 @@ def examine(campaign: Campaign, expectation: Expectation | None = None, longest:
     findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of, campaign, known)]
     findings = after_clipping(after_missing_samples(findings, {record.header.name for record in campaign.records}))
     if shortened:
-        said = (f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces with "
-                f"{longest} samples in all were examined.)")
+        said = (
+            f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces with "
+            f"{longest} samples in all were examined.)"
+        )
         findings = [replace(f, sentence=f.sentence + said) for f in findings]
     return tuple(findings)
 
@@ -69,8 +82,10 @@ def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Find
     only if samples are missing in every record in `names`.
     """
     records = {r for f in findings if f.gate == MissingSamples.name and f.severity == "stop" for r in f.records}
-    said = (f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}: "
-            "check again without them.")
+    said = (
+        f" This is likely a consequence of the missing or doubled samples of record {', '.join(sorted(records))}: "
+        "check again without them."
+    )
 
     def follows(f: Finding) -> bool:
         of = {name.removeprefix("record ") for name in f.records}
@@ -87,10 +102,12 @@ def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Find
 
 def after_clipping(findings: list[Finding]) -> list[Finding]:
     """Turn consequences of clipping into notes: spikes at the corners of flat tops, and noise if the unit is wrong."""
-    clipped = {(f.channels[0], r) for f in findings if f.gate == Clipping.name and f.severity == "stop"
-               for r in f.records}
-    scaled = {name for f in findings if f.gate == Clipping.name and f.severity == "stop" and f.limit for name in
-              f.channels}
+    clipped = {
+        (f.channels[0], r) for f in findings if f.gate == Clipping.name and f.severity == "stop" for r in f.records
+    }
+    scaled = {
+        name for f in findings if f.gate == Clipping.name and f.severity == "stop" and f.limit for name in f.channels
+    }
     spikes = " The channel is clipped in this record: these are probably the corners of its flat tops."
     noise = " This is likely a consequence of the wrong unit or scale."
     made = []

@@ -19,8 +19,8 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """most_points : maximum number of points of a line: a panel is some hundred pixels wide, with two points per pixel.
-    """
+    """most_points : maximum number of points of a line: a panel is some hundred pixels wide, with two points
+    per pixel."""
 
     most_points: int = 2000
 
@@ -131,8 +131,11 @@ class Expectation:
     def __post_init__(self) -> None:
         if self.y_range_V is not None and not self.y_range_V[0] < self.y_range_V[1]:
             raise InputError("expected the lower end below the upper end", field="y_range_V", value=self.y_range_V)
-        positive = {"y_lsb_V": self.y_lsb_V, "sensor_noise_rms_V": self.sensor_noise_rms_V,
-                    **{f"drive_limits_V[{name}]": value for name, value in self.drive_limits_V.items()}}
+        positive = {
+            "y_lsb_V": self.y_lsb_V,
+            "sensor_noise_rms_V": self.sensor_noise_rms_V,
+            **{f"drive_limits_V[{name}]": value for name, value in self.drive_limits_V.items()},
+        }
         for name, value in positive.items():
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise InputError("expected a positive number", field=name, value=value)
@@ -145,10 +148,10 @@ def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
 
 
 def times(ratio: float, most: float = 1000.0) -> str:
-    """"3.1 times", or "over 1000 times": larger numbers carry no more information."""
+    """ "3.1 times", or "over 1000 times": larger numbers carry no more information."""
     return f"over {most:g} times" if ratio > most else f"{ratio:.1f} times" if ratio < 100 else f"{ratio:.0f} times"
 
 
 def percent(part: float) -> str:
-    """"0.12 %", "12 %", "230 %" or "over 1000 %"."""
+    """ "0.12 %", "12 %", "230 %" or "over 1000 %"."""
     return "over 1000 %" if part > 10 else f"{100 * part:.0f} %" if part >= 0.1 else f"{100 * part:.2g} %"

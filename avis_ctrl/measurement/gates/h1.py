@@ -106,7 +106,7 @@ def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
         u, y = seen.periods("u"), seen.periods("y")
         if u.shape[1] <= SETTINGS.most_samples:
             return u[1:].mean(axis=0), y[1:].mean(axis=0), True
-    return seen.first.u[:SETTINGS.most_samples], seen.first.y[:SETTINGS.most_samples], False
+    return seen.first.u[: SETTINGS.most_samples], seen.first.y[: SETTINGS.most_samples], False
 
 
 def moving(u: np.ndarray) -> int:

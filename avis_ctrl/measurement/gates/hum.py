@@ -92,13 +92,21 @@ class Hum(Gate):
             for line in k.lines:
                 if line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio:
                     hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
-        found = [self._finding(campaign.y_names[j], mains, some, campaign.y_unit)
-                 for (j, mains), some in sorted(hits.items())]
+        found = [
+            self._finding(campaign.y_names[j], mains, some, campaign.y_unit)
+            for (j, mains), some in sorted(hits.items())
+        ]
         note = f"; {passed} lines are excited by u and were not tested" if passed else ""
         what = "No mains hum was found" if tested else "No line of the mains could be tested"
         return found or [
-            Finding(self.name, "ok", f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).", limit=FALSE_ALARM,
-                    picture=self._picture(kept[-1], 0, campaign.y_names[0], campaign.y_unit, []))]
+            Finding(
+                self.name,
+                "ok",
+                f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).",
+                limit=FALSE_ALARM,
+                picture=self._picture(kept[-1], 0, campaign.y_names[0], campaign.y_unit, []),
+            )
+        ]
 
     def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)
@@ -107,16 +115,30 @@ class Hum(Gate):
         at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
         harmonics = ", ".join(f"{k * mains:g}" for k in at)
         picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
-        return Finding(self.name, "warning" if part > SETTINGS.large else "note",
-                       f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
-                       f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
-                       f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
-                       "lines out of the fit.", (name,), records, float(line.ratio), SETTINGS.least_ratio, picture)
+        return Finding(
+            self.name,
+            "warning" if part > SETTINGS.large else "note",
+            f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
+            f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
+            f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
+            "lines out of the fit.",
+            (name,),
+            records,
+            float(line.ratio),
+            SETTINGS.least_ratio,
+            picture,
+        )
 
     def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
-        return Picture(f"Record {kept.record}, {name}", "frequency [Hz]", f"amplitude density [{unit}/√Hz]",
-                       (Series(name, kept.f[1:], kept.asd[1:, j]),),
-                       tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ), "log", "log")
+        return Picture(
+            f"Record {kept.record}, {name}",
+            "frequency [Hz]",
+            f"amplitude density [{unit}/√Hz]",
+            (Series(name, kept.f[1:], kept.asd[1:, j]),),
+            tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ),
+            "log",
+            "log",
+        )
 
 
 def _length(samples: int, rate: float) -> int:
@@ -145,8 +167,10 @@ def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: 
         return None
     lines = []
     for j in range(P.shape[1]):
-        floor = max(P[low - SETTINGS.guard - SETTINGS.reference : low - SETTINGS.guard, j].mean(),
-                    P[high + SETTINGS.guard + 1 : high + SETTINGS.guard + SETTINGS.reference + 1, j].mean())
+        floor = max(
+            P[low - SETTINGS.guard - SETTINGS.reference : low - SETTINGS.guard, j].mean(),
+            P[high + SETTINGS.guard + 1 : high + SETTINGS.guard + SETTINGS.reference + 1, j].mean(),
+        )
         peak = low + int(np.argmax(P[low : high + 1, j]))
         if floor <= 0:
             continue

@@ -69,9 +69,14 @@ class MissingSamples(Gate):
 
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         t, delay = delays(seen)
-        stepped = [one for one in delay if (step := delay_step(one, FALSE_ALARM)) is not None
-                   and SETTINGS.jump_samples < abs(step[1]) <= SETTINGS.longest_samples and not drifts(one, step[0])
-                   and explained(seen, t, *step) > SETTINGS.explains]
+        stepped = [
+            one
+            for one in delay
+            if (step := delay_step(one, FALSE_ALARM)) is not None
+            and SETTINGS.jump_samples < abs(step[1]) <= SETTINGS.longest_samples
+            and not drifts(one, step[0])
+            and explained(seen, t, *step) > SETTINGS.explains
+        ]
         block = repeated_block(seen.first.y, seen.header.period_samples)
         return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
 
@@ -85,38 +90,66 @@ class MissingSamples(Gate):
         said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if comparable else ""
         said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
         return found or [
-            Finding(self.name, "ok", f"No lost or repeated samples were found ({len(comparable)} of {len(kept)} "
-                    f"records could be compared with a moving commanded voltage{said}).",
-                    value=scatter if comparable else None, limit=SETTINGS.jump_samples, picture=_picture(longest))]
+            Finding(
+                self.name,
+                "ok",
+                f"No lost or repeated samples were found ({len(comparable)} of {len(kept)} "
+                f"records could be compared with a moving commanded voltage{said}).",
+                value=scatter if comparable else None,
+                limit=SETTINGS.jump_samples,
+                picture=_picture(longest),
+            )
+        ]
 
     def _faults(self, k: _Kept, level: float) -> Iterator[Finding]:
         """Findings on one record."""
         rate, name, picture = k.header.sample_rate_Hz, k.header.name, _picture(k)
         if k.block:
             at, back, n = k.block
-            yield Finding(self.name, "stop",
-                          f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples "
-                          "before: a buffer was written twice. Repeat the record.", (), (name,), float(n),
-                          float(SETTINGS.block_rows), picture)
+            yield Finding(
+                self.name,
+                "stop",
+                f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples "
+                "before: a buffer was written twice. Repeat the record.",
+                (),
+                (name,),
+                float(n),
+                float(SETTINGS.block_rows),
+                picture,
+            )
         if k.clock is not None and np.any(k.clock != 0):
             p = int(np.flatnonzero(k.clock)[0])
             # Within the period of the loss the correlation shows only part of the shift.
             shift = float(k.clock[-1] or k.clock[p])
-            yield Finding(self.name, "stop",
-                          f"The commanded voltage of record {name} is {abs(shift):g} samples off "
-                          f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, "
-                          "or the stated period is wrong. Check period_s, or repeat the record.", (), (name,),
-                          shift, 0.0, picture)
+            yield Finding(
+                self.name,
+                "stop",
+                f"The commanded voltage of record {name} is {abs(shift):g} samples off "
+                f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, "
+                "or the stated period is wrong. Check period_s, or repeat the record.",
+                (),
+                (name,),
+                shift,
+                0.0,
+                picture,
+            )
         steps = [step for one in k.stepped if (step := delay_step(one, level)) is not None]
         at, size = max(steps, key=lambda step: abs(step[1]), default=(0, 0.0))
         if abs(size) > SETTINGS.jump_samples:
             fewer = size < 0
-            yield Finding(self.name, "stop",
-                          f"In record {name} the delay of the measured channels after the commanded voltage becomes "
-                          f"{abs(size):.1f} samples {'shorter' if fewer else 'longer'} at about "
-                          f"{k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were "
-                          f"{'lost' if fewer else 'doubled'}. Repeat the record, or use only the part before.", (),
-                          (name,), float(size), SETTINGS.jump_samples, picture)
+            yield Finding(
+                self.name,
+                "stop",
+                f"In record {name} the delay of the measured channels after the commanded voltage becomes "
+                f"{abs(size):.1f} samples {'shorter' if fewer else 'longer'} at about "
+                f"{k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were "
+                f"{'lost' if fewer else 'doubled'}. Repeat the record, or use only the part before.",
+                (),
+                (name,),
+                float(size),
+                SETTINGS.jump_samples,
+                picture,
+            )
 
     def _overlaps(self, kept: list[_Kept]) -> list[Finding]:
         if len(kept) < 2 or len({k.header.start_s for k in kept}) == 1:
@@ -127,11 +160,19 @@ class MissingSamples(Gate):
             end = a.header.start_s + a.header.duration_s
             if b.header.start_s < end - 1.5 / a.header.sample_rate_Hz:
                 found.append(
-                    Finding(self.name, "warning",
-                            f"Record {b.header.name} starts at {b.header.start_s:.6g} s, before record {a.header.name} "
-                            f"ends at {end:.6g} s: the clocks or the sample rate are wrong. Check start_s and "
-                            "sample_rate_Hz.", (), (a.header.name, b.header.name), float(b.header.start_s - end), 0.0,
-                            _picture(a)))
+                    Finding(
+                        self.name,
+                        "warning",
+                        f"Record {b.header.name} starts at {b.header.start_s:.6g} s, before record {a.header.name} "
+                        f"ends at {end:.6g} s: the clocks or the sample rate are wrong. Check start_s and "
+                        "sample_rate_Hz.",
+                        (),
+                        (a.header.name, b.header.name),
+                        float(b.header.start_s - end),
+                        0.0,
+                        _picture(a),
+                    )
+                )
         return found[:3]
 
 
@@ -236,8 +277,9 @@ def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | 
     moving, rows = np.ptp(y, axis=0) > 0, SETTINGS.block_rows
     if not moving.any() or len(y) < 2 * rows:
         return None
-    _, codes = np.unique(np.ascontiguousarray(y[:, moving]).view(np.dtype((np.void, 8 * int(moving.sum())))).ravel(),
-                         return_inverse=True)
+    _, codes = np.unique(
+        np.ascontiguousarray(y[:, moving]).view(np.dtype((np.void, 8 * int(moving.sum())))).ravel(), return_inverse=True
+    )
     changed = np.concatenate([[True], np.diff(codes) != 0])
     factors = np.random.default_rng(0).integers(1, 1 << 62, rows, dtype=np.int64) | 1
     windows = np.lib.stride_tricks.sliding_window_view(codes.astype(np.int64), rows)
@@ -272,6 +314,10 @@ def _clock(seen: Excerpt) -> np.ndarray | None:
 
 def _picture(kept: _Kept) -> Picture:
     t = kept.t - kept.header.start_s
-    return Picture(f"Record {kept.header.name}: delay of y behind the response to u", "time [s]", "delay [samples]",
-                   (Series("delay", t, kept.delay[0], "points"),),
-                   (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)))
+    return Picture(
+        f"Record {kept.header.name}: delay of y behind the response to u",
+        "time [s]",
+        "delay [samples]",
+        (Series("delay", t, kept.delay[0], "points"),),
+        (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)),
+    )

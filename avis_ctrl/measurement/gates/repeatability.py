@@ -128,36 +128,64 @@ class Comparison(Gate):
         level = FALSE_ALARM / max(1, len(apart) * n_y)
         levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
-        return [*_judged(self.name, repeats, campaign, _drifted, agreed,
-                         "Repeatability was not tested: no two driven records of one level and enough length."),
-                *_judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, "The responses at all levels agree",
-                         "Dependence on the level was not tested: no driven records of one kind and enough length at "
-                         f"two levels, at least a factor {SETTINGS.apart:g} apart.")]
+        return [
+            *_judged(
+                self.name,
+                repeats,
+                campaign,
+                _drifted,
+                agreed,
+                "Repeatability was not tested: no two driven records of one level and enough length.",
+            ),
+            *_judged(
+                LEVEL_DEPENDENCE,
+                levels,
+                campaign,
+                _nonlinear,
+                "The responses at all levels agree",
+                "Dependence on the level was not tested: no driven records of one kind and enough length at "
+                f"two levels, at least a factor {SETTINGS.apart:g} apart.",
+            ),
+        ]
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
     """Sentence and records of the finding."""
-    return (f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to "
-            f"{percent(d.relative[bad].max())} of the response, {significance(d.T[bad].max())}. The rig drifted or "
-            "was changed in between; treat its parameters as uncertain by this amount, or use only one of the two."
-            ), (d.a, d.b)
+    return (
+        f"{d.b.capitalize()} does not repeat {d.a}: {quoted(names)} differ by up to "
+        f"{percent(d.relative[bad].max())} of the response, {significance(d.T[bad].max())}. The rig drifted or "
+        "was changed in between; treat its parameters as uncertain by this amount, or use only one of the two."
+    ), (d.a, d.b)
 
 
 def _nonlinear(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
     low, high = d.band_Hz[int(np.argmax(np.where(bad, d.relative, 0)))]
-    return (f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to "
-            f"{percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz), "
-            f"{significance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and include the difference "
-            "in the uncertainty."), ()
+    return (
+        f"The response depends on the level: from {d.a} to {d.b} {quoted(names)} change by up to "
+        f"{percent(d.relative[bad].max())} (most from {low:.3g} to {high:.3g} Hz), "
+        f"{significance(d.T[bad].max())}: nonlinearity. Identify at the level of use, and include the difference "
+        "in the uncertainty."
+    ), ()
 
 
-def _judged(gate: str, differences: list[Difference], campaign: Campaign,
-            described: Callable[[Difference, np.ndarray, tuple[str, ...]], tuple[str, tuple[str, ...]]], agreed: str,
-            untested: str) -> list[Finding]:
+def _judged(
+    gate: str,
+    differences: list[Difference],
+    campaign: Campaign,
+    described: Callable[[Difference, np.ndarray, tuple[str, ...]], tuple[str, tuple[str, ...]]],
+    agreed: str,
+    untested: str,
+) -> list[Finding]:
     """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
-        return [Finding(gate, "ok", untested, picture=Picture(gate.capitalize(), "frequency [Hz]",
-                                                              "relative difference [-]", ()))]
+        return [
+            Finding(
+                gate,
+                "ok",
+                untested,
+                picture=Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ()),
+            )
+        ]
     found = []
     for d in differences:
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
@@ -165,23 +193,51 @@ def _judged(gate: str, differences: list[Difference], campaign: Campaign,
             names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
             large = d.relative[bad].max() > SETTINGS.large
             sentence, records = described(d, bad, names)
-            found.append(Finding(gate, "warning" if large else "note", sentence, names, records, float(d.T[bad].max()),
-                                 1.0, _picture(d, campaign.y_names)))
+            found.append(
+                Finding(
+                    gate,
+                    "warning" if large else "note",
+                    sentence,
+                    names,
+                    records,
+                    float(d.T[bad].max()),
+                    1.0,
+                    _picture(d, campaign.y_names),
+                )
+            )
     if found:
         return found
     d = max(differences, key=lambda d: d.noise)
     blind = d.noise > SETTINGS.blind
-    hint = (" Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive "
-            "comparison." if blind else "")
-    return [Finding(gate, "note" if blind else "ok", f"{agreed} within their noise, which is up to {100 * d.noise:.2g} "
-                    f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}",
-                    value=float(d.T.max()), limit=1.0, picture=_picture(d, campaign.y_names))]
+    hint = (
+        " Smaller changes would not be detected; records with the same periodic voltage allow a more sensitive "
+        "comparison."
+        if blind
+        else ""
+    )
+    return [
+        Finding(
+            gate,
+            "note" if blind else "ok",
+            f"{agreed} within their noise, which is up to {100 * d.noise:.2g} "
+            f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}",
+            value=float(d.T.max()),
+            limit=1.0,
+            picture=_picture(d, campaign.y_names),
+        )
+    ]
 
 
 def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
-    return Picture(f"{d.a} against {d.b}", "frequency [Hz]", "relative difference [-]",
-                   tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
-                   (Limit("large", SETTINGS.large),), "log", "log")
+    return Picture(
+        f"{d.a} against {d.b}",
+        "frequency [Hz]",
+        "relative difference [-]",
+        tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
+        (Limit("large", SETTINGS.large),),
+        "log",
+        "log",
+    )
 
 
 def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list[_Kept]]:
@@ -235,8 +291,9 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
     power = np.abs(D) ** 2
     by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    T, relative, band = _by_band(f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1,
-                                 min(first.dof, second.dof), level)
+    T, relative, band = _by_band(
+        f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1, min(first.dof, second.dof), level
+    )
     noise = _noise(f[keep], variance[keep], size[keep])
     return Difference(*names, T, relative, band, f[keep], by_line[keep], noise)
 
@@ -244,11 +301,13 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
 def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
     """Noise of the difference relative to the response, r.m.s. in the octave where it is largest."""
     return max(
-        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f))
+        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f)
+    )
 
 
-def _by_band(f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int,
-             level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _by_band(
+    f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int, level: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(n_y,) in the most significant octave: mean ratio over the limit of F(n_u L, dof L), relative excess, ends (n_y,
     2).
     """
@@ -271,8 +330,9 @@ def _compared(first: list[Spectra], second: list[Spectra], level: float, names: 
     if a is None or b is None:
         return None
     f, ia, ib = np.intersect1d(a.f, b.f, return_indices=True)
-    inside = ((a.power[ia] > SETTINGS.excited * np.median(a.power))
-              & (b.power[ib] > SETTINGS.excited * np.median(b.power)))
+    inside = (a.power[ia] > SETTINGS.excited * np.median(a.power)) & (
+        b.power[ib] > SETTINGS.excited * np.median(b.power)
+    )
     ia, ib, f = ia[inside][::2], ib[inside][::2], f[inside][::2]
     common = _common(a.basis, b.basis)
     rank = common.shape[1]

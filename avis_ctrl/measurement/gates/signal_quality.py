@@ -75,40 +75,74 @@ class SignalToNoise(Gate):
         noisy = list(self._noisy(kept, campaign, expectation))
         measured = [k for k in kept if k.snr is not None and len(k.f)]
         if not measured:
-            return noisy or [Finding(self.name, "ok", "No driven record is long enough to separate signal and noise.",
-                                     picture=Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ()))]
+            return noisy or [
+                Finding(
+                    self.name,
+                    "ok",
+                    "No driven record is long enough to separate signal and noise.",
+                    picture=Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ()),
+                )
+            ]
         best = max(measured, key=lambda k: float(np.median(np.asarray(k.snr))))
         f, snr = best.f, np.asarray(best.snr)
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])
-        picture = Picture("Signal to noise of the best record", "frequency [Hz]", "ratio [dB]",
-                          tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
-                          (Limit("low", SETTINGS.low_dB),), "log")
+        picture = Picture(
+            "Signal to noise of the best record",
+            "frequency [Hz]",
+            "ratio [dB]",
+            tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
+            (Limit("low", SETTINGS.low_dB),),
+            "log",
+        )
         found = noisy + list(self._weak(campaign.y_names, middle, dB, best.segment_s, picture))
         b, j = divmod(int(np.argmin(dB)), dB.shape[1])
         return found or [
-            Finding(self.name, "ok", f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest "
-                    f"{campaign.y_names[j]!r} around {middle[b]:.3g} Hz).", value=float(dB[b, j]),
-                    limit=SETTINGS.low_dB, picture=picture)]
+            Finding(
+                self.name,
+                "ok",
+                f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest "
+                f"{campaign.y_names[j]!r} around {middle[b]:.3g} Hz).",
+                value=float(dB[b, j]),
+                limit=SETTINGS.low_dB,
+                picture=picture,
+            )
+        ]
 
-    def _weak(self, names: tuple[str, ...], middle: np.ndarray, dB: np.ndarray, segment_s: float,
-              picture: Picture) -> Iterator[Finding]:
-        advice = (f". Causes are noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. "
-                  "A periodic excitation would distinguish them; a higher level helps only against noise."
-                  if segment_s else
-                  ". Such bands have little weight in a fit; excite them more if they are important.")
+    def _weak(
+        self, names: tuple[str, ...], middle: np.ndarray, dB: np.ndarray, segment_s: float, picture: Picture
+    ) -> Iterator[Finding]:
+        advice = (
+            f". Causes are noise, or leakage of a mode that rings longer than the segments of {segment_s:.3g} s. "
+            "A periodic excitation would distinguish them; a higher level helps only against noise."
+            if segment_s
+            else ". Such bands have little weight in a fit; excite them more if they are important."
+        )
         for name, levels in zip(names, dB.T, strict=True):
             weak = np.flatnonzero(levels < SETTINGS.low_dB)
             if levels.max() < SETTINGS.poor_dB:
-                yield Finding(self.name, "warning",
-                              f"Channel {name!r} has more noise than signal in every band (at best {levels.max():.1f} "
-                              f"dB at {middle[np.argmax(levels)]:.3g} Hz). Raise the level, or average longer.",
-                              (name,), value=float(levels.max()), limit=SETTINGS.poor_dB, picture=picture)
+                yield Finding(
+                    self.name,
+                    "warning",
+                    f"Channel {name!r} has more noise than signal in every band (at best {levels.max():.1f} "
+                    f"dB at {middle[np.argmax(levels)]:.3g} Hz). Raise the level, or average longer.",
+                    (name,),
+                    value=float(levels.max()),
+                    limit=SETTINGS.poor_dB,
+                    picture=picture,
+                )
             elif weak.size:
                 low = ", ".join(f"{round(float(levels[b]))} dB at {middle[b]:.3g} Hz" for b in weak)
-                yield Finding(self.name, "note", f"Channel {name!r} has little signal: {low}{advice}", (name,),
-                              value=float(levels.min()), limit=SETTINGS.low_dB, picture=picture)
+                yield Finding(
+                    self.name,
+                    "note",
+                    f"Channel {name!r} has little signal: {low}{advice}",
+                    (name,),
+                    value=float(levels.min()),
+                    limit=SETTINGS.low_dB,
+                    picture=picture,
+                )
 
     def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> Iterator[Finding]:
         stated = expectation.sensor_noise_rms_V
@@ -116,16 +150,28 @@ class SignalToNoise(Gate):
         if stated is None or not levels:
             return
         rms = np.median(levels, axis=0)
-        picture = Picture("Noise of each channel, from above half the Nyquist frequency", "channel",
-                          f"r.m.s. [{campaign.y_unit}]", (Series("measured", np.arange(len(rms)), rms, "bars"),),
-                          (Limit("stated", stated),), y_scale="log", x_names=campaign.y_names)
+        picture = Picture(
+            "Noise of each channel, from above half the Nyquist frequency",
+            "channel",
+            f"r.m.s. [{campaign.y_unit}]",
+            (Series("measured", np.arange(len(rms)), rms, "bars"),),
+            (Limit("stated", stated),),
+            y_scale="log",
+            x_names=campaign.y_names,
+        )
         for name, one in zip(campaign.y_names, rms, strict=True):
             if one > SETTINGS.noise_factor * stated:
-                yield Finding(self.name, "warning",
-                              f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., "
-                              f"{one / stated:.1f} times what the rig file states. Check its preamplifier and cable, "
-                              "or correct the rig file.", (name,), value=float(one),
-                              limit=SETTINGS.noise_factor * stated, picture=picture)
+                yield Finding(
+                    self.name,
+                    "warning",
+                    f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., "
+                    f"{one / stated:.1f} times what the rig file states. Check its preamplifier and cable, "
+                    "or correct the rig file.",
+                    (name,),
+                    value=float(one),
+                    limit=SETTINGS.noise_factor * stated,
+                    picture=picture,
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +209,14 @@ class Coherence(Gate):
         chosen = [k for k in driven if k.level * SETTINGS.same_level >= top]
         best, seconds = _pooled(chosen)
         if best is None:
-            return [Finding(self.name, "ok", "No driven record is long enough for a coherence of all inputs together.",
-                            picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()))]
+            return [
+                Finding(
+                    self.name,
+                    "ok",
+                    "No driven record is long enough for a coherence of all inputs together.",
+                    picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()),
+                )
+            ]
         free = best.unbiased_coherence()
         bands = thirds(best.f)
         middle = np.array([np.sqrt(best.f[b][0] * best.f[b][-1]) for b in bands])
@@ -173,45 +225,78 @@ class Coherence(Gate):
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
-        picture = Picture(f"Multiple coherence at {top:.3g} V, third octaves", "frequency [Hz]", "coherence [-]",
-                          tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
-                          (Limit("low", SETTINGS.low_coherence),), "log")
+        picture = Picture(
+            f"Multiple coherence at {top:.3g} V, third octaves",
+            "frequency [Hz]",
+            "coherence [-]",
+            tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
+            (Limit("low", SETTINGS.low_coherence),),
+            "log",
+        )
         below, excited = "", _lowest_driven(chosen)
         if best.f[0] > 1.5 * excited:
-            below = (f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are "
-                     "too short for a coherence of all inputs.")
+            below = (
+                f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are "
+                "too short for a coherence of all inputs."
+            )
         low = np.any(mean < SETTINGS.low_coherence, axis=0)
         groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
-        found = [self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
-                 for group in groups if group]
+        found = [
+            self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
+            for group in groups
+            if group
+        ]
         if found:
             return found
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         return [
-            Finding(self.name, "ok",
-                    f"Multiple coherence is at least {mean[b, j]:.2f} in every third-octave band from {best.f[0]:.3g} "
-                    f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
-                    f"Hz).{below}", value=float(mean[b, j]), limit=SETTINGS.low_coherence, picture=picture)]
+            Finding(
+                self.name,
+                "ok",
+                f"Multiple coherence is at least {mean[b, j]:.2f} in every third-octave band from {best.f[0]:.3g} "
+                f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
+                f"Hz).{below}",
+                value=float(mean[b, j]),
+                limit=SETTINGS.low_coherence,
+                picture=picture,
+            )
+        ]
 
-    def _low(self, names: tuple[str, ...], group: list[int], middle: np.ndarray, mean: np.ndarray, surely: bool,
-             seconds: float, below: str, picture: Picture) -> Finding:
+    def _low(
+        self,
+        names: tuple[str, ...],
+        group: list[int],
+        middle: np.ndarray,
+        mean: np.ndarray,
+        surely: bool,
+        seconds: float,
+        below: str,
+        picture: Picture,
+    ) -> Finding:
         """Finding on one channel that is low everywhere, or on all channels that are low somewhere."""
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
             b = int(np.argmin(mean[:, j]))
             count = int(np.count_nonzero(mean[:, j] < SETTINGS.low_coherence))
-            said.append(f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in "
-                        f"{count} band{'s' * (count > 1)})")
+            said.append(
+                f"{names[j]!r} {max(mean[b, j], 0):.2f} around {middle[b]:.3g} Hz (low in "
+                f"{count} band{'s' * (count > 1)})"
+            )
         more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
-        return Finding(self.name, "warning" if surely else "note",
-                       f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
-                       f"the {len(middle)} third-octave bands: {'; '.join(said)}{more}. Causes are noise, an input "
-                       "that is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
-                       f"decays more slowly than the segments of {seconds:.3g} s. Longer records distinguish "
-                       f"leakage from the other causes; a higher level reduces the influence of noise.{below}",
-                       tuple(names[j] for j in ordered), value=float(mean[:, group].min()),
-                       limit=SETTINGS.low_coherence, picture=picture)
+        return Finding(
+            self.name,
+            "warning" if surely else "note",
+            f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
+            f"the {len(middle)} third-octave bands: {'; '.join(said)}{more}. Causes are noise, an input "
+            "that is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
+            f"decays more slowly than the segments of {seconds:.3g} s. Longer records distinguish "
+            f"leakage from the other causes; a higher level reduces the influence of noise.{below}",
+            tuple(names[j] for j in ordered),
+            value=float(mean[:, group].min()),
+            limit=SETTINGS.low_coherence,
+            picture=picture,
+        )
 
 
 def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:

@@ -51,8 +51,13 @@ def fit_sine(record: str, x: np.ndarray, n_u: int, rate: float) -> SineFit:
         return float(np.sum((centred[:, lead] - A @ c) ** 2))
 
     f = float(
-        minimize_scalar(residual, bounds=(max(start - rate / n, 0.1 * rate / n), start + rate / n), method="bounded",
-                        options={"xatol": 1e-6 * rate / n}).x)
+        minimize_scalar(
+            residual,
+            bounds=(max(start - rate / n, 0.1 * rate / n), start + rate / n),
+            method="bounded",
+            options={"xatol": 1e-6 * rate / n},
+        ).x
+    )
     A = regressors(f)
     c, *_ = np.linalg.lstsq(A, centred, rcond=None)
     shown = min(n, max(50, int(3 * rate / f)), 4000)
@@ -60,8 +65,8 @@ def fit_sine(record: str, x: np.ndarray, n_u: int, rate: float) -> SineFit:
 
 
 def second_order(f: np.ndarray, H: np.ndarray) -> SecondOrder:
-    """The best of low-pass, band-pass and high-pass, by robust least squares of relative errors from several corners.
-    """
+    """The best of low-pass, band-pass and high-pass, by robust least squares of relative errors from several
+    corners."""
     s = 2j * np.pi * f
     best: SecondOrder | None = None
     for k in KINDS:
@@ -79,8 +84,9 @@ def second_order(f: np.ndarray, H: np.ndarray) -> SecondOrder:
 
         for corner in np.geomspace(f[0], f[-1], 5):
             q = least_squares(errors, [np.log(2 * np.pi * corner), np.log(0.5)], loss="soft_l1", f_scale=0.05).x
-            made = SecondOrder(k, float(np.exp(q[0]) / (2 * np.pi)), float(np.exp(q[1])),
-                               float(np.median(np.abs(shape(q)))))
+            made = SecondOrder(
+                k, float(np.exp(q[0]) / (2 * np.pi)), float(np.exp(q[1])), float(np.median(np.abs(shape(q))))
+            )
             if best is None or made.misfit < best.misfit:
                 best = made
     assert best is not None

@@ -75,34 +75,67 @@ class Spikes(Gate):
                     part = slice(max(0, k - 100), k + 100)
                     expected = float(x[k] - departure(x[k - 2 : k + 3])[0])
                     found.append(
-                        _Kept(seen.header.name, name, len(where), k + round(float(t[0]) * seen.header.sample_rate_Hz),
-                              float(t[k]), float(x[k]), expected, float(ratio.max()), t[part], x[part]))
+                        _Kept(
+                            seen.header.name,
+                            name,
+                            len(where),
+                            k + round(float(t[0]) * seen.header.sample_rate_Hz),
+                            float(t[k]),
+                            float(x[k]),
+                            expected,
+                            float(ratio.max()),
+                            t[part],
+                            x[part],
+                        )
+                    )
         return found, least
 
-    def conclude(self, kept: list[tuple[list[_Kept], float]], campaign: Campaign,
-                 expectation: Expectation) -> list[Finding]:
+    def conclude(
+        self, kept: list[tuple[list[_Kept], float]], campaign: Campaign, expectation: Expectation
+    ) -> list[Finding]:
         found = [self._finding(k, campaign.y_unit) for of, _ in kept for k in of]
         if found:
             return found
         least = np.array([SETTINGS.factor * one for _, one in kept])
-        return [Finding(self.name, "ok",
-                        f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
-                        f"{campaign.y_unit} would be found in every record.", value=float(least.max()),
-                        picture=Picture("Smallest spike that would be found", "record", f"spike [{campaign.y_unit}]",
-                                        (Series("least spike", np.arange(len(least)), least, "bars"),),
-                                        x_names=tuple(r.header.name for r in campaign.records)))]
+        return [
+            Finding(
+                self.name,
+                "ok",
+                f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
+                f"{campaign.y_unit} would be found in every record.",
+                value=float(least.max()),
+                picture=Picture(
+                    "Smallest spike that would be found",
+                    "record",
+                    f"spike [{campaign.y_unit}]",
+                    (Series("least spike", np.arange(len(least)), least, "bars"),),
+                    x_names=tuple(r.header.name for r in campaign.records),
+                ),
+            )
+        ]
 
     def _finding(self, k: _Kept, unit: str) -> Finding:
         many = f"{k.count} single samples, the worst" if k.count > 1 else "a single sample"
-        return Finding(self.name, "warning",
-                       f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at "
-                       f"{k.at_s:.6g} s (sample {k.sample}): {k.value:.4g} {unit}, while interpolation gives "
-                       f"{k.expected:.4g}. The deviation is {times(k.ratio)} the usual one (limit {SETTINGS.factor:g}):"
-                       " an electrical disturbance or a faulty conversion. Check cables and grounding; repeat the "
-                       "record, or replace the sample by the interpolated value.", (k.channel,), (k.record,), k.ratio,
-                       SETTINGS.factor,
-                       Picture(f"Record {k.record}, {k.channel}", "time [s]", f"{k.channel} [{unit}]",
-                               (Series(k.channel, k.t, k.x),), (Limit("spike", k.at_s, "x"),)))
+        return Finding(
+            self.name,
+            "warning",
+            f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at "
+            f"{k.at_s:.6g} s (sample {k.sample}): {k.value:.4g} {unit}, while interpolation gives "
+            f"{k.expected:.4g}. The deviation is {times(k.ratio)} the usual one (limit {SETTINGS.factor:g}):"
+            " an electrical disturbance or a faulty conversion. Check cables and grounding; repeat the "
+            "record, or replace the sample by the interpolated value.",
+            (k.channel,),
+            (k.record,),
+            k.ratio,
+            SETTINGS.factor,
+            Picture(
+                f"Record {k.record}, {k.channel}",
+                "time [s]",
+                f"{k.channel} [{unit}]",
+                (Series(k.channel, k.t, k.x),),
+                (Limit("spike", k.at_s, "x"),),
+            ),
+        )
 
 
 def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -145,4 +178,3 @@ def jump_corner(here: np.ndarray) -> float:
 def departure(x: np.ndarray) -> np.ndarray:
     """(n - 4,) difference of each sample from the cubic through its two neighbours on either side."""
     return np.convolve(x, SHAPE, "valid")
-

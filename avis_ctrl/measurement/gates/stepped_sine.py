@@ -66,24 +66,46 @@ class SteppedSine(Gate):
         names = (*campaign.u_names, *campaign.y_names)
         if len(fits) < SETTINGS.fewest:
             return [
-                Finding(self.name, "ok",
-                        f"No stepped-sine campaign: {len(fits)} sine records, {SETTINGS.fewest} are needed to compare "
-                        "neighbours.", picture=Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ()))]
+                Finding(
+                    self.name,
+                    "ok",
+                    f"No stepped-sine campaign: {len(fits)} sine records, {SETTINGS.fewest} are needed to compare "
+                    "neighbours.",
+                    picture=Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ()),
+                )
+            ]
         f, X = np.array([k.f for k in fits]), np.array([k.X for k in fits])
         rest = np.array([k.residual_rms for k in fits]) / np.maximum(np.abs(X), 1e-300) * np.sqrt(2)
         silent = [j for j in range(len(names)) if np.median(rest[:, j]) > 10]
         live = [j for j in range(len(names)) if j not in silent]
         drive = _drive(rest, live, len(campaign.u_names))
-        found = [*self._labels(f, X, names, live, drive, len(campaign.u_names), silent),
-                 *self._bad_records(fits, f, X, rest, names, live, drive)]
+        found = [
+            *self._labels(f, X, names, live, drive, len(campaign.u_names), silent),
+            *self._bad_records(fits, f, X, rest, names, live, drive),
+        ]
         largest = float(rest[:, live].max())
         return found or [
-            Finding(self.name, "ok", f"{len(fits)} sine records from {f[0]:.3g} to {f[-1]:.3g} Hz are smooth in "
-                    f"frequency; the largest residual is {100 * largest:.2g} % of its sine.", value=largest,
-                    limit=SETTINGS.residual, picture=_bode(f, X, names, live, drive))]
+            Finding(
+                self.name,
+                "ok",
+                f"{len(fits)} sine records from {f[0]:.3g} to {f[-1]:.3g} Hz are smooth in "
+                f"frequency; the largest residual is {100 * largest:.2g} % of its sine.",
+                value=largest,
+                limit=SETTINGS.residual,
+                picture=_bode(f, X, names, live, drive),
+            )
+        ]
 
-    def _labels(self, f: np.ndarray, X: np.ndarray, names: tuple[str, ...], live: list[int], drive: int, n_u: int,
-                silent: list[int]) -> Iterator[Finding]:
+    def _labels(
+        self,
+        f: np.ndarray,
+        X: np.ndarray,
+        names: tuple[str, ...],
+        live: list[int],
+        drive: int,
+        n_u: int,
+        silent: list[int],
+    ) -> Iterator[Finding]:
         for j in (j for j in live if j < n_u and j != drive):
             H = X[:, j] / X[:, drive]
             spread = float(np.exp(np.std(np.log(np.abs(H)))) - 1)
@@ -94,19 +116,36 @@ class SteppedSine(Gate):
             if model.misfit > SETTINGS.second_order:
                 continue
             lost = [names[k] for k in silent if k >= n_u]
-            likely = (f"; the sensor channel {lost[0]!r} is silent: their names or cables are probably exchanged"
-                      if lost else "")
-            yield Finding(self.name, "stop",
-                          f"Channel {names[j]!r} is recorded as a drive but is a sensor's output: its ratio to "
-                          f"{names[drive]!r} is not constant (it varies from {np.abs(H).min():.3g} to "
-                          f"{np.abs(H).max():.3g} and turns by {turned:.0f} degrees from {f[0]:.3g} to {f[-1]:.3g} Hz) "
-                          f"but follows a second-order {KINDS[model.k]} response with corner {model.corner_Hz:.3f} Hz "
-                          f"and damping {model.damping:.3f} within {100 * model.misfit:.1f} %{likely}. Record it as an "
-                          "output, and find the channel that measures the drive.", (names[j], *lost), value=spread,
-                          limit=SETTINGS.constant, picture=_bode(f, X, names, live, drive))
+            likely = (
+                f"; the sensor channel {lost[0]!r} is silent: their names or cables are probably exchanged"
+                if lost
+                else ""
+            )
+            yield Finding(
+                self.name,
+                "stop",
+                f"Channel {names[j]!r} is recorded as a drive but is a sensor's output: its ratio to "
+                f"{names[drive]!r} is not constant (it varies from {np.abs(H).min():.3g} to "
+                f"{np.abs(H).max():.3g} and turns by {turned:.0f} degrees from {f[0]:.3g} to {f[-1]:.3g} Hz) "
+                f"but follows a second-order {KINDS[model.k]} response with corner {model.corner_Hz:.3f} Hz "
+                f"and damping {model.damping:.3f} within {100 * model.misfit:.1f} %{likely}. Record it as an "
+                "output, and find the channel that measures the drive.",
+                (names[j], *lost),
+                value=spread,
+                limit=SETTINGS.constant,
+                picture=_bode(f, X, names, live, drive),
+            )
 
-    def _bad_records(self, fits: list[SineFit], f: np.ndarray, X: np.ndarray, rest: np.ndarray, names: tuple[str, ...],
-                     live: list[int], drive: int) -> Iterator[Finding]:
+    def _bad_records(
+        self,
+        fits: list[SineFit],
+        f: np.ndarray,
+        X: np.ndarray,
+        rest: np.ndarray,
+        names: tuple[str, ...],
+        live: list[int],
+        drive: int,
+    ) -> Iterator[Finding]:
         for j in live:
             H = np.abs(X[:, j] / X[:, drive])
             off = _departure(np.log(f), np.log(H)) if j != drive else np.zeros(len(f))
@@ -117,19 +156,34 @@ class SteppedSine(Gate):
                 noisy = rest[k, j] > max(SETTINGS.residual, SETTINGS.residual_factor * near)
                 # A bad record makes its neighbours depart too: only the largest departure around counts.
                 astray = abs(off[k]) > max(SETTINGS.ratio, SETTINGS.ratio_factor * usual) and abs(off[k]) >= np.max(
-                    np.abs(off[max(0, k - 1) : k + 2]))
+                    np.abs(off[max(0, k - 1) : k + 2])
+                )
                 if not noisy and not (astray and rest[k, j] > 2 * near):
                     continue
-                ratio = (f"; its ratio to {names[drive]!r} is {H[k]:.3g}, while its neighbours suggest "
-                         f"{H[k] * np.exp(-off[k]):.3g}" if off[k] else "")
-                yield Finding(self.name, "stop",
-                              f"Record {fit.record} is bad in channel {names[j]!r}: the residual after removing the "
-                              f"sine of {f[k]:.4g} Hz is {100 * rest[k, j]:.3g} % of the sine, in neighbouring records "
-                              f"{100 * near:.2g} %{ratio}. The signal is distorted, clipped or out of range there (see "
-                              "its figure); leave the record out.", (names[j],), (fit.record,), float(rest[k, j]),
-                              float(max(SETTINGS.residual, SETTINGS.residual_factor * near)),
-                              Picture(f"Record {fit.record}, {names[j]}", "time [s]", names[j],
-                                      (Series(names[j], fit.t, fit.traces[:, j]),)))
+                ratio = (
+                    f"; its ratio to {names[drive]!r} is {H[k]:.3g}, while its neighbours suggest "
+                    f"{H[k] * np.exp(-off[k]):.3g}"
+                    if off[k]
+                    else ""
+                )
+                yield Finding(
+                    self.name,
+                    "stop",
+                    f"Record {fit.record} is bad in channel {names[j]!r}: the residual after removing the "
+                    f"sine of {f[k]:.4g} Hz is {100 * rest[k, j]:.3g} % of the sine, in neighbouring records "
+                    f"{100 * near:.2g} %{ratio}. The signal is distorted, clipped or out of range there (see "
+                    "its figure); leave the record out.",
+                    (names[j],),
+                    (fit.record,),
+                    float(rest[k, j]),
+                    float(max(SETTINGS.residual, SETTINGS.residual_factor * near)),
+                    Picture(
+                        f"Record {fit.record}, {names[j]}",
+                        "time [s]",
+                        names[j],
+                        (Series(names[j], fit.t, fit.traces[:, j]),),
+                    ),
+                )
 
 
 def _drive(rest: np.ndarray, live: list[int], n_u: int) -> int:
@@ -147,6 +201,12 @@ def _departure(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _bode(f: np.ndarray, X: np.ndarray, names: tuple[str, ...], live: list[int], drive: int) -> Picture:
-    return Picture(f"Amplitude of each channel by {names[drive]}", "frequency [Hz]", "ratio [-]",
-                   tuple(Series(names[j], f, np.abs(X[:, j] / X[:, drive]), "points") for j in live if j != drive),
-                   (Limit("proportional", 1.0),), "log", "log")
+    return Picture(
+        f"Amplitude of each channel by {names[drive]}",
+        "frequency [Hz]",
+        "ratio [-]",
+        tuple(Series(names[j], f, np.abs(X[:, j] / X[:, drive]), "points") for j in live if j != drive),
+        (Limit("proportional", 1.0),),
+        "log",
+        "log",
+    )

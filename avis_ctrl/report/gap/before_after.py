@@ -42,11 +42,24 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
     for title, reduce in (("Mean of all channels", _mean), ("Worst channel of each band", _worst)):
         curves = [Curve(*steps(edges, reduce(values)), label, style) for label, values, style in sides]
         curves.append(level(edges[0], edges[-1], 1.0, "noise alone", NOISE))
-        panels.append(Panel(hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log"),
-                            tuple(curves), (), title))
-    return Figure("gap_spectrum", "The gap on held-out data: power of the residual relative to that of the "
-                  "measured noise, by frequency band. For a complete model the mean is 1, and the worst of "
-                  f"{heat.before.shape[1]} channels is a little above.", tuple(panels), 2, 0.95)
+        panels.append(
+            Panel(
+                hertz(float(edges[0]), float(edges[-1])),
+                Axis("residual / noise power [-]", "log"),
+                tuple(curves),
+                (),
+                title,
+            )
+        )
+    return Figure(
+        "gap_spectrum",
+        "The gap on held-out data: power of the residual relative to that of the "
+        "measured noise, by frequency band. For a complete model the mean is 1, and the worst of "
+        f"{heat.before.shape[1]} channels is a little above.",
+        tuple(panels),
+        2,
+        0.95,
+    )
 
 
 def edges_of(heat: HeatMap) -> np.ndarray:
@@ -73,13 +86,21 @@ def ladder(gap: Gap) -> Figure:
     noise = 100 * gap.noise_nrmse
     low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
     limits = float(10 ** np.floor(np.log10(low))), high
-    bars = Curve(place, np.where(np.isfinite(values) & (values > 0), values, np.nan), "error of the model",
-                 Style("#8fbbdc"), line=False, bars=0.6)
+    bars = Curve(
+        place,
+        np.where(np.isfinite(values) & (values > 0), values, np.nan),
+        "error of the model",
+        Style("#8fbbdc"),
+        line=False,
+        bars=0.6,
+    )
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
-    return Figure("ladder", "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. "
-                  "Logarithmic scale.",
-                  (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits),
-                         (bars, *lines)),), height=0.7)
+    return Figure(
+        "ladder",
+        "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. Logarithmic scale.",
+        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), (bars, *lines)),),
+        height=0.7,
+    )
 
 
 def rung(name: str, k: int) -> str:
@@ -91,49 +112,70 @@ def _stages(gap: Gap) -> Table:
     rows = []
     for k, one in enumerate(gap.stages):
         over = one.nrmse / gap.noise_nrmse if gap.noise_nrmse > 0 else np.nan
-        rows.append((rung(one.name, k), words.percent(one.nrmse), words.number(over), words.number(
-            one.chi2_per_dof, 4)))
+        rows.append(
+            (rung(one.name, k), words.percent(one.nrmse), words.number(over), words.number(one.chi2_per_dof, 4))
+        )
     if np.isfinite(gap.noise_nrmse):
         rows.append(("noise alone", words.percent(gap.noise_nrmse), "1", "1"))
-    return table("Each model is fitted to the same records; the figures are those of records or periods that no fit "
-                 f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
-                 "relative to that of the measured outputs.",
-                 ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"), rows)
+    return table(
+        "Each model is fitted to the same records; the figures are those of records or periods that no fit "
+        f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
+        "relative to that of the measured outputs.",
+        ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"),
+        rows,
+    )
 
 
 def responses(seen: GapOverlay, named: bool) -> list[Piece]:
     """Description and figure of the input-output pairs that disagree most."""
     pairs, who = worst_pairs(seen), "updated" if named else "re-identified"
-    text = (f"Frequency responses from records {', '.join(seen.records)}, some of which were fitted. Points: "
-            f"{seen.method}. The figure shows the {len(pairs)} paths with the largest error of the re-identified "
-            "model, in standard deviations of the measured response; each path has a different output.")
+    text = (
+        f"Frequency responses from records {', '.join(seen.records)}, some of which were fitted. Points: "
+        f"{seen.method}. The figure shows the {len(pairs)} paths with the largest error of the re-identified "
+        "model, in standard deviations of the measured response; each path has a different output."
+    )
     if seen.method.startswith(BESIDE):
-        text += (" From these records, no response can be estimated without a model. The points are therefore the "
-                 f"linear part of the {who} model plus its residual, regressed on the inputs in windows of spectral "
-                 "lines. They depend on that model: a model error narrower than a window is visible only in the "
-                 "residual above.")
+        text += (
+            " From these records, no response can be estimated without a model. The points are therefore the "
+            f"linear part of the {who} model plus its residual, regressed on the inputs in windows of spectral "
+            "lines. They depend on that model: a model error narrower than a window is visible only in the "
+            "residual above."
+        )
     if seen.simulated:
-        text += (f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response. "
-                 "That of the updated model is therefore estimated in the same way as the measured one, from a "
-                 "simulation of the same records.")
+        text += (
+            f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response. "
+            "That of the updated model is therefore estimated in the same way as the measured one, from a "
+            "simulation of the same records."
+        )
     if seen.left_out:
         names = words.joined(list(map(wording.titled, seen.left_out)))
-        text += (f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
-                 "no frequency response.")
-    points = (f"the {who} model's response plus its residual, regressed on the inputs (points)"
-              if seen.method.startswith(BESIDE) else "measured (points)")
+        text += (
+            f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
+            "no frequency response."
+        )
+    points = (
+        f"the {who} model's response plus its residual, regressed on the inputs (points)"
+        if seen.method.startswith(BESIDE)
+        else "measured (points)"
+    )
     models = [("re-identified", seen.baseline, BEFORE)] + ([("updated", seen.updated, AFTER)] if named else [])
     panels = [draw(seen, i, j, models) for i, j in pairs for draw in (magnitude, difference)]
-    figure = Figure("gap_responses", f"Left: magnitude, {points} with a band of two standard deviations to "
-                    "each side. Right: magnitude of the complex difference between measured and model; with noise "
-                    "alone 86 % of the points lie below the dotted line.", tuple(panels), 2, 0.68)
+    figure = Figure(
+        "gap_responses",
+        f"Left: magnitude, {points} with a band of two standard deviations to "
+        "each side. Right: magnitude of the complex difference between measured and model; with noise "
+        "alone 86 % of the points lie below the dotted line.",
+        tuple(panels),
+        2,
+        0.68,
+    )
     return [Paragraph(text), figure]
 
 
 def worst_pairs(seen: GapOverlay) -> list[tuple[int, int]]:
     """The worst outputs, each with its worst input, by mean squared error of the re-identified model over variance."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std ** 2
+        far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std**2
     size = np.mean(np.where(np.isfinite(far), far, 0.0), axis=0)
     best = [(i, max(drives(seen), key=lambda j: size[i, j])) for i in range(len(seen.outputs))]
     return sorted(best, key=lambda pair: -size[pair])[:PAIRS]

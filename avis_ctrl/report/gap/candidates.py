@@ -17,17 +17,31 @@ def candidates(found: GapFinding) -> Section:
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     if not ranked:
         return Section("Rejected candidates", "considered", (Paragraph(_none(found)),))
-    header = ("candidate", "chi-square / dof", "odds", "best size",
-              "why it was not named")
-    rows = [(wording.candidate(one), words.number(one.chi2_per_dof, 4), wording.probability(one.probability),
-             wording.quantities(one.parameters, MOST) or "not stated", one.reason) for one in ranked]
-    pieces: list[Piece] = [table("Candidates that were fitted together with all parameters of the rig, and the reason "
-                                 "for rejection. Chi-square is that of selected lines of the held-out records, dense "
-                                 "at the resonances, and differs from that of all lines.",
-                                 header, rows[:FIRST], "lrrll")]
+    header = ("candidate", "chi-square / dof", "odds", "best size", "why it was not named")
+    rows = [
+        (
+            wording.candidate(one),
+            words.number(one.chi2_per_dof, 4),
+            wording.probability(one.probability),
+            wording.quantities(one.parameters, MOST) or "not stated",
+            one.reason,
+        )
+        for one in ranked
+    ]
+    pieces: list[Piece] = [
+        table(
+            "Candidates that were fitted together with all parameters of the rig, and the reason "
+            "for rejection. Chi-square is that of selected lines of the held-out records, dense "
+            "at the resonances, and differs from that of all lines.",
+            header,
+            rows[:FIRST],
+            "lrrll",
+        )
+    ]
     if rows[FIRST:]:
-        pieces.append(Fold(f"{len(rows) - FIRST} more candidates",
-                           (table("The others.", header, rows[FIRST:], "lrrll"),)))
+        pieces.append(
+            Fold(f"{len(rows) - FIRST} more candidates", (table("The others.", header, rows[FIRST:], "lrrll"),))
+        )
     return Section("Rejected candidates", "considered", tuple(pieces))
 
 

@@ -22,8 +22,11 @@ def measurement(found: GapFinding) -> Section:
     """The records, and their division into fitted and held-out ones."""
     use = {one.name: "held out" if one.held_out else "fitted" for one in found.gap.records}
     how = found.gap.held_out.rstrip(".")
-    return Section("Measurement", "measurement", (records(found.measured, use, f"Held out: {how}" if how else ""),
-                                                  *remarks(found.measured)))
+    return Section(
+        "Measurement",
+        "measurement",
+        (records(found.measured, use, f"Held out: {how}" if how else ""), *remarks(found.measured)),
+    )
 
 
 def document(found: GapFinding) -> Document:
@@ -32,7 +35,14 @@ def document(found: GapFinding) -> Document:
     sections += [part for part in (controller(found),) if part is not None]
     sections += [measurement(found), gates(found.findings), method(found.gap)]
     told = {"seed": found.gap.seed, "seconds": found.gap.seconds, **found.provenance}
-    sections.append(provenance_table(told, "The same measurement, rig, options, seed, library versions and "
-                                     "processor give the same figures."))
-    return document_of(f"Gap between simulation and measurement of the rig {found.gap.baseline.rig.name}",
-                       "Where they disagree, and which effects the model misses", found.provenance, sections)
+    sections.append(
+        provenance_table(
+            told, "The same measurement, rig, options, seed, library versions and processor give the same figures."
+        )
+    )
+    return document_of(
+        f"Gap between simulation and measurement of the rig {found.gap.baseline.rig.name}",
+        "Where they disagree, and which effects the model misses",
+        found.provenance,
+        sections,
+    )

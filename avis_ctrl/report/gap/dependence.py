@@ -23,22 +23,31 @@ class DependenceSettings:
 
 
 SETTINGS = DependenceSettings()
-LOOKS = {"model": ("model, linear in measured inputs", Style("#222222", "solid", 1.4)),
-         "missing": ("linear, missing from the model", Style("#d55e00", "dash", 1.8)),
-         "nonlinear": ("not linear (amplitude, time)", Style("#009e73", "solid", 1.8)),
-         "unmeasured": ("unmeasured inputs", Style("#0072b2", "dashdot", 1.6)),
-         "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6))}
-COLUMNS = {"model": "model", "missing": "linear, not in the model", "nonlinear": "not linear",
-           "unmeasured": "unmeasured inputs", "sensors": "sensors' noise"}
-HOW = {"silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; any power of the "
-                 "excited lines beyond this and beyond a linear response is counted as not linear.",
-       "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
-                 "terms, is therefore attributed to noise and unmeasured inputs, which do not grow with the drives; "
-                 "any additional residual at a higher level is not linear. Nonlinearity at the lowest level that is "
-                 "not in the model counts as unmeasured inputs.",
-       "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
-                    "from nonlinearity that is not in the model: \"not linear\" contains only the model's own "
-                    "nonlinear terms, and \"unmeasured inputs\" all else that does not follow the drives linearly."}
+LOOKS = {
+    "model": ("model, linear in measured inputs", Style("#222222", "solid", 1.4)),
+    "missing": ("linear, missing from the model", Style("#d55e00", "dash", 1.8)),
+    "nonlinear": ("not linear (amplitude, time)", Style("#009e73", "solid", 1.8)),
+    "unmeasured": ("unmeasured inputs", Style("#0072b2", "dashdot", 1.6)),
+    "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6)),
+}
+COLUMNS = {
+    "model": "model",
+    "missing": "linear, not in the model",
+    "nonlinear": "not linear",
+    "unmeasured": "unmeasured inputs",
+    "sensors": "sensors' noise",
+}
+HOW = {
+    "silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; any power of the "
+    "excited lines beyond this and beyond a linear response is counted as not linear.",
+    "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
+    "terms, is therefore attributed to noise and unmeasured inputs, which do not grow with the drives; "
+    "any additional residual at a higher level is not linear. Nonlinearity at the lowest level that is "
+    "not in the model counts as unmeasured inputs.",
+    "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
+    'from nonlinearity that is not in the model: "not linear" contains only the model\'s own '
+    'nonlinear terms, and "unmeasured inputs" all else that does not follow the drives linearly.',
+}
 
 
 def dependence(found: GapFinding) -> Section:
@@ -50,21 +59,35 @@ def dependence(found: GapFinding) -> Section:
     else:
         pieces.append(Paragraph("The residual of single records was not computed.", "note"))
     pieces.append(Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"))
-    pieces += coherence(gap.shares) if gap.shares else [
-        Paragraph("No fractions of power were computed: the driven records have too few lines for their inputs.",
-                  "note")]
+    pieces += (
+        coherence(gap.shares)
+        if gap.shares
+        else [
+            Paragraph(
+                "No fractions of power were computed: the driven records have too few lines for their inputs.", "note"
+            )
+        ]
+    )
     return Section("Level, time and coherence", "dependence", tuple(pieces))
 
 
 def by_record(gap: Gap) -> Figure:
     """Residual over noise of every record, by level and by time; filled markers for held-out records."""
-    panels = (_panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
-              _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s))
-    return Figure("gap_records", "Residual of each record, relative to the noise. Filled: held-out records; open: "
-                  "fitted. A missing linear effect gives an error in proportion to the level. An error that is the "
-                  "same at every level is noise; an error that grows in any other way depends on amplitude. A slope "
-                  "over time is drift. The frequency lines are a random selection, dense near resonances, the same for "
-                  "all records: these values differ from those of all lines in the table of stages.", panels, 2, 0.85)
+    panels = (
+        _panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
+        _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s),
+    )
+    return Figure(
+        "gap_records",
+        "Residual of each record, relative to the noise. Filled: held-out records; open: "
+        "fitted. A missing linear effect gives an error in proportion to the level. An error that is the "
+        "same at every level is noise; an error that grows in any other way depends on amplitude. A slope "
+        "over time is drift. The frequency lines are a random selection, dense near resonances, the same for "
+        "all records: these values differ from those of all lines in the table of stages.",
+        panels,
+        2,
+        0.85,
+    )
 
 
 def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:
@@ -75,8 +98,17 @@ def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> P
     for label, style, value in sides:
         for held, word in ((False, "fitted"), (True, "held out")):
             some = [one for one in gap.records if one.held_out == held]
-            curves.append(Curve(np.array([of(one) for one in some]), np.array([value(one) for one in some]),
-                                f"{label}, {word}", Style(style.colour), points=True, line=False, hollow=not held))
+            curves.append(
+                Curve(
+                    np.array([of(one) for one in some]),
+                    np.array([value(one) for one in some]),
+                    f"{label}, {word}",
+                    Style(style.colour),
+                    points=True,
+                    line=False,
+                    hollow=not held,
+                )
+            )
     low, high = _limits([of(one) for one in gap.records])
     curves.append(level(low, high, 1.0, "noise alone", NOISE))
     values = np.array([1.0, *(v for one in gap.records for v in (one.before, one.after))])
@@ -100,13 +132,18 @@ def coherence(shares: tuple[PowerShares, ...]) -> list[Piece]:
 
 
 def _explained(one: PowerShares) -> str:
-    unknown = "" if "sensors" in one.shares else (" The sensors' own noise is not known by itself and counts as "
-                                                  "unmeasured inputs.")
+    unknown = (
+        ""
+        if "sensors" in one.shares
+        else (" The sensors' own noise is not known by itself and counts as unmeasured inputs.")
+    )
     narrow = float(np.min(np.diff(one.bands_Hz)))
-    return (f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear means the "
-            "response of the model, with up to two poles moved, plus any response to the measured inputs that is "
-            f"smooth over a band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) "
-            "is partly counted as not linear.")
+    return (
+        f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear means the "
+        "response of the model, with up to two poles moved, plus any response to the measured inputs that is "
+        f"smooth over a band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) "
+        "is partly counted as not linear."
+    )
 
 
 def figure(one: PowerShares, name: str) -> Figure:
@@ -117,14 +154,30 @@ def figure(one: PowerShares, name: str) -> Figure:
     low = float(10 ** np.floor(np.log10(positive.min(initial=0.1))))
     panels = []
     for k, output in enumerate(one.outputs):
-        curves = tuple(Curve(*steps(edges, _drawn(one.shares[key][:, k])), label, style)
-                       for key, (label, style) in LOOKS.items() if key in one.shares)
-        panels.append(Panel(hertz(float(edges[0]), float(edges[-1])),
-                            Axis("fraction of the power [-]", "log", (low, 2.0)), curves, (), output))
+        curves = tuple(
+            Curve(*steps(edges, _drawn(one.shares[key][:, k])), label, style)
+            for key, (label, style) in LOOKS.items()
+            if key in one.shares
+        )
+        panels.append(
+            Panel(
+                hertz(float(edges[0]), float(edges[-1])),
+                Axis("fraction of the power [-]", "log", (low, 2.0)),
+                curves,
+                (),
+                output,
+            )
+        )
     records = ", ".join(one.records)
-    return Figure(name, f"What accounts for the power of each output at {words.number(one.level_V)} V r.m.s. "
-                  f"({one.excitation}, records {records}), by frequency; the fractions of a band add up to 1. A line "
-                  "that ends is below what can be determined.", tuple(panels), 2, 0.72)
+    return Figure(
+        name,
+        f"What accounts for the power of each output at {words.number(one.level_V)} V r.m.s. "
+        f"({one.excitation}, records {records}), by frequency; the fractions of a band add up to 1. A line "
+        "that ends is below what can be determined.",
+        tuple(panels),
+        2,
+        0.72,
+    )
 
 
 def _drawn(share: np.ndarray) -> np.ndarray:
@@ -134,7 +187,14 @@ def _drawn(share: np.ndarray) -> np.ndarray:
 def _whole(one: PowerShares) -> Table:
     """Fractions of the power over all bands together."""
     keys = [key for key in LOOKS if key in one.whole]
-    rows = [(output, *(words.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
-            for k, output in enumerate(one.outputs)]
-    return table(f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
-                 "lies at the resonances.", ("output", *(COLUMNS[key] for key in keys)), rows, "l" + "r" * len(keys))
+    rows = [
+        (output, *(words.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
+        for k, output in enumerate(one.outputs)
+    ]
+    return table(
+        f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
+        "lies at the resonances.",
+        ("output", *(COLUMNS[key] for key in keys)),
+        rows,
+        "l" + "r" * len(keys),
+    )

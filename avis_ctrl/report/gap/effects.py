@@ -27,8 +27,11 @@ def parameters(found: GapFinding) -> Section:
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
         groups = inseparable_parameters(gap.baseline)
-        pieces.append(Fold(f"The rig's own parameters, re-identified{both}",
-                           (_rig(gap, groups), *_together(groups), *_always(gap))))
+        pieces.append(
+            Fold(
+                f"The rig's own parameters, re-identified{both}", (_rig(gap, groups), *_together(groups), *_always(gap))
+            )
+        )
     return Section("Parameters", "parameters", (*pieces, *tolerances(gap.tolerances)))
 
 
@@ -38,12 +41,24 @@ def _sizes(gap: Gap) -> Table:
         for name, p in one.parameters.items():
             value, sigma = words.with_std(p.value, p.std)
             known = np.isfinite(p.std) and p.std > 0
-            rows.append((one.name, one.location, name, value, f"± {sigma}" if known else "none",
-                         "" if p.unit == "1" else words.unit(p.unit)))
-    return table("Parameters of the named effects. Those of the table are fitted together with all parameters of the "
-                 "rig and all tolerances. Their standard deviation includes the noise and what no effect explains. "
-                 "Those of hum, converters and floor are from the records themselves.",
-                 ("effect", "place", "parameter", "value", "± 1 σ", "unit"), rows, "lllrrl")
+            rows.append(
+                (
+                    one.name,
+                    one.location,
+                    name,
+                    value,
+                    f"± {sigma}" if known else "none",
+                    "" if p.unit == "1" else words.unit(p.unit),
+                )
+            )
+    return table(
+        "Parameters of the named effects. Those of the table are fitted together with all parameters of the "
+        "rig and all tolerances. Their standard deviation includes the noise and what no effect explains. "
+        "Those of hum, converters and floor are from the records themselves.",
+        ("effect", "place", "parameter", "value", "± 1 σ", "unit"),
+        rows,
+        "lllrrl",
+    )
 
 
 def _as_text(one: NamedEffect) -> str:
@@ -77,11 +92,16 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
         middle = (words.number(value, 5), shown, spread, change) if gap.effects else (shown, spread)
         rows.append((name, *middle, words.unit(units[name])))
     if not gap.effects:
-        return table("The rig's own parameters as re-identified.", ("parameter", "value", "± 1 σ", "unit"), rows,
-                     "lrrl")
-    return table("A model without the effect is fitted with biased parameters; the change shows by how much. "
-                 "A large change is no error: it may lie along a direction that the data hardly determine.",
-                 ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"), rows, "lrrrrl")
+        return table(
+            "The rig's own parameters as re-identified.", ("parameter", "value", "± 1 σ", "unit"), rows, "lrrl"
+        )
+    return table(
+        "A model without the effect is fitted with biased parameters; the change shows by how much. "
+        "A large change is no error: it may lie along a direction that the data hardly determine.",
+        ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"),
+        rows,
+        "lrrrrl",
+    )
 
 
 def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
@@ -89,25 +109,41 @@ def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
     if not groups:
         return []
     told = "; ".join(words.joined(list(group)) for group in groups)
-    return [Paragraph(f"No record can determine {told} individually, only in combination. Their individual values "
-                      "follow from the combination and the rig file.", "note")]
+    return [
+        Paragraph(
+            f"No record can determine {told} individually, only in combination. Their individual values "
+            "follow from the combination and the rig file.",
+            "note",
+        )
+    ]
 
 
 def _always(gap: Gap) -> list[Piece]:
     """Second-order terms of large rotations, which are part of every model and not an effect."""
-    own = [(name, value) for name, value in zip(gap.updated.names, gap.updated.values, strict=True)
-           if name.startswith(f"{LargeMotion.name}@")]
+    own = [
+        (name, value)
+        for name, value in zip(gap.updated.names, gap.updated.values, strict=True)
+        if name.startswith(f"{LargeMotion.name}@")
+    ]
     if not own:
         return []
     sigma = _deviations(gap)
     told = []
     for name, value in own:
         size, spread = words.with_std(value, sigma.get(name, np.nan))
-        told.append(f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}" if name in sigma else
-                    f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}")
-    return [Paragraph("Every model, with or without a named effect, also contains the second-order terms of large "
-                      "rotations, which exist in every table. Their factors, 0 or 1 in theory, are fitted as well and "
-                      f"are often poorly determined: {'; '.join(told)}.", "note")]
+        told.append(
+            f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}"
+            if name in sigma
+            else f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}"
+        )
+    return [
+        Paragraph(
+            "Every model, with or without a named effect, also contains the second-order terms of large "
+            "rotations, which exist in every table. Their factors, 0 or 1 in theory, are fitted as well and "
+            f"are often poorly determined: {'; '.join(told)}.",
+            "note",
+        )
+    ]
 
 
 def _deviations(gap: Gap) -> dict[str, float]:

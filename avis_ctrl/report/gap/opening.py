@@ -15,9 +15,11 @@ from avis_ctrl.study.gap import GapFinding
 
 # Maximum number of an effect's parameters in a row; the section on parameters lists all.
 MOST = 5
-CHANCES = (" The probability takes into account the other candidates, the tolerances, and causes outside the library; "
-           "for hum, a converter and floor motion it is one minus the p-value of the signal. No probability above 99 % "
-           "is stated.")
+CHANCES = (
+    " The probability takes into account the other candidates, the tolerances, and causes outside the library; "
+    "for hum, a converter and floor motion it is one minus the p-value of the signal. No probability above 99 % "
+    "is stated."
+)
 
 
 def opening(found: GapFinding) -> Section:
@@ -38,8 +40,9 @@ def opening(found: GapFinding) -> Section:
     pieces.append(Paragraph(f"What to measure next: {next_step(found)}"))
     warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
     if warned:
-        pieces.append(Paragraph(f"Gates that warned of the records: {words.joined(warned)}; see the section on gates.",
-                                "note"))
+        pieces.append(
+            Paragraph(f"Gates that warned of the records: {words.joined(warned)}; see the section on gates.", "note")
+        )
     return Section("Summary", "result", tuple(pieces), alone=True)
 
 
@@ -48,10 +51,16 @@ def sentence(gap: Gap) -> str:
     if gap.sentences:
         return wording.said(gap.sentences[0])
     if not gap.effects:
-        return ("No disagreement beyond the measured noise." if gap.verdict == "none" else
-                "A significant disagreement that no effect of the library accounts for.")
-    return " ".join(f"{wording.titled(one.name).capitalize()} at {one.location}: {wording.quantities(one.parameters)}; "
-                    f"probability {wording.probability(one.probability)}." for one in gap.effects)
+        return (
+            "No disagreement beyond the measured noise."
+            if gap.verdict == "none"
+            else "A significant disagreement that no effect of the library accounts for."
+        )
+    return " ".join(
+        f"{wording.titled(one.name).capitalize()} at {one.location}: {wording.quantities(one.parameters)}; "
+        f"probability {wording.probability(one.probability)}."
+        for one in gap.effects
+    )
 
 
 def in_numbers(gap: Gap) -> str:
@@ -79,24 +88,38 @@ def _reference(gap: Gap) -> float:
 
 def _group(one: NamedEffect) -> str:
     names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
-    return (f"These records cannot distinguish {words.joined(names)}. The missing effect is one of them; the section "
-            "on what to measure next names the record that would decide.")
+    return (
+        f"These records cannot distinguish {words.joined(names)}. The missing effect is one of them; the section "
+        "on what to measure next names the record that would decide."
+    )
 
 
 def _stage(name: str) -> str:
-    return {"nominal": "with the values of the rig file", "re-identified": "after re-identification",
-            "tolerances": "with all tolerances"}.get(name, f"with {wording.titled(name)}")
+    return {
+        "nominal": "with the values of the rig file",
+        "re-identified": "after re-identification",
+        "tolerances": "with all tolerances",
+    }.get(name, f"with {wording.titled(name)}")
 
 
 def named(gap: Gap | AxisGap, remark: str) -> Table:
     """The named effects with their sizes, traces (very small effects) last. remark : on their probabilities."""
-    rows = [(f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}", one.location,
-             wording.quantities(one.parameters, MOST), words.percent(np.nan if one.share is None else one.share),
-             wording.probability(one.probability),
-             ", ".join(map(wording.titled, one.indistinguishable_from)) or "none")
-            for one in (*gap.effects, *gap.traces)]
-    return table("Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
-                 "held-out data if only this effect is removed, divided by the residual power beyond noise of the "
-                 f"model without effects. Effects below 1 % are called traces.{remark}",
-                 ("effect", "place", "size", "fraction of the gap", "probability", "indistinguishable from"), rows,
-                 "lllrrl")
+    rows = [
+        (
+            f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}",
+            one.location,
+            wording.quantities(one.parameters, MOST),
+            words.percent(np.nan if one.share is None else one.share),
+            wording.probability(one.probability),
+            ", ".join(map(wording.titled, one.indistinguishable_from)) or "none",
+        )
+        for one in (*gap.effects, *gap.traces)
+    ]
+    return table(
+        "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
+        "held-out data if only this effect is removed, divided by the residual power beyond noise of the "
+        f"model without effects. Effects below 1 % are called traces.{remark}",
+        ("effect", "place", "size", "fraction of the gap", "probability", "indistinguishable from"),
+        rows,
+        "lllrrl",
+    )

@@ -36,8 +36,12 @@ def places(found: GapFinding) -> Section:
 
 def _nowhere(gap: Gap) -> str:
     if gap.verdict == "none":
-        return ("No effect is named. The bands in which the residual exceeds the noise are listed in the section on "
-                "the residual." if gap.remaining else "No band of any channel exceeds the noise significantly.")
+        return (
+            "No effect is named. The bands in which the residual exceeds the noise are listed in the section on "
+            "the residual."
+            if gap.remaining
+            else "No band of any channel exceeds the noise significantly."
+        )
     return "The places of the gap were not stated."
 
 
@@ -49,26 +53,41 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     edges, n = edges_of(heat), len(heat.columns)
     rows = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
     sides = [("After re-identification", heat.before)] + ([("With the named effects", heat.after)] if named else [])
-    panels = tuple(Panel(hertz(float(edges[0]), float(edges[-1])), rows, (), (), title,
-                         Heat(edges, np.asarray(values, float).T, "residual / noise power [-]", (LOWEST, top)))
-                   for title, values in sides)
-    return Figure("heat_map", "Power of the residual on held-out data relative to that of the measured noise, by "
-                  "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.", panels,
-                  len(panels), max(0.75, min(2.4, 0.085 * n + 0.25)))
+    panels = tuple(
+        Panel(
+            hertz(float(edges[0]), float(edges[-1])),
+            rows,
+            (),
+            (),
+            title,
+            Heat(edges, np.asarray(values, float).T, "residual / noise power [-]", (LOWEST, top)),
+        )
+        for title, values in sides
+    )
+    return Figure(
+        "heat_map",
+        "Power of the residual on held-out data relative to that of the measured noise, by "
+        "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.",
+        panels,
+        len(panels),
+        max(0.75, min(2.4, 0.085 * n + 0.25)),
+    )
 
 
 def _short(name: str) -> str:
     """A name shortened to fit beside a map."""
-    return name if len(name) <= LETTERS else f"{name[:LETTERS - 1]}…"
+    return name if len(name) <= LETTERS else f"{name[: LETTERS - 1]}…"
 
 
 def table_of(listed: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
-    rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value))
-            for one in listed]
-    return table(f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
-                 "noise power. p-value: probability of such a residual by noise alone, family-wise over all places.",
-                 ("place", "fraction", "over noise", "p-value"), rows)
+    rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value)) for one in listed]
+    return table(
+        f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
+        "noise power. p-value: probability of such a residual by noise alone, family-wise over all places.",
+        ("place", "fraction", "over noise", "p-value"),
+        rows,
+    )
 
 
 def _stated(value: float) -> str:

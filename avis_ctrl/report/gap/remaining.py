@@ -36,11 +36,15 @@ def detectable(gap: Gap) -> Table:
         ends = [ordered[0]] if len(ordered) == 1 else [ordered[0], ordered[-1]]
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, spoken(parameter, unit), size))
-    return table("Detection limits: the size at which an effect would differ from zero by five standard deviations of "
-                 "the fit, at the best and at the worst of its places. Smaller effects may be present. \"Not "
-                 "detectable\": the re-identified parameters of the rig absorb the effect. Effects with a frequency or "
-                 "a shape of their own are not in this table.",
-                 ("effect", "place", "parameter", "detection limit"), rows, "lllr")
+    return table(
+        "Detection limits: the size at which an effect would differ from zero by five standard deviations of "
+        'the fit, at the best and at the worst of its places. Smaller effects may be present. "Not '
+        'detectable": the re-identified parameters of the rig absorb the effect. Effects with a frequency or '
+        "a shape of their own are not in this table.",
+        ("effect", "place", "parameter", "detection limit"),
+        rows,
+        "lllr",
+    )
 
 
 def _seen(one: Detectable) -> str:
@@ -51,20 +55,29 @@ def _seen(one: Detectable) -> str:
 def _left(gap: Gap) -> str:
     """Size of the residual relative to response and noise, and its growth with level."""
     if gap.raised:
-        return (f"The held-out residual is the measured noise. That of {words.joined(list(gap.raised))} is above the "
-                "rig file's ambient level.")
+        return (
+            f"The held-out residual is the measured noise. That of {words.joined(list(gap.raised))} is above the "
+            "rig file's ambient level."
+        )
     left = gap.left
     if left is None:
         return "The residual was not computed."
     after = " with the named effects" if gap.effects else ""
-    level = {True: "It grows faster than the drives: its cause is not linear.",
-             False: "It does not grow faster than the drives.",
-             None: "From these records it is not known whether it grows faster than the drives."}[left.grows_with_level]
-    places = ("The table below lists where it lies." if gap.remaining else
-              f"No band of any channel exceeds the estimated noise significantly{after}.")
-    return (f"On held-out records the residual of the updated model is {words.percent(left.nrmse)} of the response, "
-            f"r.m.s., which is {words.number(left.over_noise)} times the estimated noise. Its power beyond noise is "
-            f"{words.percent(left.share)} of that of the re-identified model. {level} {places}")
+    level = {
+        True: "It grows faster than the drives: its cause is not linear.",
+        False: "It does not grow faster than the drives.",
+        None: "From these records it is not known whether it grows faster than the drives.",
+    }[left.grows_with_level]
+    places = (
+        "The table below lists where it lies."
+        if gap.remaining
+        else f"No band of any channel exceeds the estimated noise significantly{after}."
+    )
+    return (
+        f"On held-out records the residual of the updated model is {words.percent(left.nrmse)} of the response, "
+        f"r.m.s., which is {words.number(left.over_noise)} times the estimated noise. Its power beyond noise is "
+        f"{words.percent(left.share)} of that of the re-identified model. {level} {places}"
+    )
 
 
 def next_step(found: GapFinding) -> str:
@@ -77,6 +90,8 @@ def next_step(found: GapFinding) -> str:
     if gap.verdict in ("partly explained", "unexplained"):
         return "No further measurement was found that would explain more."
     if gap.effects and found.design is None:
-        return ("No further measurement is needed to name the missing effects. avis gap --design shows their influence "
-                "on the controller; avis predict tests the updated model on another campaign.")
+        return (
+            "No further measurement is needed to name the missing effects. avis gap --design shows their influence "
+            "on the controller; avis predict tests the updated model on another campaign."
+        )
     return "No further measurement is needed for this question."

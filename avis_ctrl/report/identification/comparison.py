@@ -24,17 +24,25 @@ def ways(found: Identification) -> Section:
         return Section(TITLE, "ways", (Paragraph(f"{note[:1].upper()}{note[1:]}.", "note"), _sequential(found)))
     pieces: list[Piece] = [_agreement(found, result), _table(found, result)]
     pieces += [_figure(found, result, title, index, k) for k, (title, index) in enumerate(kinds(result).items())]
-    pieces += [_consistency(found, result), Heading("Influence of the filter's tuning"), Bullets(_hidden(result)),
-               _sequential(found)]
+    pieces += [
+        _consistency(found, result),
+        Heading("Influence of the filter's tuning"),
+        Bullets(_hidden(result)),
+        _sequential(found),
+    ]
     return Section(TITLE, "ways", tuple(pieces))
 
 
 def _sequential(found: Identification) -> Paragraph:
     if isinstance(found.start, Halcyonics):
-        return Paragraph("The sequential fit of Beadle et al. was not run here: it needs the displacement per volt "
-                         "from single tests.", "note")
-    return Paragraph("The sequential fit of Beadle et al. is for the spring-suspended table; it does not apply to this "
-                     "rig.", "note")
+        return Paragraph(
+            "The sequential fit of Beadle et al. was not run here: it needs the displacement per volt "
+            "from single tests.",
+            "note",
+        )
+    return Paragraph(
+        "The sequential fit of Beadle et al. is for the spring-suspended table; it does not apply to this rig.", "note"
+    )
 
 
 def _differences(found: Identification, result: EkfResult) -> np.ndarray:
@@ -61,29 +69,44 @@ def _agreement(found: Identification, result: EkfResult) -> Paragraph:
     far = int(np.count_nonzero(np.abs(d[known, 4]) > 3))
     k = int(np.argmax(np.abs(np.where(known, d[:, 4], 0))))
     share = 100 * np.abs(d[:, 2] / np.where(d[:, 0] == 0, np.nan, d[:, 0]) - 1)[known]
-    text = (f"Maximum likelihood and the extended Kalman filter differ by "
-            f"{words.number(float(np.nanmedian(share)), 2)} % in the median over {np.count_nonzero(known)} determined "
-            f"combinations, and by at most {words.number(float(np.nanmax(share)), 2)} %. {far} of them differ by more "
-            f"than 3 standard deviations; the largest difference is {words.number(float(abs(d[k, 4])), 2)} standard "
-            f"deviations, in {found.identifiability.combinations[k].words}.")
+    text = (
+        f"Maximum likelihood and the extended Kalman filter differ by "
+        f"{words.number(float(np.nanmedian(share)), 2)} % in the median over {np.count_nonzero(known)} determined "
+        f"combinations, and by at most {words.number(float(np.nanmax(share)), 2)} %. {far} of them differ by more "
+        f"than 3 standard deviations; the largest difference is {words.number(float(abs(d[k, 4])), 2)} standard "
+        f"deviations, in {found.identifiability.combinations[k].words}."
+    )
     broken = [name for name, one in zip(_names(found, result), result.innovations, strict=True) if not one.consistent]
     if broken:
-        text += (f" The filter's innovations do not agree with its covariance in record{'s' * (len(broken) > 1)} "
-                 f"{words.joined(broken)}: its standard deviations are too small.")
+        text += (
+            f" The filter's innovations do not agree with its covariance in record{'s' * (len(broken) > 1)} "
+            f"{words.joined(broken)}: its standard deviations are too small."
+        )
     return Paragraph(text, "verdict", far == 0 and not broken)
 
 
 def _table(found: Identification, result: EkfResult) -> Table:
     rows = []
-    for one, (value, sigma, other, spread, apart) in zip(found.identifiability.combinations,
-                                                         _differences(found, result), strict=True):
+    for one, (value, sigma, other, spread, apart) in zip(
+        found.identifiability.combinations, _differences(found, result), strict=True
+    ):
         first, second = words.with_std(value, sigma), words.with_std(other, spread)
-        rows.append((one.words, *(first if one.determined else (first[0], "not determined")), *second,
-                     f"{apart:+.1f}" if np.isfinite(apart) else "",
-                     words.unit(one.unit) if one.unit != "1" else ""))
-    return table("Estimates of each combination by both methods. The difference is divided by the root of the sum of "
-                 "both variances. Because both use the same data, it should be smaller than for independent data.",
-                 ("combination", "likelihood", "± 1 σ", "Kalman", "± 1 σ", "difference [σ]", "unit"), rows, "lrrrrrl")
+        rows.append(
+            (
+                one.words,
+                *(first if one.determined else (first[0], "not determined")),
+                *second,
+                f"{apart:+.1f}" if np.isfinite(apart) else "",
+                words.unit(one.unit) if one.unit != "1" else "",
+            )
+        )
+    return table(
+        "Estimates of each combination by both methods. The difference is divided by the root of the sum of "
+        "both variances. Because both use the same data, it should be smaller than for independent data.",
+        ("combination", "likelihood", "± 1 σ", "Kalman", "± 1 σ", "difference [σ]", "unit"),
+        rows,
+        "lrrrrrl",
+    )
 
 
 def _figure(found: Identification, result: EkfResult, title: str, index: list[int], number: int) -> Figure:
@@ -102,18 +125,31 @@ def _figure(found: Identification, result: EkfResult, title: str, index: list[in
         edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
         x = np.array([v for b in edges for v in (b, b, np.nan)])
         y = np.array([v for _ in edges for v in (*ends, np.nan)])
-        drawn = [Curve(t, curves.theta[:, k], "estimate", ESTIMATE),
-                 Curve(np.array(frame), np.array([likely, likely]), "maximum likelihood", LIKELY),
-                 Curve(x, y, "a record begins", RECORDS)]
+        drawn = [
+            Curve(t, curves.theta[:, k], "estimate", ESTIMATE),
+            Curve(np.array(frame), np.array([likely, likely]), "maximum likelihood", LIKELY),
+            Curve(x, y, "a record begins", RECORDS),
+        ]
         band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
         known = "" if information.known[information.names.index(name)] else " *"
-        panels.append(Panel(Axis("time in the records [s]", "linear", frame),
-                            Axis(f"[{words.unit(result.units[k])}]", "linear", ends), tuple(drawn), (band,),
-                            f"{name}{known}"))
-    return Figure(f"kalman_{number}", f"{title}: the extended Kalman filter's estimate against time, as in "
-                  "figs. 3.1 to 3.3 of Rademakers; the first second, with the far wider band of the prior, is not "
-                  "shown. A parameter marked * is known only in combination; its own value depends on the prior.",
-                  tuple(panels), min(3, len(panels)), 0.62)
+        panels.append(
+            Panel(
+                Axis("time in the records [s]", "linear", frame),
+                Axis(f"[{words.unit(result.units[k])}]", "linear", ends),
+                tuple(drawn),
+                (band,),
+                f"{name}{known}",
+            )
+        )
+    return Figure(
+        f"kalman_{number}",
+        f"{title}: the extended Kalman filter's estimate against time, as in "
+        "figs. 3.1 to 3.3 of Rademakers; the first second, with the far wider band of the prior, is not "
+        "shown. A parameter marked * is known only in combination; its own value depends on the prior.",
+        tuple(panels),
+        min(3, len(panels)),
+        0.62,
+    )
 
 
 def _names(found: Identification, result: EkfResult) -> list[str]:
@@ -128,24 +164,36 @@ def _consistency(found: Identification, result: EkfResult) -> Table:
     for name, one in zip(_names(found, result), result.innovations, strict=True):
         n_y = one.autocorrelation.shape[1]
         low, high = (v / n_y for v in one.nis_interval)
-        rows.append((name, words.number(one.nis_per_output, 4), f"{low:.4f} to {high:.4f}",
-                     f"{words.number(100 * one.outside, 2)} %",
-                     yes_or_no(one.consistent)))
-    return table("Innovations of the filter: mean normalised square per output, the interval that contains 99.9 % of "
-                 "such means for a consistent filter, and the fraction of autocorrelations outside the 95 % limits of "
-                 "white noise. If the innovations are larger than the filter's covariance predicts, its standard "
-                 "deviations are too small.",
-                 ("record", "mean square", "expected", "beyond the bound", "consistent"), rows, "lrrrc")
+        rows.append(
+            (
+                name,
+                words.number(one.nis_per_output, 4),
+                f"{low:.4f} to {high:.4f}",
+                f"{words.number(100 * one.outside, 2)} %",
+                yes_or_no(one.consistent),
+            )
+        )
+    return table(
+        "Innovations of the filter: mean normalised square per output, the interval that contains 99.9 % of "
+        "such means for a consistent filter, and the fraction of autocorrelations outside the 95 % limits of "
+        "white noise. If the innovations are larger than the filter's covariance predicts, its standard "
+        "deviations are too small.",
+        ("record", "mean square", "expected", "beyond the bound", "consistent"),
+        rows,
+        "lrrrc",
+    )
 
 
 def _hidden(result: EkfResult) -> tuple[str, ...]:
     s = result.settings
-    said = ["Measurement noise: the sensor noise and converter of the rig file.",
-            "Process noise: the rig file's ambient floor motion, transmitted by the isolators. It is too small for a "
-            "record with stronger floor motion.",
-            f"Prior: standard deviation {100 * s.prior_share:g} % of each starting value. A parameter that the data do "
-            "not determine keeps this band; the band then depends on the prior only, not on the rig.",
-            f"The covariance is kept from record to record, after {s.warm_up} record of warm-up for the linearisation."]
+    said = [
+        "Measurement noise: the sensor noise and converter of the rig file.",
+        "Process noise: the rig file's ambient floor motion, transmitted by the isolators. It is too small for a "
+        "record with stronger floor motion.",
+        f"Prior: standard deviation {100 * s.prior_share:g} % of each starting value. A parameter that the data do "
+        "not determine keeps this band; the band then depends on the prior only, not on the rig.",
+        f"The covariance is kept from record to record, after {s.warm_up} record of warm-up for the linearisation.",
+    ]
     held = [name for name, count in zip(result.names, result.guarded, strict=True) if count]
     if held:
         said.append(f"The lower limit of the parameters was reached by {words.joined(held)}.")

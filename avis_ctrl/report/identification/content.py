@@ -20,9 +20,23 @@ from avis_ctrl.study.identified_uncertainty import InDesign
 def document(found: Identification, in_design: InDesign | None = None) -> Document:
     """The report of an identification. in_design : the uncertainty model for a design, if it was computed."""
     return document_of(
-        f"Identification of the rig {found.rig.name}", "From measurements to a rig with known uncertainty",
-        found.provenance, (opening(found), parameters(found), measurements(found), gates(found.findings),
-                           responses(found), identifiability(found), ways(found), validation(found),
-                           uncertainty(found, in_design), method(found),
-                           provenance_table(found.provenance, "The same measurement, rig, options, seed, library "
-                                            "versions and processor give the same figures.")))
+        f"Identification of the rig {found.rig.name}",
+        "From measurements to a rig with known uncertainty",
+        found.provenance,
+        (
+            opening(found),
+            parameters(found),
+            measurements(found),
+            gates(found.findings),
+            responses(found),
+            identifiability(found),
+            ways(found),
+            validation(found),
+            uncertainty(found, in_design),
+            method(found),
+            provenance_table(
+                found.provenance,
+                "The same measurement, rig, options, seed, library versions and processor give the same figures.",
+            ),
+        ),
+    )

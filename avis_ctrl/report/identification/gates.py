@@ -12,8 +12,12 @@ from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Limit, Pict
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, log_range, numbered
 from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, table
 
-MARKS: dict[str, Cell] = {"ok": Mark("ok", True), "note": "note", "warning": Mark("WARNING", False),
-                          "stop": Mark("STOP", False)}
+MARKS: dict[str, Cell] = {
+    "ok": Mark("ok", True),
+    "note": "note",
+    "warning": Mark("WARNING", False),
+    "stop": Mark("STOP", False),
+}
 LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
 
 
@@ -33,17 +37,25 @@ SETTINGS = GateFigureSettings()
 def gates(findings: Sequence[Finding]) -> Section:
     """Table of all findings, and their pictures."""
     if not findings:
-        return Section("Gates", "gates", (Paragraph("The gates (automatic checks of the data) need records in the time "
-                                                    "domain; there were none."),))
+        return Section(
+            "Gates",
+            "gates",
+            (Paragraph("The gates (automatic checks of the data) need records in the time domain; there were none."),),
+        )
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
     listed = [severity for _, severity, _ in together]
     counts = ", ".join(f"{n} {s}{'s' * (n > 1 and s != 'ok')}" for s in reversed(SEVERITIES) if (n := listed.count(s)))
     pieces: list[Piece] = [
-        table(f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
-              "note is for information, a warning means less accurate results, a stop means wrong results.",
-              ("gate", "severity", "finding"), rows, "lcl")]
+        table(
+            f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
+            "note is for information, a warning means less accurate results, a stop means wrong results.",
+            ("gate", "severity", "finding"),
+            rows,
+            "lcl",
+        )
+    ]
     grave = [f for f in ordered if f.severity in ("warning", "stop")]
     for k, (picture, sentences) in enumerate(_pictures(grave)):
         pieces.append(figure_of(f"gate_{k}", " ".join(sentences), [picture]))
@@ -62,8 +74,9 @@ def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
     for f in findings:
         first, _, rest = f.sentence.partition(". ")
         grouped.setdefault((f.gate, f.severity, rest), []).append(first.rstrip("."))
-    return [(gate, severity, f"{'; '.join(firsts)}. {rest}".rstrip()) for (gate, severity, rest), firsts
-            in grouped.items()]
+    return [
+        (gate, severity, f"{'; '.join(firsts)}. {rest}".rstrip()) for (gate, severity, rest), firsts in grouped.items()
+    ]
 
 
 def _pictures(findings: list[Finding]) -> list[tuple[Picture, list[str]]]:
@@ -82,9 +95,13 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
     # Pictures with a curve per channel are kept apart: their legend would list channels that the others lack.
     many = [p for p in pictures if len(p.series) > 2]
     few = [p for p in pictures if len(p.series) <= 2]
-    groups = [of[k:k + SETTINGS.together] for of in (many, few) for k in range(0, len(of), SETTINGS.together)]
-    return [figure_of(f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group,
-                      2, 0.75) for k, group in enumerate(groups)]
+    groups = [of[k : k + SETTINGS.together] for of in (many, few) for k in range(0, len(of), SETTINGS.together)]
+    return [
+        figure_of(
+            f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group, 2, 0.75
+        )
+        for k, group in enumerate(groups)
+    ]
 
 
 def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:
@@ -102,10 +119,10 @@ def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], lett
     if len(picture.series) == 1:  # title and axis label suffice
         curves = tuple(replace(curve, label="") for curve in curves)
     x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names, letters))
-    panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)),
-                  curves, (), picture.title)
-    lines = tuple(_line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3))
-                  for one in picture.limits)
+    panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)), curves, (), picture.title)
+    lines = tuple(
+        _line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3)) for one in picture.limits
+    )
     return _framed(replace(panel, curves=(*curves, *lines)))
 
 
@@ -154,8 +171,9 @@ def _framed(panel: Panel) -> Panel:
         return replace(panel, y=_with_range(panel))
     numbers = np.unique(np.concatenate([c.x for c in panel.curves] or [np.zeros(0)]))
     if 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
-        return replace(panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)),
-                       y=_with_range(panel))
+        return replace(
+            panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)), y=_with_range(panel)
+        )
     return replace(panel, y=_with_range(panel))
 
 

@@ -16,10 +16,16 @@ def identifiability(found: Identification) -> Section:
     information = report.information
     missing = len(information.names) - report.rank
     pieces: list[Piece] = [
-        Paragraph(f"The data determine {report.rank} of {len(information.names)} combinations of the parameters: their "
-                  f"relative standard deviation is below 1. The condition number of their information matrix, in "
-                  f"relative parameters, is {words.number(report.condition)}.", "verdict", missing == 0 or None),
-        _combinations(found), _directions(found)]
+        Paragraph(
+            f"The data determine {report.rank} of {len(information.names)} combinations of the parameters: their "
+            f"relative standard deviation is below 1. The condition number of their information matrix, in "
+            f"relative parameters, is {words.number(report.condition)}.",
+            "verdict",
+            missing == 0 or None,
+        ),
+        _combinations(found),
+        _directions(found),
+    ]
     pieces += [Heading("In words"), Bullets(report.sentences[1:] or report.sentences)]
     if found.advice:
         pieces += [Heading("What would determine the rest"), Bullets(found.advice)]
@@ -38,9 +44,13 @@ def _combinations(found: Identification) -> Table:
         else:
             value, sigma, share = words.number(one.value, 4), "not determined", ""
         rows.append((one.words, value, sigma, share, unit))
-    return table("Combinations of parameters that the data determine, from the joint covariance of the parameters. A "
-                 "parameter listed alone is determined individually.",
-                 ("combination", "value", "± 1 σ", "relative", "unit"), rows, "lrrrl")
+    return table(
+        "Combinations of parameters that the data determine, from the joint covariance of the parameters. A "
+        "parameter listed alone is determined individually.",
+        ("combination", "value", "± 1 σ", "relative", "unit"),
+        rows,
+        "lrrrl",
+    )
 
 
 def _directions(found: Identification) -> Figure:
@@ -51,11 +61,26 @@ def _directions(found: Identification) -> Figure:
     lost = int(n - np.count_nonzero(np.isfinite(shown)))
     top = max(10.0, 3 * float(np.nanmax(shown))) if np.isfinite(shown).any() else 10.0
     bottom = float(np.nanmin(shown)) / 3 if np.isfinite(shown).any() else 1e-3
-    beyond = (f" On {lost} more directions the data contain no information." if lost > 1 else
-              " On one more direction the data contain no information." if lost else "")
-    curves = (Curve(place, shown, "relative standard deviation", Style("#0072b2"), points=True, line=False),
-              level(0.5, n + 0.5, 1.0, "not determined above"))
-    return Figure("directions", "Relative standard deviations along the principal directions of the information "
-                  f"matrix, the most precise first.{beyond}",
-                  (Panel(Axis("direction, by precision", "linear", (0.5, n + 0.5)),
-                         Axis("relative standard deviation [-]", "log", (bottom, top)), curves),))
+    beyond = (
+        f" On {lost} more directions the data contain no information."
+        if lost > 1
+        else " On one more direction the data contain no information."
+        if lost
+        else ""
+    )
+    curves = (
+        Curve(place, shown, "relative standard deviation", Style("#0072b2"), points=True, line=False),
+        level(0.5, n + 0.5, 1.0, "not determined above"),
+    )
+    return Figure(
+        "directions",
+        "Relative standard deviations along the principal directions of the information "
+        f"matrix, the most precise first.{beyond}",
+        (
+            Panel(
+                Axis("direction, by precision", "linear", (0.5, n + 0.5)),
+                Axis("relative standard deviation [-]", "log", (bottom, top)),
+                curves,
+            ),
+        ),
+    )

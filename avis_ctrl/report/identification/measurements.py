@@ -22,16 +22,21 @@ def measurements(found: Identification) -> Section:
     if isinstance(measured, FrequencyResponse):
         return Section("Measurements", "measurements", _response(measured))
     levels = distortion(measured)
-    return Section("Measurements", "measurements", (_records(found, measured), _channels(found, measured),
-                                                    *([levels] if levels else []), *remarks(measured)))
+    return Section(
+        "Measurements",
+        "measurements",
+        (_records(found, measured), _channels(found, measured), *([levels] if levels else []), *remarks(measured)),
+    )
 
 
 def _records(found: Identification, campaign: Campaign) -> Table:
     if found.split is None:
         return records(campaign, {}, "")
     fitted, held = ({r.header.name for r in part.records} for part in found.split[:2])
-    use = {name: "part fitted, part held out" if name in fitted & held else "held out" if name in held else "fitted"
-           for name in fitted | held}
+    use = {
+        name: "part fitted, part held out" if name in fitted & held else "held out" if name in held else "fitted"
+        for name in fitted | held
+    }
     return records(campaign, use, found.split.how)
 
 
@@ -50,38 +55,56 @@ def distortion(campaign: Campaign) -> Table | None:
         for kind in DISTORTIONS:
             ratio = np.divide(levels.rms(kind), linear, out=np.zeros_like(linear), where=linear > 0)
             worst = int(np.argmax(ratio))
-            cells.append(f"{words.number(100 * ratio[worst], 2)} % ({levels.outputs[worst]})" if ratio[worst] > 0
-                         else "below the noise")
+            cells.append(
+                f"{words.number(100 * ratio[worst], 2)} % ({levels.outputs[worst]})"
+                if ratio[worst] > 0
+                else "below the noise"
+            )
         rows.append((record.header.name, *cells))
     if not rows:
         return None
-    return table("Distortion of the multisines that have unexcited lines: r.m.s. of the even and of the odd distortion "
-                 "relative to that of the excited lines, after subtraction of the noise, for the output with the "
-                 "largest distortion. Even distortion comes from asymmetry, odd distortion from stiffening, friction "
-                 "or saturation.",
-                 ("record", "even", "odd"), rows, "lrr")
+    return table(
+        "Distortion of the multisines that have unexcited lines: r.m.s. of the even and of the odd distortion "
+        "relative to that of the excited lines, after subtraction of the noise, for the output with the "
+        "largest distortion. Even distortion comes from asymmetry, odd distortion from stiffening, friction "
+        "or saturation.",
+        ("record", "even", "odd"),
+        rows,
+        "lrr",
+    )
 
 
 def _channels(found: Identification, campaign: Campaign) -> Table:
     first = campaign.records[0].header
     floor = next((r.header for r in campaign.records if r.header.floor_names), None)
     low, high = found.campaign_fit.band_Hz
-    rows = [("commanded, u", str(len(first.u_names)), ", ".join(first.u_names), words.unit(first.u_unit)),
-            ("sensed, y", str(len(first.y_names)), ", ".join(first.y_names), words.unit(first.y_unit))]
+    rows = [
+        ("commanded, u", str(len(first.u_names)), ", ".join(first.u_names), words.unit(first.u_unit)),
+        ("sensed, y", str(len(first.y_names)), ", ".join(first.y_names), words.unit(first.y_unit)),
+    ]
     if floor is not None:
-        rows.append(("floor velocity", str(len(floor.floor_names)), ", ".join(floor.floor_names),
-                     words.unit(floor.floor_unit)))
-    return table(f"The channels. The fit uses the spectral lines from {words.number(low)} to {words.number(high)} Hz.",
-                 ("channels", "count", "names", "unit"), rows, "lrll")
+        rows.append(
+            ("floor velocity", str(len(floor.floor_names)), ", ".join(floor.floor_names), words.unit(floor.floor_unit))
+        )
+    return table(
+        f"The channels. The fit uses the spectral lines from {words.number(low)} to {words.number(high)} Hz.",
+        ("channels", "count", "names", "unit"),
+        rows,
+        "lrll",
+    )
 
 
 def _response(measured: FrequencyResponse) -> tuple[Piece, ...]:
     f = measured.frequency_Hz
     uncertain = "covariance of the noise" if measured.noise is not None else "a variance for each entry"
-    rows = [("lines", f"{len(f)}, {words.number(float(f[0]))} to {words.number(float(f[-1]))} Hz"),
-            ("inputs", f"{', '.join(measured.inputs)} [{words.unit(measured.input_unit)}]"),
-            ("outputs", f"{', '.join(measured.outputs)} [{words.unit(measured.output_unit)}]"),
-            ("uncertainty", uncertain), ("method", measured.method or "not stated in the file")]
-    return (table("The measured frequency responses; the file contains no time records.",
-                  ("what", "value"), rows, "ll"),
-            Paragraph("Every fourth group of neighbouring lines was held out of the fit for validation."))
+    rows = [
+        ("lines", f"{len(f)}, {words.number(float(f[0]))} to {words.number(float(f[-1]))} Hz"),
+        ("inputs", f"{', '.join(measured.inputs)} [{words.unit(measured.input_unit)}]"),
+        ("outputs", f"{', '.join(measured.outputs)} [{words.unit(measured.output_unit)}]"),
+        ("uncertainty", uncertain),
+        ("method", measured.method or "not stated in the file"),
+    ]
+    return (
+        table("The measured frequency responses; the file contains no time records.", ("what", "value"), rows, "ll"),
+        Paragraph("Every fourth group of neighbouring lines was held out of the fit for validation."),
+    )

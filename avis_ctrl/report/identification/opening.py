@@ -32,21 +32,33 @@ def parameters(found: Identification) -> Section:
     """All parameters, changes of the values with tolerances, and what the standard deviations include."""
     fit = found.campaign_fit
     notes = [*([found.caution] if fit.tolerances else []), *fit.notes]
-    return Section("Parameters", "parameters", (_parameters(found), _changes(found), *tolerances(fit.tolerances),
-                                                *(Paragraph(words.sentence(note), "note") for note in notes)))
+    return Section(
+        "Parameters",
+        "parameters",
+        (
+            _parameters(found),
+            _changes(found),
+            *tolerances(fit.tolerances),
+            *(Paragraph(words.sentence(note), "note") for note in notes),
+        ),
+    )
 
 
 def _measured(found: Identification) -> Paragraph:
     low, high = found.campaign_fit.band_Hz
     band = f"{words.number(low)} to {words.number(high)} Hz"
     if not isinstance(found.measured, Campaign):
-        return Paragraph(f"Measured: frequency responses; the fit uses them from {band}. The error below is that of "
-                         "lines that no fit has used.")
+        return Paragraph(
+            f"Measured: frequency responses; the fit uses them from {band}. The error below is that of "
+            "lines that no fit has used."
+        )
     total = sum(r.header.duration_s for r in found.measured.records)
     how = f" {words.sentence(found.split.how)}" if found.split else ""
-    return Paragraph(f"Measured: {len(found.measured.records)} records, {words.number(total)} s in total; the fit uses "
-                     f"the spectral lines from {band}.{how} The error is evaluated on held-out data, which no fit "
-                     "has used.")
+    return Paragraph(
+        f"Measured: {len(found.measured.records)} records, {words.number(total)} s in total; the fit uses "
+        f"the spectral lines from {band}.{how} The error is evaluated on held-out data, which no fit "
+        "has used."
+    )
 
 
 def _sentence(found: Identification) -> Paragraph:
@@ -56,9 +68,11 @@ def _sentence(found: Identification) -> Paragraph:
     stops = any(f.severity == "stop" for f in found.findings)
     consistent = all(one.consistent for one in found.validation.held_out)
     count = len(information.names)
-    said = [words.sentence(found.validation.verdict),
-            f"The data determine {information.rank} combinations of the {count} parameters, and {alone} parameters "
-            "individually."]
+    said = [
+        words.sentence(found.validation.verdict),
+        f"The data determine {information.rank} combinations of the {count} parameters, and {alone} parameters "
+        "individually.",
+    ]
     if not found.campaign_fit.fit.converged:
         said.append("The fit did not converge.")
     if warned:
@@ -72,8 +86,9 @@ def _sentence(found: Identification) -> Paragraph:
 def _parameters(found: Identification) -> Table:
     information, start = found.information, found.campaign_fit.start.values
     rows = []
-    for name, unit, before, value, sigma in zip(information.names, information.units, start, information.values,
-                                                information.standard_deviation, strict=True):
+    for name, unit, before, value, sigma in zip(
+        information.names, information.units, start, information.values, information.standard_deviation, strict=True
+    ):
         change = f"{100 * (value / before - 1):+.2f} %" if before else "from zero"
         if np.isfinite(sigma):
             shown, spread = words.with_std(value, sigma)
@@ -82,12 +97,16 @@ def _parameters(found: Identification) -> Table:
             shown, spread, share = words.number(value, 5), TOGETHER, ""
         rows.append((name, words.number(before, 5), shown, spread, share, change, words.unit(unit)))
     prior = " The standard deviations include the priors." if found.campaign_fit.fit.priors else ""
-    return table("Every fitted parameter: starting value and maximum likelihood estimate with one standard deviation "
-                 "(Cramér-Rao bound). If a parameter is known only in combination with others, its own value is the "
-                 "one nearest to the start and has no meaning by itself; the section on identifiability lists the "
-                 "combinations."
-                 f"{prior}", ("parameter", "start", "identified", "± 1 σ", "relative", "change", "unit"), rows,
-                 "lrrrrrl")
+    return table(
+        "Every fitted parameter: starting value and maximum likelihood estimate with one standard deviation "
+        "(Cramér-Rao bound). If a parameter is known only in combination with others, its own value is the "
+        "one nearest to the start and has no meaning by itself; the section on identifiability lists the "
+        "combinations."
+        f"{prior}",
+        ("parameter", "start", "identified", "± 1 σ", "relative", "change", "unit"),
+        rows,
+        "lrrrrrl",
+    )
 
 
 def _changes(found: Identification) -> Figure:
@@ -97,17 +116,41 @@ def _changes(found: Identification) -> Figure:
     bars = 200 * information.standard_deviation / size
     known, n = information.known, len(start)
     place = np.arange(n, 0, -1.0)
-    curves = [Curve(change[known], place[known], "determined individually, ± 2 σ", Style("#0072b2"), points=True,
-                    line=False, error=bars[known], along="x")]
+    curves = [
+        Curve(
+            change[known],
+            place[known],
+            "determined individually, ± 2 σ",
+            Style("#0072b2"),
+            points=True,
+            line=False,
+            error=bars[known],
+            along="x",
+        )
+    ]
     if not known.all():
-        curves.append(Curve(change[~known], place[~known], f"{TOGETHER}: the nearest to the start",
-                            Style("#9a9a9a"), points=True, line=False))
+        curves.append(
+            Curve(
+                change[~known],
+                place[~known],
+                f"{TOGETHER}: the nearest to the start",
+                Style("#9a9a9a"),
+                points=True,
+                line=False,
+            )
+        )
     curves.append(Curve(np.zeros(2), np.array([0.3, n + 0.7]), "", STYLES["faint"]))
     ticks = tuple((float(p), name) for p, name in zip(place, information.names, strict=True))
     longest = float(np.max(bars[known])) if known.any() else np.nan
-    caption = (f"Change of each parameter from its starting value. The longest bar (2 σ) is "
-               f"{words.number(longest, 2)} % of its starting value; bars shorter than a marker are hidden by it."
-               if known.any() else "Change of each parameter from its starting value; none is determined individually.")
-    return Figure("changes", caption, (Panel(Axis("change from the start [%]"),
-                                             Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
-                  height=max(0.5, 0.07 * n))
+    caption = (
+        f"Change of each parameter from its starting value. The longest bar (2 σ) is "
+        f"{words.number(longest, 2)} % of its starting value; bars shorter than a marker are hidden by it."
+        if known.any()
+        else "Change of each parameter from its starting value; none is determined individually."
+    )
+    return Figure(
+        "changes",
+        caption,
+        (Panel(Axis("change from the start [%]"), Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
+        height=max(0.5, 0.07 * n),
+    )

@@ -33,21 +33,37 @@ def responses(found: Identification) -> Section:
     """Large figures of the strongest input of each output, and small ones of all pairs."""
     seen = found.validation.overlay
     if seen is None:
-        return Section("Frequency responses", "responses", (Paragraph(
-            "No measured frequency response can be shown; the notes of the section on validation state the reason."),))
+        return Section(
+            "Frequency responses",
+            "responses",
+            (
+                Paragraph(
+                    "No measured frequency response can be shown; the notes of the section on validation state the "
+                    "reason."
+                ),
+            ),
+        )
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
-    pieces: list[Piece] = [Paragraph(
-        f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured values lie within their 95 % "
-        f"confidence region about the identified model; 95 % are expected if they differ from the model by noise only "
-        f"and the estimate has no bias. Shown in full: the strongest input of each output, {named}.")]
+    pieces: list[Piece] = [
+        Paragraph(
+            f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured values lie within "
+            f"their 95 % confidence region about the identified model; 95 % are expected if they differ from the model "
+            f"by noise only and the estimate has no bias. Shown in full: the strongest input of each output, {named}."
+        )
+    ]
     if seen.method.startswith("response of the model"):
-        pieces.append(Paragraph("From these records, any response estimated without a model would be smoothed at the "
-                                "resonances. The points are therefore the identified model's response plus the "
-                                "residual of the records, regressed on the inputs. A model error that is narrower than "
-                                "a window of lines is not visible here, but in the tests of the section on "
-                                "validation.", "note"))
-    groups = [pairs[k:k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
+        pieces.append(
+            Paragraph(
+                "From these records, any response estimated without a model would be smoothed at the "
+                "resonances. The points are therefore the identified model's response plus the "
+                "residual of the records, regressed on the inputs. A model error that is narrower than "
+                "a window of lines is not visible here, but in the tests of the section on "
+                "validation.",
+                "note",
+            )
+        )
+    groups = [pairs[k : k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
     pieces += [_bode(seen, group, k) for k, group in enumerate(groups)]
     pieces += [_residual(seen, pairs), _overview(seen)]
     return Section("Frequency responses", "responses", tuple(pieces))
@@ -62,24 +78,34 @@ def strongest(seen: ResponseOverlay) -> list[tuple[int, int]]:
 
 def _bode(seen: ResponseOverlay, pairs: list[tuple[int, int]], number: int) -> Figure:
     panels = [panel for i, j in pairs for panel in (magnitude(seen, i, j, _models(seen)), _phase(seen, i, j))]
-    return Figure(f"response_{number}", "Magnitude (left) and phase (right): measured (points) with a band of ± 2 "
-                  "standard deviations, start model (dashed) and identified model (line). A band narrower than a point "
-                  "is not visible.", tuple(panels), 2, 0.85)
+    return Figure(
+        f"response_{number}",
+        "Magnitude (left) and phase (right): measured (points) with a band of ± 2 "
+        "standard deviations, start model (dashed) and identified model (line). A band narrower than a point "
+        "is not visible.",
+        tuple(panels),
+        2,
+        0.85,
+    )
 
 
 def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     f, measured, model = seen.frequency_Hz, seen.measured[:, i, j], seen.model[:, i, j]
     base = np.unwrap(np.angle(model))
     # Phases are unwrapped relative to that of the identified model.
-    shown = {name: np.rad2deg(base + np.angle(value / model)) for name, value in
-             (("measured", measured), ("start", seen.start[:, i, j]))}
+    shown = {
+        name: np.rad2deg(base + np.angle(value / model))
+        for name, value in (("measured", measured), ("start", seen.start[:, i, j]))
+    }
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))
     keep = thin(len(f), MOST_POINTS)
-    curves = (Curve(f[keep], shown["measured"][keep], "measured", MEASURED, points=True, line=False),
-              Curve(f, np.rad2deg(base), "identified", MODEL), Curve(f, shown["start"], "start", START))
+    curves = (
+        Curve(f[keep], shown["measured"][keep], "measured", MEASURED, points=True, line=False),
+        Curve(f, np.rad2deg(base), "identified", MODEL),
+        Curve(f, shown["start"], "start", START),
+    )
     band = Band(f, shown["measured"] - s, shown["measured"] + s, "measured, ± 2 σ", SCATTER)
-    return Panel(frequencies(seen), Axis("phase [°]"), curves, (band,),
-                 title(seen, i, j))
+    return Panel(frequencies(seen), Axis("phase [°]"), curves, (band,), title(seen, i, j))
 
 
 def _models(seen: ResponseOverlay) -> list[Model]:
@@ -87,9 +113,14 @@ def _models(seen: ResponseOverlay) -> list[Model]:
 
 
 def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
-    return Figure("residuals", "Residual: magnitude of the complex difference between measured response and model. "
-                  "With noise alone, 86 % of the points are expected below the dotted line.",
-                  tuple(difference(seen, i, j, _models(seen)) for i, j in pairs), 2, 0.75)
+    return Figure(
+        "residuals",
+        "Residual: magnitude of the complex difference between measured response and model. "
+        "With noise alone, 86 % of the points are expected below the dotted line.",
+        tuple(difference(seen, i, j, _models(seen)) for i, j in pairs),
+        2,
+        0.75,
+    )
 
 
 def _overview(seen: ResponseOverlay) -> Figure:
@@ -103,11 +134,26 @@ def _overview(seen: ResponseOverlay) -> Figure:
         for j in columns:
             first, last = j == columns[0], i == n_y - 1
             measured, start, model = (np.abs(G[keep, i, j]) for G in (seen.measured, seen.start, seen.model))
-            curves = (Curve(f, measured, "measured", Style("#7a7a7a", "solid", 2.6)),
-                      Curve(f, model, "identified", Style(MODEL.colour, "solid", 1.0)),
-                      Curve(f, start, "start", Style(START.colour, "dash", 1.0)))
-            panels.append(Panel(Axis("[Hz]" if last else "", "log", frequencies(seen).range, silent=not last),
-                                Axis(f"{seen.outputs[i]}" if first else "", "log", limits, silent=not first),
-                                curves, (), seen.inputs[j] if i == 0 else ""))
-    return Figure("overview", f"Magnitude of every pair on the same scales [{unit(seen, columns[0])}]: inputs from "
-                  "left to right, outputs from top to bottom.", tuple(panels), len(columns), 0.36, True)
+            curves = (
+                Curve(f, measured, "measured", Style("#7a7a7a", "solid", 2.6)),
+                Curve(f, model, "identified", Style(MODEL.colour, "solid", 1.0)),
+                Curve(f, start, "start", Style(START.colour, "dash", 1.0)),
+            )
+            panels.append(
+                Panel(
+                    Axis("[Hz]" if last else "", "log", frequencies(seen).range, silent=not last),
+                    Axis(f"{seen.outputs[i]}" if first else "", "log", limits, silent=not first),
+                    curves,
+                    (),
+                    seen.inputs[j] if i == 0 else "",
+                )
+            )
+    return Figure(
+        "overview",
+        f"Magnitude of every pair on the same scales [{unit(seen, columns[0])}]: inputs from "
+        "left to right, outputs from top to bottom.",
+        tuple(panels),
+        len(columns),
+        0.36,
+        True,
+    )

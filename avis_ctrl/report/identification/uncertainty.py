@@ -16,23 +16,41 @@ TITLE = "Uncertainty for design"
 def uncertainty(found: Identification, made: InDesign | None) -> Section:
     """Directions of the parameters, and the filter that covers the measured spread."""
     if made is None:
-        return Section(TITLE, "uncertainty", (Paragraph(
-            "The uncertainty model for a controller design was not computed with this report; the covariance is in "
-            "result.json."),))
+        return Section(
+            TITLE,
+            "uncertainty",
+            (
+                Paragraph(
+                    "The uncertainty model for a controller design was not computed with this report; the covariance "
+                    "is in result.json."
+                ),
+            ),
+        )
     kept = words.joined([words.axis(name) for name in made.spread.keep])
     count = len(made.directions)
-    bounded = (f"the joint covariance of the parameters is represented by {count} bounded "
-               f"direction{'s' * (count != 1)}" if count else
-               "the parameters are known so precisely that no direction of their covariance needs a bound of its own")
-    text = (f"For a design of {kept}, {bounded}. The spread of the measured response about the model is represented by "
-            "one filter. The directions and the remaining parameter uncertainty contain the true parameters with a "
-            f"probability of {words.number(100 * made.found.coverage)} %; the bound of the spread is valid with a "
-            f"probability of {words.number(100 * made.confidence)} % at each spectral line. Outside the measured band, "
-            "or if the design file states a larger uncertainty of the drives, the filter is increased accordingly.")
+    bounded = (
+        f"the joint covariance of the parameters is represented by {count} bounded direction{'s' * (count != 1)}"
+        if count
+        else "the parameters are known so precisely that no direction of their covariance needs a bound of its own"
+    )
+    text = (
+        f"For a design of {kept}, {bounded}. The spread of the measured response about the model is represented by "
+        "one filter. The directions and the remaining parameter uncertainty contain the true parameters with a "
+        f"probability of {words.number(100 * made.found.coverage)} %; the bound of the spread is valid with a "
+        f"probability of {words.number(100 * made.confidence)} % at each spectral line. Outside the measured band, "
+        "or if the design file states a larger uncertainty of the drives, the filter is increased accordingly."
+    )
     left = words.number(100 * float(np.max(made.found.rest, initial=0.0)), 2)
     rig = found.rig.parameters()
-    return Section(TITLE, "uncertainty", (
-        Paragraph(text), *directions(made, {name: p.value for name, p in rig.items()},
-                                     {name: p.unit for name, p in rig.items()}),
-        Paragraph(f"The remaining parameter uncertainty changes the response by at most {left} %; the filter covers "
-                  "it."), spread(made)))
+    return Section(
+        TITLE,
+        "uncertainty",
+        (
+            Paragraph(text),
+            *directions(made, {name: p.value for name, p in rig.items()}, {name: p.unit for name, p in rig.items()}),
+            Paragraph(
+                f"The remaining parameter uncertainty changes the response by at most {left} %; the filter covers it."
+            ),
+            spread(made),
+        ),
+    )

@@ -23,13 +23,21 @@ def validation(found: Identification) -> Section:
     drawn = v.held_out[:MOST_DRAWN]
     for one in drawn:
         # The errors of the first record are in the summary.
-        pieces += [_chi_square(one, v.outputs), *([errors(one, v.outputs)] if one is not drawn[0] else []),
-                   _nrms(one, v.outputs)]
+        pieces += [
+            _chi_square(one, v.outputs),
+            *([errors(one, v.outputs)] if one is not drawn[0] else []),
+            _nrms(one, v.outputs),
+        ]
         if one.whiteness is not None:
             pieces += [_whiteness(one.name, one.whiteness)]
     if len(v.held_out) > len(drawn):
-        pieces.append(Paragraph(f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records "
-                                "and pieces; the table lists all.", "note"))
+        pieces.append(
+            Paragraph(
+                f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records "
+                "and pieces; the table lists all.",
+                "note",
+            )
+        )
     if v.modes:
         pieces += _measured_modes(found)
     pieces.append(Bullets(tuple(dict.fromkeys(map(words.sentence, (*v.sentences[1:], *v.notes))))))
@@ -41,26 +49,42 @@ def _records(found: Identification) -> Table:
     for one in found.validation.held_out:
         low, high = one.chi2_interval
         white = one.whiteness
-        rows.append((one.name, str(one.lines), words.number(one.chi2_per_dof, 4), f"{low:.4f} to {high:.4f}",
-                     words.number(one.chi2_start, 4),
-                     "none" if np.isnan(one.chi2_local) else words.number(one.chi2_local, 4),
-                     yes_or_no(one.consistent),
-                     "not tested" if white is None else yes_or_no(white.white)))
+        rows.append(
+            (
+                one.name,
+                str(one.lines),
+                words.number(one.chi2_per_dof, 4),
+                f"{low:.4f} to {high:.4f}",
+                words.number(one.chi2_start, 4),
+                "none" if np.isnan(one.chi2_local) else words.number(one.chi2_local, 4),
+                yes_or_no(one.consistent),
+                "not tested" if white is None else yes_or_no(white.white),
+            )
+        )
     noise = "; ".join(dict.fromkeys(one.noise for one in found.validation.held_out))
-    return table("Chi-square per degree of freedom of the held-out data, with its 95 % interval for a residual that is "
-                 f"due only to noise and parameter uncertainty. Noise: {noise}. \"Local noise\" is the same chi-square "
-                 "with the noise covariance of a local polynomial model.",
-                 ("record", "lines", "chi-square", "expected", "start model", "local noise", "consistent", "white"),
-                 rows, "lrrrrrcc")
+    return table(
+        "Chi-square per degree of freedom of the held-out data, with its 95 % interval for a residual that is "
+        f'due only to noise and parameter uncertainty. Noise: {noise}. "Local noise" is the same chi-square '
+        "with the noise covariance of a local polynomial model.",
+        ("record", "lines", "chi-square", "expected", "start model", "local noise", "consistent", "white"),
+        rows,
+        "lrrrrrcc",
+    )
 
 
 def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     x, axis = places(outputs, "output")
     low, high = one.output_chi2_interval.T
-    curves = (Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=True, line=False, error=(high - low) / 2),
-              Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False))
-    return Figure(f"chi_square_{one.name}", f"Chi-square per degree of freedom of each output, record {one.name}, with "
-                  "its interval.", (Panel(axis, Axis("chi-square / dof [-]"), curves),), height=0.8)
+    curves = (
+        Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=True, line=False, error=(high - low) / 2),
+        Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False),
+    )
+    return Figure(
+        f"chi_square_{one.name}",
+        f"Chi-square per degree of freedom of each output, record {one.name}, with its interval.",
+        (Panel(axis, Axis("chi-square / dof [-]"), curves),),
+        height=0.8,
+    )
 
 
 def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
@@ -68,64 +92,126 @@ def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     x, axis = places(outputs, "output")
     values = [100 * v for v in (one.nrms_start, one.nrms, one.nrms_floor)]
     labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
-    curves = tuple(Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)
-                   for k, (v, label, style) in enumerate(zip(values, labels, styles, strict=True)))
+    curves = tuple(
+        Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)
+        for k, (v, label, style) in enumerate(zip(values, labels, styles, strict=True))
+    )
     limits = log_limits(np.concatenate(values), 1 / 3, 2, (0.01, 100.0))
-    return Figure(f"nrms_{one.name}", f"Normalised r.m.s. error of each output in the band, record {one.name}: error "
-                  "divided by output, with the transient of the record removed. Logarithmic.",
-                  (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves),), height=0.9)
+    return Figure(
+        f"nrms_{one.name}",
+        f"Normalised r.m.s. error of each output in the band, record {one.name}: error "
+        "divided by output, with the transient of the record removed. Logarithmic.",
+        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves),),
+        height=0.9,
+    )
 
 
 def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
     def percent(values: np.ndarray | None, k: int) -> str:
         return "none" if values is None else f"{words.number(100 * float(values[k]), 3)} %"
-    rows = [(name, percent(one.nrms_start, k), percent(one.nrms, k), percent(one.nrms_floor, k),
-             percent(one.nrms_time_start, k), percent(one.nrms_time, k), percent(one.nrms_time_whole, k))
-            for k, name in enumerate(outputs)]
+
+    rows = [
+        (
+            name,
+            percent(one.nrms_start, k),
+            percent(one.nrms, k),
+            percent(one.nrms_floor, k),
+            percent(one.nrms_time_start, k),
+            percent(one.nrms_time, k),
+            percent(one.nrms_time_whole, k),
+        )
+        for k, name in enumerate(outputs)
+    ]
     note = f" In time: {one.time_note}." if one.time_note else ""
-    return table(f"Normalised r.m.s. errors of record {one.name}, on the spectral lines of the band and in time.{note}",
-                 ("output", "start", "identified", "noise alone", "in time, start", "in time, identified",
-                  "in time, no filter"), rows)
+    return table(
+        f"Normalised r.m.s. errors of record {one.name}, on the spectral lines of the band and in time.{note}",
+        ("output", "start", "identified", "noise alone", "in time, start", "in time, identified", "in time, no filter"),
+        rows,
+    )
 
 
 def _whiteness(name: str, white: Whiteness) -> Figure:
     panels = tuple(_correlation(one) for one in white.correlations)
-    return Figure(f"whiteness_{name}", f"Correlations of the residual of each output in record {name}; the largest "
-                  "over the inputs if there are several. With noise alone, at least one of the limits (dashed) is "
-                  "exceeded in 1 % of all validations.", panels, height=0.55)
+    return Figure(
+        f"whiteness_{name}",
+        f"Correlations of the residual of each output in record {name}; the largest "
+        "over the inputs if there are several. With noise alone, at least one of the limits (dashed) is "
+        "exceeded in 1 % of all validations.",
+        panels,
+        height=0.55,
+    )
 
 
 def _correlation(one: Correlation) -> Panel:
     outputs = list(dict.fromkeys(row.partition(" with ")[0] for row in one.rows))
     of = np.array([outputs.index(row.partition(" with ")[0]) for row in one.rows])
-    curves = [Curve(one.lags, one.value[of == k].max(axis=0), name, Style(numbered(k).colour, "solid", 1.0))
-              for k, name in enumerate(outputs)]
+    curves = [
+        Curve(one.lags, one.value[of == k].max(axis=0), name, Style(numbered(k).colour, "solid", 1.0))
+        for k, name in enumerate(outputs)
+    ]
     curves.append(Curve(one.lags, one.limit.max(axis=0), "limit", Style("#b3261e", "dash", 1.4)))
-    return Panel(Axis(f"lag [{one.lag_unit}]"), Axis("correlation [-]", "linear", (0.0, 1.15 * float(
-        max(one.value.max(), one.limit.max())))), tuple(curves), (), f"{one.what[:1].upper()}{one.what[1:]}")
+    return Panel(
+        Axis(f"lag [{one.lag_unit}]"),
+        Axis("correlation [-]", "linear", (0.0, 1.15 * float(max(one.value.max(), one.limit.max())))),
+        tuple(curves),
+        (),
+        f"{one.what[:1].upper()}{one.what[1:]}",
+    )
 
 
 def modes(found: Identification) -> Table:
     """Natural frequencies and damping of the start and of the identified model."""
-    rows = [(row.shape, words.number(row.start_frequency_Hz, 4), words.number(row.frequency_Hz, 4),
-             words.number(100 * row.start_damping), words.number(100 * row.damping)) for row in found.validation.modes]
-    return table("Modes of the start and of the identified model. Shapes are given by the distribution of the kinetic "
-                 "energy.", ("shape", "frequency, start [Hz]", "identified [Hz]", "damping ratio, start [%]",
-                             "identified [%]"), rows)
+    rows = [
+        (
+            row.shape,
+            words.number(row.start_frequency_Hz, 4),
+            words.number(row.frequency_Hz, 4),
+            words.number(100 * row.start_damping),
+            words.number(100 * row.damping),
+        )
+        for row in found.validation.modes
+    ]
+    return table(
+        "Modes of the start and of the identified model. Shapes are given by the distribution of the kinetic energy.",
+        ("shape", "frequency, start [Hz]", "identified [Hz]", "damping ratio, start [%]", "identified [%]"),
+        rows,
+    )
 
 
 def _measured_modes(found: Identification) -> list[Piece]:
     """Identified and measured modes with standard deviations."""
     rows = found.validation.modes
-    frequency = [(r.shape, _pair(r.frequency_Hz, r.frequency_std_Hz),
-                  _pair(r.measured_frequency_Hz, r.measured_frequency_std_Hz), _sigma(r.frequency_sigma)) for r in rows]
-    damping = [(r.shape, _pair(100 * r.damping, 100 * r.damping_std),
-                _pair(100 * r.measured_damping, 100 * r.measured_damping_std), _sigma(r.damping_sigma)) for r in rows]
-    return [table(caption, ("shape", f"identified [{unit}]", f"measured [{unit}]", "difference [σ]"), several)
-            for caption, unit, several in (
-                ("Natural frequencies of the identified model beside those measured in the held-out data without the "
-                 "rig's equations, with one standard deviation. The difference is model minus measured, divided by "
-                 "its standard deviation.", "Hz", frequency), ("Damping ratios in the same way.", "%", damping))]
+    frequency = [
+        (
+            r.shape,
+            _pair(r.frequency_Hz, r.frequency_std_Hz),
+            _pair(r.measured_frequency_Hz, r.measured_frequency_std_Hz),
+            _sigma(r.frequency_sigma),
+        )
+        for r in rows
+    ]
+    damping = [
+        (
+            r.shape,
+            _pair(100 * r.damping, 100 * r.damping_std),
+            _pair(100 * r.measured_damping, 100 * r.measured_damping_std),
+            _sigma(r.damping_sigma),
+        )
+        for r in rows
+    ]
+    return [
+        table(caption, ("shape", f"identified [{unit}]", f"measured [{unit}]", "difference [σ]"), several)
+        for caption, unit, several in (
+            (
+                "Natural frequencies of the identified model beside those measured in the held-out data without the "
+                "rig's equations, with one standard deviation. The difference is model minus measured, divided by "
+                "its standard deviation.",
+                "Hz",
+                frequency,
+            ),
+            ("Damping ratios in the same way.", "%", damping),
+        )
+    ]
 
 
 def _pair(value: float, sigma: float) -> str:

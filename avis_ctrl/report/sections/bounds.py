@@ -17,12 +17,25 @@ Pick = Callable[[ControllerResult], Bound]
 def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and the perturbations that attain the lower bounds."""
     pieces: list[Piece] = [certificate(result)]
-    pieces += [_figure("mu_performance", result, lambda c: c.mu, "mu, performance", "mu of the weighted performance",
-                       "Below 1 (dashed line) every weighted requirement holds for every plant of the uncertainty "
-                       "set."),
-               _figure("mu_stability", result, lambda c: c.stability, "mu, stability", "mu of the uncertainty alone",
-                       "Below 1 the loop is stable for every plant of the set; the inverse of its peak is the factor "
-                       "by which the whole set may grow.")]
+    pieces += [
+        _figure(
+            "mu_performance",
+            result,
+            lambda c: c.mu,
+            "mu, performance",
+            "mu of the weighted performance",
+            "Below 1 (dashed line) every weighted requirement holds for every plant of the uncertainty set.",
+        ),
+        _figure(
+            "mu_stability",
+            result,
+            lambda c: c.stability,
+            "mu, stability",
+            "mu of the uncertainty alone",
+            "Below 1 the loop is stable for every plant of the set; the inverse of its peak is the factor "
+            "by which the whole set may grow.",
+        ),
+    ]
     pieces += [_stability(result), _worst(result)]
     return Section("Bounds of mu", "bounds", tuple(pieces))
 
@@ -31,14 +44,19 @@ def certificate(result: DesignResult) -> Paragraph:
     """Both bounds of mu, and whether the upper bound is guaranteed between the computed frequencies."""
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
-    between = ("The upper bound is guaranteed at every frequency, also between the computed points."
-               if mu.guaranteed else "The upper bound holds at the computed frequencies; between them it is not "
-               "guaranteed, although the grid was refined near every local peak.")
-    return Paragraph(f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
-                     f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
-                     + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
-                     + f". Below 1, every weighted requirement holds for every plant of the uncertainty set. {between} "
-                     "The lower bound is reached: a perturbation of size 1/mu makes the loop singular.")
+    between = (
+        "The upper bound is guaranteed at every frequency, also between the computed points."
+        if mu.guaranteed
+        else "The upper bound holds at the computed frequencies; between them it is not "
+        "guaranteed, although the grid was refined near every local peak."
+    )
+    return Paragraph(
+        f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
+        f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
+        + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
+        + f". Below 1, every weighted requirement holds for every plant of the uncertainty set. {between} "
+        "The lower bound is reached: a perturbation of size 1/mu makes the loop singular."
+    )
 
 
 def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, meaning: str) -> Figure:
@@ -53,8 +71,9 @@ def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, 
         curves.append(Curve(f, b.lower_curve[order], "", Style(style.colour, "dot", 0.9)))
     passive = pick(result.controller("passive"))
     order = np.argsort(passive.frequencies)
-    curves.append(Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive",
-                        STYLES["passive"]))
+    curves.append(
+        Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive", STYLES["passive"])
+    )
     curves.append(level(0.01, 1000.0, 1.0, "mu = 1"))
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
     top = min(max(finite) * 1.3, 30.0)
@@ -67,11 +86,23 @@ def _stability(result: DesignResult) -> Table:
     for c in result.controllers:
         b = c.stability
         margin = words.number(1 / b.upper) if c.stable and np.isfinite(b.upper) and b.upper > 0 else "none"
-        rows.append((c.title, words.bound(b.upper, 4), words.bound(b.lower, 4), words.hertz(b.omega), margin,
-                     stable_for_the_set(c)))
-    return table("Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
-                 "upper bound of mu reaches 1.",
-                 ("controller", "mu upper", "mu lower", "peak at", "margin", "stable for the set"), rows, "lrrrrc")
+        rows.append(
+            (
+                c.title,
+                words.bound(b.upper, 4),
+                words.bound(b.lower, 4),
+                words.hertz(b.omega),
+                margin,
+                stable_for_the_set(c),
+            )
+        )
+    return table(
+        "Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
+        "upper bound of mu reaches 1.",
+        ("controller", "mu upper", "mu lower", "peak at", "margin", "stable for the set"),
+        rows,
+        "lrrrrc",
+    )
 
 
 def stable_for_the_set(c: ControllerResult) -> Mark:
@@ -87,11 +118,18 @@ def _worst(result: DesignResult) -> Table:
         c = next((one for one in result.controllers if one.name == name), None)
         if c is None:
             continue
-        for what, b, gain in (("mu of the weighted performance", c.mu, False), ("stability", c.stability, False),
-                              ("peak transmissibility", c.worst_peak, True)):
+        for what, b, gain in (
+            ("mu of the weighted performance", c.mu, False),
+            ("stability", c.stability, False),
+            ("peak transmissibility", c.worst_peak, True),
+        ):
             value = words.decibel(b.lower) if gain else words.bound(b.lower, 4)
             rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
-    return table("The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
-                 "perturbations of mu have the size 1/mu, which makes the loop singular: if mu is below 1 they lie "
-                 "outside the uncertainty set. Those of the transmissibility lie inside the set.",
-                 ("worst case of", "reaches", "at", "perturbation"), rows, "lrrl")
+    return table(
+        "The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
+        "perturbations of mu have the size 1/mu, which makes the loop singular: if mu is below 1 they lie "
+        "outside the uncertainty set. Those of the transmissibility lie inside the set.",
+        ("worst case of", "reaches", "at", "perturbation"),
+        rows,
+        "lrrl",
+    )

@@ -7,17 +7,7 @@ import numpy as np
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import (
-    STYLES,
-    Axis,
-    Curve,
-    Figure,
-    Panel,
-    Style,
-    controller_style,
-    hertz,
-    numbered,
-)
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, numbered
 from avis_ctrl.report.pieces import Piece, Section, Table, table
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
@@ -29,8 +19,13 @@ MOST_ENTRIES = 9  # of a controller whose entries can be told apart in one diagr
 def controllers(result: DesignResult) -> Section:
     """The section on the controllers."""
     made = [c for c in result.controllers if c.K is not None]
-    pieces: list[Piece] = [_files(result, made), _gains(made), _bode(result), _loops(result, made),
-                           _poles(result.controller("mu"))]
+    pieces: list[Piece] = [
+        _files(result, made),
+        _gains(made),
+        _bode(result),
+        _loops(result, made),
+        _poles(result.controller("mu")),
+    ]
     return Section("Controllers", "controllers", tuple(pieces))
 
 
@@ -41,16 +36,37 @@ def _system(c: ControllerResult) -> StateSpace:
 
 def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
     rate = result.rig.sample_rate_Hz
-    rows = [(c.title, f"controllers/{c.name}.json", str(c.order), f"{words.number(c.fastest_pole_Hz)} Hz",
-             words.number(2 * c.fastest_pole_Hz / rate), words.yes(_system(c).is_stable()),
-             f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
-             _offset(c.rest.percent) if c.rest else "") for c in made]
-    return table(f"The controllers and their state-space files. The fastest pole is compared with half the sample "
-                 f"rate of {words.number(rate, 4)} Hz. The gain at zero frequency converts offsets of the sensor "
-                 "electronics into drive voltage. The last column is the fraction of a drive's range that the largest "
-                 "offsets of the rig file use up, each with its worst-case sign.",
-                 ("controller", "file", "order", "fastest pole", "relative to half the rate", "stable itself",
-                  "gain at rest", "offset needs"), rows, "llrrrcrr")
+    rows = [
+        (
+            c.title,
+            f"controllers/{c.name}.json",
+            str(c.order),
+            f"{words.number(c.fastest_pole_Hz)} Hz",
+            words.number(2 * c.fastest_pole_Hz / rate),
+            words.yes(_system(c).is_stable()),
+            f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
+            _offset(c.rest.percent) if c.rest else "",
+        )
+        for c in made
+    ]
+    return table(
+        f"The controllers and their state-space files. The fastest pole is compared with half the sample "
+        f"rate of {words.number(rate, 4)} Hz. The gain at zero frequency converts offsets of the sensor "
+        "electronics into drive voltage. The last column is the fraction of a drive's range that the largest "
+        "offsets of the rig file use up, each with its worst-case sign.",
+        (
+            "controller",
+            "file",
+            "order",
+            "fastest pole",
+            "relative to half the rate",
+            "stable itself",
+            "gain at rest",
+            "offset needs",
+        ),
+        rows,
+        "llrrrcrr",
+    )
 
 
 def _offset(percent: float) -> str:
@@ -67,9 +83,11 @@ def _gains(made: list[ControllerResult]) -> Figure:
         if sigma.shape[1] > 1:
             style = controller_style(c.name)
             curves.append(Curve(HZ, sigma[:, -1], "", Style(style.colour, style.dash, 0.8)))
-    return Figure("controller_gains", "Singular values of the controllers, from measured velocity to force: largest "
-                  "(thick) and smallest (thin).",
-                  (Panel(hertz(0.01, 500.0), Axis("gain [N s/m]", "log"), tuple(curves)),))
+    return Figure(
+        "controller_gains",
+        "Singular values of the controllers, from measured velocity to force: largest (thick) and smallest (thin).",
+        (Panel(hertz(0.01, 500.0), Axis("gain [N s/m]", "log"), tuple(curves)),),
+    )
 
 
 def _bode(result: DesignResult) -> Figure:
@@ -91,9 +109,15 @@ def _bode(result: DesignResult) -> Figure:
         sizes.append(Curve(HZ, coupling, "largest gain between two axes", STYLES["faint"]))
         what = "the measurement of each axis to the command of the same axis, and the largest gain between two axes"
     x = hertz(0.01, 500.0)
-    return Figure("controller_bode", f"Bode plot of the mu controller: {what}; the phase is wrapped into ±180 degrees.",
-                  (Panel(x, Axis("gain [N s/m]", "log"), tuple(sizes)),
-                   Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases))), 2)
+    return Figure(
+        "controller_bode",
+        f"Bode plot of the mu controller: {what}; the phase is wrapped into ±180 degrees.",
+        (
+            Panel(x, Axis("gain [N s/m]", "log"), tuple(sizes)),
+            Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases)),
+        ),
+        2,
+    )
 
 
 def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
@@ -111,11 +135,16 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         loops.append(Curve(HZ, in_dB(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
         sensitivities.append(Curve(HZ, in_dB(size), c.title, controller_style(c.name)))
     x = hertz(0.01, 500.0)
-    return Figure("loops", "Largest singular value of the open loop G K at the measurement (left) and of the "
-                  f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
-                  (Panel(x, Axis("open loop [dB]", "linear", (-80.0, _above(loops, 50.0))), tuple(loops)),
-                   Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, _above(sensitivities, 20.0))),
-                         tuple(sensitivities))), 2)
+    return Figure(
+        "loops",
+        "Largest singular value of the open loop G K at the measurement (left) and of the "
+        f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
+        (
+            Panel(x, Axis("open loop [dB]", "linear", (-80.0, _above(loops, 50.0))), tuple(loops)),
+            Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, _above(sensitivities, 20.0))), tuple(sensitivities)),
+        ),
+        2,
+    )
 
 
 def _above(curves: list[Curve], least: float) -> float:
@@ -132,5 +161,9 @@ def _poles(mu: ControllerResult) -> Table:
         damping = -p.real / abs(p) if abs(p) > 0 else 1.0
         rows.append((f"{words.number(abs(p) / (2 * np.pi), 4)} Hz", words.number(damping), kind))
     left = f" The fastest {len(shown) - MOST_POLES} are listed only in the file." if len(shown) > MOST_POLES else ""
-    return table(f"Poles of the mu controller, slowest first; a pair counts once.{left}",
-                 ("frequency", "damping ratio", "kind"), rows, "rrl")
+    return table(
+        f"Poles of the mu controller, slowest first; a pair counts once.{left}",
+        ("frequency", "damping ratio", "kind"),
+        rows,
+        "rrl",
+    )

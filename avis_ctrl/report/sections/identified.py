@@ -32,22 +32,30 @@ def _origin(result: DesignResult, found: InDesign) -> Paragraph:
     d = found.found
     source = content.provenance.get("measurement")
     determined, kept = len(content.direction), len(found.directions)
-    text = (f"The identification{f' ({source})' if source else ''} determined {determined} combinations of "
-            f"{len(content.parameter)} parameters; {content.undetermined} have no influence on the measurements and "
-            f"keep their starting values. ")
+    text = (
+        f"The identification{f' ({source})' if source else ''} determined {determined} combinations of "
+        f"{len(content.parameter)} parameters; {content.undetermined} have no influence on the measurements and "
+        f"keep their starting values. "
+    )
     if kept:
-        text += (f"{kept} of them are bounded directions of the uncertainty set, each with a range of ± "
-                 f"{words.number(d.box)} standard deviations. The remaining combinations together change the response "
-                 f"by at most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}. ")
+        text += (
+            f"{kept} of them are bounded directions of the uncertainty set, each with a range of ± "
+            f"{words.number(d.box)} standard deviations. The remaining combinations together change the response "
+            f"by at most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}. "
+        )
     else:
-        text += (f"Within {words.number(d.ball)} standard deviations, all of them together change the response by at "
-                 f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}, so they need "
-                 "no separate uncertainty block. ")
-    text += ("The remaining combinations are added to the spread of the response. As the spread acts at the actuators, "
-             "their influence on the response to floor motion is not covered. If the errors are normally distributed, "
-             "directions and remaining combinations contain the true parameters with a probability of "
-             f"{words.number(100 * d.coverage)} %, and the spread bounds the error of the response with a probability "
-             f"of {words.number(100 * found.confidence)} % at each frequency.")
+        text += (
+            f"Within {words.number(d.ball)} standard deviations, all of them together change the response by at "
+            f"most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}, so they need "
+            "no separate uncertainty block. "
+        )
+    text += (
+        "The remaining combinations are added to the spread of the response. As the spread acts at the actuators, "
+        "their influence on the response to floor motion is not covered. If the errors are normally distributed, "
+        "directions and remaining combinations contain the true parameters with a probability of "
+        f"{words.number(100 * d.coverage)} %, and the spread bounds the error of the response with a probability "
+        f"of {words.number(100 * found.confidence)} % at each frequency."
+    )
     return Paragraph(text)
 
 
@@ -60,14 +68,28 @@ def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str
     rows = []
     for direction, effect in zip(found.directions, found.found.effect, strict=True):
         sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal.get(one[0]) or 1.0)))
-        shown = [f"{name} {100 * change / abs(nominal[name]):+.2g} %" if nominal.get(name) else
-                 f"{name} {change:+.2g} {words.unit(units.get(name, ''))}" for name, change in sizes[:SHOWN]]
+        shown = [
+            f"{name} {100 * change / abs(nominal[name]):+.2g} %"
+            if nominal.get(name)
+            else f"{name} {change:+.2g} {words.unit(units.get(name, ''))}"
+            for name, change in sizes[:SHOWN]
+        ]
         more = f" and {len(sizes) - SHOWN} parameters by less" if len(sizes) > SHOWN else ""
         rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %", ", ".join(shown) + more))
-    return [table("Directions of correlated parameters: each is one real number between −1 and 1 that changes all of "
-                  f"them together; 1 corresponds to {words.number(found.found.box)} standard deviations. The effect is "
-                  "the largest relative change of the response at 1.",
-                  ("direction", "effect", "change at +1"), rows, "lrl")] if rows else []
+    return (
+        [
+            table(
+                "Directions of correlated parameters: each is one real number between −1 and 1 that changes all of "
+                f"them together; 1 corresponds to {words.number(found.found.box)} standard deviations. The effect is "
+                "the largest relative change of the response at 1.",
+                ("direction", "effect", "change at +1"),
+                rows,
+                "lrl",
+            )
+        ]
+        if rows
+        else []
+    )
 
 
 def spread(found: InDesign) -> Figure:
@@ -75,16 +97,34 @@ def spread(found: InDesign) -> Figure:
     s, weight = found.spread, found.weight
     f = np.geomspace(min(JUDGED_HZ[0], s.frequency_Hz[0]), max(JUDGED_HZ[-1], s.frequency_Hz[-1]), 400)
     omega = 2 * np.pi * f
-    curves = (Curve(s.frequency_Hz, 100 * s.measured, "measured minus model, with noise", Style("#0072b2"),
-                    points=True, line=False),
-              Curve(s.frequency_Hz, 100 * (s.bound(found.confidence) - s.measured), "noise of the measurement",
-                    Style("#7a7a7a", "dot", 1.4)),
-              Curve(weight.omega / (2 * np.pi), 100 * weight.data, "bound to be covered",
-                    Style("#d55e00", "dash", 1.5)),
-              Curve(f, 100 * weight.envelope(omega), "envelope", Style("#e69f00", "dashdot", 1.3)),
-              Curve(f, 100 * weight.shape.magnitude(omega), f"filter of order {weight.shape.order}",
-                    Style("#222222", "solid", 2.0)))
-    return Figure("spread", "Relative difference between the measured response and the identified model in the kept "
-                  f"coordinates, largest singular value: {weight.meaning}. {found.assumption}".rstrip(),
-                  (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log"), curves),),
-                  height=1.1)
+    curves = (
+        Curve(
+            s.frequency_Hz,
+            100 * s.measured,
+            "measured minus model, with noise",
+            Style("#0072b2"),
+            points=True,
+            line=False,
+        ),
+        Curve(
+            s.frequency_Hz,
+            100 * (s.bound(found.confidence) - s.measured),
+            "noise of the measurement",
+            Style("#7a7a7a", "dot", 1.4),
+        ),
+        Curve(weight.omega / (2 * np.pi), 100 * weight.data, "bound to be covered", Style("#d55e00", "dash", 1.5)),
+        Curve(f, 100 * weight.envelope(omega), "envelope", Style("#e69f00", "dashdot", 1.3)),
+        Curve(
+            f,
+            100 * weight.shape.magnitude(omega),
+            f"filter of order {weight.shape.order}",
+            Style("#222222", "solid", 2.0),
+        ),
+    )
+    return Figure(
+        "spread",
+        "Relative difference between the measured response and the identified model in the kept "
+        f"coordinates, largest singular value: {weight.meaning}. {found.assumption}".rstrip(),
+        (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log"), curves),),
+        height=1.1,
+    )

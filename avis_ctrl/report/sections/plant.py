@@ -18,8 +18,15 @@ from avis_ctrl.study.plant import EFFORT, DesignPlant
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainEquation
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
-ROLES = {"w": "disturbance", "z": "performance", "u": "command", "y": "measurement", "internal": "internal",
-         "w_delta": "from Delta", "z_delta": "to Delta"}
+ROLES = {
+    "w": "disturbance",
+    "z": "performance",
+    "u": "command",
+    "y": "measurement",
+    "internal": "internal",
+    "w_delta": "from Delta",
+    "z_delta": "to Delta",
+}
 KINDS = {"real": "real", "complex": "complex scalar", "full": "complex"}
 HZ = np.geomspace(0.1, 500.0, 400)
 
@@ -28,18 +35,33 @@ def generalized_plant(result: DesignResult) -> Section:
     """The section on the generalized plant."""
     plant = result.plant
     P = plant.synthesis
-    drawing = Drawing("blocks", "Block diagram of the generalized plant, drawn from its parts and signals. A star "
-                      "stands for the axes or channels; ×n is the number of equal parts. Red: disturbances; blue: "
-                      "performance outputs; Δ: uncertainty.", block_diagram(plant),
-                      "Block diagram of the loop: controller, actuators, rig, sensors, weights and uncertainty")
-    summary = Paragraph(f"The plant of the synthesis has {P.P.nstates} states, {P.ncon} commands, {P.nmeas} "
-                        f"measurements, {len(P.w)} disturbances, {len(P.z)} weighted outputs and "
-                        f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
-                        f"{words.joined([words.axis(a) for a in plant.axes])}.")
+    drawing = Drawing(
+        "blocks",
+        "Block diagram of the generalized plant, drawn from its parts and signals. A star "
+        "stands for the axes or channels; ×n is the number of equal parts. Red: disturbances; blue: "
+        "performance outputs; Δ: uncertainty.",
+        block_diagram(plant),
+        "Block diagram of the loop: controller, actuators, rig, sensors, weights and uncertainty",
+    )
+    summary = Paragraph(
+        f"The plant of the synthesis has {P.P.nstates} states, {P.ncon} commands, {P.nmeas} "
+        f"measurements, {len(P.w)} disturbances, {len(P.z)} weighted outputs and "
+        f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
+        f"{words.joined([words.axis(a) for a in plant.axes])}."
+    )
     meanings = Bullets(tuple(f"{n}: {w.meaning}" for n, w in plant.weights.items()))
-    pieces: list[Piece] = [summary, drawing, _signals(plant), Heading("Uncertainty"), _blocks(result),
-                           *identified(result), Heading("Weights"), meanings, _transmissibility_weight(result),
-                           _effort(result)]
+    pieces: list[Piece] = [
+        summary,
+        drawing,
+        _signals(plant),
+        Heading("Uncertainty"),
+        _blocks(result),
+        *identified(result),
+        Heading("Weights"),
+        meanings,
+        _transmissibility_weight(result),
+        _effort(result),
+    ]
     pieces += [*_chains(plant), _noise(result), *_compliance(result)]
     return Section("Generalized plant", "plant", tuple(pieces))
 
@@ -51,8 +73,12 @@ def _signals(plant: DesignPlant) -> Table:
         readers = ", ".join(s.readers) or ("controller" if s.role == "y" else "Delta" if s.role == "z_delta" else "")
         source = {"u": "controller", "w_delta": "Delta"}.get(s.role, "outside" if s.source == EXTERNAL else s.source)
         rows.append((s.name, inside, s.meaning or _delta_words(s.role), s.unit or "1", source, readers, ROLES[s.role]))
-    return table("Signals of the connection; a star stands for an axis or a channel.",
-                 ("signal", "number", "meaning", "unit", "output of", "input of", "role"), rows, "lclllll")
+    return table(
+        "Signals of the connection; a star stands for an axis or a channel.",
+        ("signal", "number", "meaning", "unit", "output of", "input of", "role"),
+        rows,
+        "lclllll",
+    )
 
 
 def _delta_words(role: str) -> str:
@@ -84,9 +110,13 @@ def _blocks(result: DesignResult) -> Table:
             spread = "see the weight" if chain is None else "|W| of the weight"
             meaning = "neglected dynamics of this channel, of any phase"
         rows.append((block.name, KINDS[block.kind], size, spread, meaning))
-    return table("Blocks of the uncertainty, in the order of Delta. The size of a real block is the number of times "
-                 "that its parameter is repeated; each block has norm at most 1.",
-                 ("block", "kind", "size", "range", "what it stands for"), rows, "llcll")
+    return table(
+        "Blocks of the uncertainty, in the order of Delta. The size of a real block is the number of times "
+        "that its parameter is repeated; each block has norm at most 1.",
+        ("block", "kind", "size", "range", "what it stands for"),
+        rows,
+        "llcll",
+    )
 
 
 def _mu(result: DesignResult) -> ControllerResult:
@@ -98,14 +128,19 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
     omega = mu.transmissibility.omega
     f = omega / (2 * np.pi)
     limit = result.plant.weights["transmissibility"].bound(omega)
-    curves = (Curve(f, asked_dB(result, omega), "target of the synthesis", STYLES["limit"]),
-              Curve(f, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
-              Curve(f, in_dB(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
-              upper_bound(mu, "mu synthesis, upper bound over the set"))
-    return Figure("weight_transmissibility", "The target of the synthesis, its realisation by a rational "
-                  "filter, and the transmissibility achieved. The loop meets the target where its curves lie below "
-                  "that of the filter; the upper bound over the set was computed at the marked frequencies.",
-                  (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),))
+    curves = (
+        Curve(f, asked_dB(result, omega), "target of the synthesis", STYLES["limit"]),
+        Curve(f, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
+        Curve(f, in_dB(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
+        upper_bound(mu, "mu synthesis, upper bound over the set"),
+    )
+    return Figure(
+        "weight_transmissibility",
+        "The target of the synthesis, its realisation by a rational "
+        "filter, and the transmissibility achieved. The loop meets the target where its curves lie below "
+        "that of the filter; the upper bound over the set was computed at the marked frequencies.",
+        (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),),
+    )
 
 
 def _effort(result: DesignResult) -> Figure:
@@ -121,9 +156,12 @@ def _effort(result: DesignResult) -> Figure:
         closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
         curves.append(Curve(HZ, gain, f"mu synthesis, {words.axis(axis)}", numbered(k)))
-    return Figure("weight_effort", "Control effort: voltage of the drive that saturates first when a force acts along "
-                  "the axis, relative to floor velocity, compared with the limit of the weight; nominal plant.",
-                  (Panel(hertz(0.1, 500.0), Axis("drive voltage / floor velocity [V s/m]", "log"), tuple(curves)),))
+    return Figure(
+        "weight_effort",
+        "Control effort: voltage of the drive that saturates first when a force acts along "
+        "the axis, relative to floor velocity, compared with the limit of the weight; nominal plant.",
+        (Panel(hertz(0.1, 500.0), Axis("drive voltage / floor velocity [V s/m]", "log"), tuple(curves)),),
+    )
 
 
 def _chains(plant: DesignPlant) -> list[Piece]:
@@ -131,12 +169,19 @@ def _chains(plant: DesignPlant) -> list[Piece]:
     if not chains:
         return []
     omega = 2 * np.pi * HZ
-    curves = [Curve(HZ, 100 * w.magnitude(omega), f"{n.removesuffix(' *')}s", numbered(k))
-              for k, (n, w) in enumerate(chains.items())]
+    curves = [
+        Curve(HZ, 100 * w.magnitude(omega), f"{n.removesuffix(' *')}s", numbered(k))
+        for k, (n, w) in enumerate(chains.items())
+    ]
     curves.append(level(0.1, 500.0, 100.0, "100 %"))
-    return [Figure("weight_chains", "Neglected dynamics of each channel: relative uncertainty over frequency. Where it "
-                   "exceeds 100 %, not even the sign of the channel is known.",
-                   (Panel(hertz(0.1, 500.0), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),))]
+    return [
+        Figure(
+            "weight_chains",
+            "Neglected dynamics of each channel: relative uncertainty over frequency. Where it "
+            "exceeds 100 %, not even the sign of the channel is known.",
+            (Panel(hertz(0.1, 500.0), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),),
+        )
+    ]
 
 
 def _noise(result: DesignResult) -> Figure:
@@ -145,13 +190,18 @@ def _noise(result: DesignResult) -> Figure:
     noise = np.abs(plant.sensor_noise.frequency_response(omega)[:, 0, 0])
     inside = (plant.floor.low_Hz <= HZ) & (plant.floor.high_Hz >= HZ)
     floor = np.where(inside, plant.floor.asd(HZ, "velocity"), np.nan)
-    curves = (Curve(HZ, floor, f"floor ({plant.floor.name})", STYLES["plain"]),
-              Curve(HZ, noise, "noise of one sensor", STYLES["hinf"]),
-              level(0.1, 500.0, plant.floor_density, "mean floor density, unit of the noise inputs"))
-    return Figure("weight_noise", "Spectral density of the floor velocity at the site, in the band of its model, and "
-                  "of the noise of one sensor with its converter. Where the noise exceeds the floor motion, sensor "
-                  "noise dominates the signal.",
-                  (Panel(hertz(0.1, 500.0), Axis("velocity [m/s/√Hz]", "log"), curves),))
+    curves = (
+        Curve(HZ, floor, f"floor ({plant.floor.name})", STYLES["plain"]),
+        Curve(HZ, noise, "noise of one sensor", STYLES["hinf"]),
+        level(0.1, 500.0, plant.floor_density, "mean floor density, unit of the noise inputs"),
+    )
+    return Figure(
+        "weight_noise",
+        "Spectral density of the floor velocity at the site, in the band of its model, and "
+        "of the noise of one sensor with its converter. Where the noise exceeds the floor motion, sensor "
+        "noise dominates the signal.",
+        (Panel(hertz(0.1, 500.0), Axis("velocity [m/s/√Hz]", "log"), curves),),
+    )
 
 
 def _compliance(result: DesignResult) -> list[Piece]:
@@ -159,7 +209,14 @@ def _compliance(result: DesignResult) -> list[Piece]:
         return []
     omega = _mu(result).transmissibility.omega
     f = omega / (2 * np.pi)
-    curves = (Curve(f, result.plant.weights["compliance"].bound(omega), "1/|W_c|, allowed", STYLES["limit"]),
-              Curve(f, _mu(result).compliance, "mu synthesis", STYLES["mu"]))
-    return [Figure("weight_compliance", "Compliance, compared with the limit of the weight; nominal plant.",
-                   (Panel(hertz(0.1, 200.0), Axis("compliance [m/N]", "log"), curves),))]
+    curves = (
+        Curve(f, result.plant.weights["compliance"].bound(omega), "1/|W_c|, allowed", STYLES["limit"]),
+        Curve(f, _mu(result).compliance, "mu synthesis", STYLES["mu"]),
+    )
+    return [
+        Figure(
+            "weight_compliance",
+            "Compliance, compared with the limit of the weight; nominal plant.",
+            (Panel(hertz(0.1, 200.0), Axis("compliance [m/N]", "log"), curves),),
+        )
+    ]

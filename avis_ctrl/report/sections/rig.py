@@ -18,19 +18,34 @@ from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.plant import edge_levers
 
 # By measured quantity: kind of sensor, unit of its gain, and scale factor and unit of its limit.
-_KINDS = {"velocity": ("geophone", "V s/m", 1e3, "mm/s"), "acceleration": ("accelerometer", "V s²/m", 1.0, "m/s²"),
-         "displacement": ("position sensor", "V/m", 1e3, "mm")}
+_KINDS = {
+    "velocity": ("geophone", "V s/m", 1e3, "mm/s"),
+    "acceleration": ("accelerometer", "V s²/m", 1.0, "m/s²"),
+    "displacement": ("position sensor", "V/m", 1e3, "mm"),
+}
 _NUMBERED = re.compile(r"(?P<group>[A-Za-z_]+)(?P<number>\d+)\.(?P<rest>.+)")
 
 
 def rig(result: DesignResult) -> Section:
     """The section on the rig."""
     one = result.rig
-    drawing = Drawing("rig", f"The rig {one.name} by its named points, to scale; the outline is drawn around the "
-                      "points and is not the real contour. The edge lever turns the rotation phi_x into a "
-                      "displacement.", rig_drawing(one), f"Top view and side view of the rig {one.name}")
-    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _drives(one), _sensors(one), _electronics(result),
-                           *_reduction(result)]
+    drawing = Drawing(
+        "rig",
+        f"The rig {one.name} by its named points, to scale; the outline is drawn around the "
+        "points and is not the real contour. The edge lever turns the rotation phi_x into a "
+        "displacement.",
+        rig_drawing(one),
+        f"Top view and side view of the rig {one.name}",
+    )
+    pieces: list[Piece] = [
+        drawing,
+        *_parameters(one),
+        _modes(one),
+        _drives(one),
+        _sensors(one),
+        _electronics(result),
+        *_reduction(result),
+    ]
     return Section("The rig", "rig", tuple(pieces))
 
 
@@ -46,11 +61,23 @@ def _parameters(one: Rig) -> list[Piece]:
     found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
     for group, rows in grouped.items():
         numbers = sorted({n for row in rows.values() for n in row})
-        body = [(rest, words.unit(next(iter(row.values())).unit),
-                 *(_value(row[n].value) if n in row else "" for n in numbers)) for rest, row in rows.items()]
-        found.append(table(f"Parameters by {group}: stiffness k, damping c and position p along each axis, the "
-                           f"position relative to the geometric centre.",
-                           ("name", "unit", *(f"{group} {n}" for n in numbers)), body, "ll" + "r" * len(numbers)))
+        body = [
+            (
+                rest,
+                words.unit(next(iter(row.values())).unit),
+                *(_value(row[n].value) if n in row else "" for n in numbers),
+            )
+            for rest, row in rows.items()
+        ]
+        found.append(
+            table(
+                f"Parameters by {group}: stiffness k, damping c and position p along each axis, the "
+                f"position relative to the geometric centre.",
+                ("name", "unit", *(f"{group} {n}" for n in numbers)),
+                body,
+                "ll" + "r" * len(numbers),
+            )
+        )
     return found
 
 
@@ -67,40 +94,81 @@ def _modes(one: Rig) -> Table:
         damping = float(shape @ eom.C @ shape) / (4 * np.pi * frequency)
         moved = np.abs(shape * edge)
         moved /= moved.max()
-        main = sorted(((share, name) for share, name in zip(moved, eom.coordinates, strict=True) if share > 0.1),
-                      reverse=True)
-        rows.append((f"{words.number(frequency)} Hz", words.number(damping, 2),
-                     ", ".join(f"{name} {share:.2f}" for share, name in main)))
-    return table("Natural frequencies of the six degrees of freedom without control, modal damping, and mode shapes "
-                 "(largest coordinate = 1, rotations as displacement at the edge lever).",
-                 ("frequency", "damping ratio", "moves mainly"), rows, "rrl")
+        main = sorted(
+            ((share, name) for share, name in zip(moved, eom.coordinates, strict=True) if share > 0.1), reverse=True
+        )
+        rows.append(
+            (
+                f"{words.number(frequency)} Hz",
+                words.number(damping, 2),
+                ", ".join(f"{name} {share:.2f}" for share, name in main),
+            )
+        )
+    return table(
+        "Natural frequencies of the six degrees of freedom without control, modal damping, and mode shapes "
+        "(largest coordinate = 1, rotations as displacement at the edge lever).",
+        ("frequency", "damping ratio", "moves mainly"),
+        rows,
+        "rrl",
+    )
 
 
 def _drives(one: Rig) -> Table:
     actuators = one.mounted_body().actuators
-    rows = [(a.name, *_placed(a.position, a.direction), f"{words.number(a.constant_N_per_V)} N/V",
-             f"±{words.number(limit)} V", f"±{words.number(a.constant_N_per_V * limit)} N")
-            for a, limit in zip(actuators, one.limits_of([a.name for a in actuators]).tolist(), strict=True)]
-    return table("Drives: position relative to the geometric centre, direction of the force on the payload for a "
-                 "positive voltage.",
-                 ("name", "x, y, z [m]", "direction", "force constant", "limit", "largest force"), rows, "lllrrr")
+    rows = [
+        (
+            a.name,
+            *_placed(a.position, a.direction),
+            f"{words.number(a.constant_N_per_V)} N/V",
+            f"±{words.number(limit)} V",
+            f"±{words.number(a.constant_N_per_V * limit)} N",
+        )
+        for a, limit in zip(actuators, one.limits_of([a.name for a in actuators]).tolist(), strict=True)
+    ]
+    return table(
+        "Drives: position relative to the geometric centre, direction of the force on the payload for a "
+        "positive voltage.",
+        ("name", "x, y, z [m]", "direction", "force constant", "limit", "largest force"),
+        rows,
+        "lllrrr",
+    )
 
 
 def _sensors(one: Rig) -> Table:
     rows = []
     for s in one.sensors():
         kind, gain, scale, unit = _KINDS[s.quantity]
-        row = (s.name, kind, *_placed(np.array(s.position), np.array(s.direction)), f"{_value(s.gain)} {gain}",
-               _corner(s), f"{words.number(1e3 * s.noise_rms_V)} mV")
+        row = (
+            s.name,
+            kind,
+            *_placed(np.array(s.position), np.array(s.direction)),
+            f"{_value(s.gain)} {gain}",
+            _corner(s),
+            f"{words.number(1e3 * s.noise_rms_V)} mV",
+        )
         full = (f"±{words.number(scale * one.converter.range_V / s.gain)} {unit}",) if one.converter else ()
         rows.append((*row, *full))
-    header = ("name", "kind", "x, y, z [m]", "direction", "gain", "corner", "noise", *(
-        ("limit",) if one.converter else ()))
-    return table("Sensors on the payload: position relative to the geometric centre, direction of the motion that "
-                 "gives a positive voltage, gain in the passband with preamplifier, corner with the damping ratio in "
-                 "brackets, r.m.s. of white noise per sample"
-                 + (", motion at the converter's limit" if one.converter else "") + ". Position sensors, if any, "
-                 "measure relative to the chassis.", header, rows, "llllrlrr")
+    header = (
+        "name",
+        "kind",
+        "x, y, z [m]",
+        "direction",
+        "gain",
+        "corner",
+        "noise",
+        *(("limit",) if one.converter else ()),
+    )
+    return table(
+        "Sensors on the payload: position relative to the geometric centre, direction of the motion that "
+        "gives a positive voltage, gain in the passband with preamplifier, corner with the damping ratio in "
+        "brackets, r.m.s. of white noise per sample"
+        + (", motion at the converter's limit" if one.converter else "")
+        + ". Position sensors, if any, "
+        "measure relative to the chassis.",
+        header,
+        rows,
+        "llllrlrr",
+    )
 
 
 def _placed(position: np.ndarray, direction: np.ndarray) -> tuple[str, str]:
@@ -129,10 +197,12 @@ def _corner(s: Sensor) -> str:
 
 def _electronics(result: DesignResult) -> Table:
     one, loop = result.rig, result.design.loop
-    rows = [("sample rate", f"{words.number(one.sample_rate_Hz, 4)} Hz"),
-            ("delay from sample to voltage", f"{words.number(1e3 * one.loop_delay_s)} ms"),
-            ("amplifier corner", f"{words.number(loop.amplifier_corner_Hz)} Hz"),
-            ("edge lever of phi_x", f"{words.number(one.edge_m)} m")]
+    rows = [
+        ("sample rate", f"{words.number(one.sample_rate_Hz, 4)} Hz"),
+        ("delay from sample to voltage", f"{words.number(1e3 * one.loop_delay_s)} ms"),
+        ("amplifier corner", f"{words.number(loop.amplifier_corner_Hz)} Hz"),
+        ("edge lever of phi_x", f"{words.number(one.edge_m)} m"),
+    ]
     if one.acquisition is not None:
         rows.append(("converter", f"{one.acquisition.adc_bits} bits, ±{words.number(one.acquisition.adc_range_V)} V"))
     return table("Clock, amplifiers, converter and edge lever.", ("what", "value"), rows, "ll")
@@ -141,19 +211,41 @@ def _electronics(result: DesignResult) -> Table:
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
     if not error.left_out.size:
-        return [Heading("Design model"), Paragraph("The controller is designed on a model with all six degrees of "
-                                                   "freedom; no coordinate is locked.")]
-    rows = [(words.axis(out), name, words.quantity(error.max_dB[out, name], "dB"),
-             words.quantity(error.rms_dB[out, name], "dB")) for out, name in error.max_dB]
+        return [
+            Heading("Design model"),
+            Paragraph(
+                "The controller is designed on a model with all six degrees of freedom; no coordinate is locked."
+            ),
+        ]
+    rows = [
+        (
+            words.axis(out),
+            name,
+            words.quantity(error.max_dB[out, name], "dB"),
+            words.quantity(error.rms_dB[out, name], "dB"),
+        )
+        for out, name in error.max_dB
+    ]
     kept = words.joined(list(error.keep))
-    text = (f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
-            "the figure show the difference from the model with six degrees of freedom, relative to the largest gain "
-            "at the same frequency. The design model does not contain floor motion along the other axes; the "
-            f"transmissibility from these axes to {kept} is at most "
-            f"{words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. " + _largest(error))
-    return [Heading("Error of the design model"), Paragraph(text),
-            table("Difference between the design model and six degrees of freedom, relative to the largest gain, over "
-                  "0.1 to 100 Hz.", ("output", "input", "largest", "r.m.s."), rows, "llrr"), _compared(error)]
+    text = (
+        f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
+        "the figure show the difference from the model with six degrees of freedom, relative to the largest gain "
+        "at the same frequency. The design model does not contain floor motion along the other axes; the "
+        f"transmissibility from these axes to {kept} is at most "
+        f"{words.decibel(float(np.max(np.abs(error.left_out), initial=0.0)))}. " + _largest(error)
+    )
+    return [
+        Heading("Error of the design model"),
+        Paragraph(text),
+        table(
+            "Difference between the design model and six degrees of freedom, relative to the largest gain, over "
+            "0.1 to 100 Hz.",
+            ("output", "input", "largest", "r.m.s."),
+            rows,
+            "llrr",
+        ),
+        _compared(error),
+    ]
 
 
 def _largest(error: ReductionError) -> str:
@@ -161,8 +253,10 @@ def _largest(error: ReductionError) -> str:
     out, name = max(error.max_dB, key=lambda channel: error.max_dB[channel])
     k, j = error.keep.index(out), error.inputs.index(name)
     place = int(np.argmax(error.relative[:, k, j]))
-    return (f"The difference is largest at {words.hertz(float(error.omega[place]))}, from {name} to {out}: "
-            f"{words.number(100 * float(error.relative[place, k, j]))} % of the largest gain there.")
+    return (
+        f"The difference is largest at {words.hertz(float(error.omega[place]))}, from {name} to {out}: "
+        f"{words.number(100 * float(error.relative[place, k, j]))} % of the largest gain there."
+    )
 
 
 def _compared(error: ReductionError) -> Figure:
@@ -170,17 +264,33 @@ def _compared(error: ReductionError) -> Figure:
     curves = []
     for k, name in enumerate(error.keep):
         colour = numbered(k).colour
-        curves += [Curve(f, in_dB(error.full[:, k, k]), f"{name}, six degrees of freedom",
-                         Style(colour, "solid", 2.2)),
-                   Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, design model", Style("#111111", "dot", 1.6))]
+        curves += [
+            Curve(f, in_dB(error.full[:, k, k]), f"{name}, six degrees of freedom", Style(colour, "solid", 2.2)),
+            Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, design model", Style("#111111", "dot", 1.6)),
+        ]
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
     curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
-    panel = Panel(hertz(), Axis("gain [dB]", "linear", (-80.0, 40.0)), tuple(curves),
-                  title="transmissibility along each kept axis")
-    apart = [Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
-             for k, name in enumerate(error.keep)]
-    lower = Panel(hertz(), Axis("difference [dB]", "linear", (-140.0, 20.0)), tuple(apart),
-                  title="difference, relative to the largest gain")
-    return Figure("reduction", "Transmissibility without control, floor to payload along each kept axis: six degrees "
-                  "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
-                  "the floor's other axes. Beside it, their difference.", (panel, lower), 2)
+    panel = Panel(
+        hertz(),
+        Axis("gain [dB]", "linear", (-80.0, 40.0)),
+        tuple(curves),
+        title="transmissibility along each kept axis",
+    )
+    apart = [
+        Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
+        for k, name in enumerate(error.keep)
+    ]
+    lower = Panel(
+        hertz(),
+        Axis("difference [dB]", "linear", (-140.0, 20.0)),
+        tuple(apart),
+        title="difference, relative to the largest gain",
+    )
+    return Figure(
+        "reduction",
+        "Transmissibility without control, floor to payload along each kept axis: six degrees "
+        "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
+        "the floor's other axes. Beside it, their difference.",
+        (panel, lower),
+        2,
+    )

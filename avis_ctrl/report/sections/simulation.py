@@ -19,12 +19,14 @@ def simulation(result: DesignResult) -> Section:
     if not isinstance(check, SimulationCheck):
         return Section("Simulation of the nonlinear rig", "simulation", (Paragraph("No simulation was run."),))
     passed = sum(p.passed for p in check.plants)
-    text = (f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom, with "
-            f"the sampled mu controller and the skyhook loops of the other axes, simulated for "
-            f"{words.number(check.duration_s)} s with hold, delay, converter, limits, sensors, floor motion and "
-            "noise. A plant passes if it is stable, no voltage reaches its limit, and its "
-            "spectrum agrees with the linear prediction within the limits of random scatter "
-            f"(probability of a false alarm in any plant: {words.number(100 * check.false_alarm, 2)} %).")
+    text = (
+        f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom, with "
+        f"the sampled mu controller and the skyhook loops of the other axes, simulated for "
+        f"{words.number(check.duration_s)} s with hold, delay, converter, limits, sensors, floor motion and "
+        "noise. A plant passes if it is stable, no voltage reaches its limit, and its "
+        "spectrum agrees with the linear prediction within the limits of random scatter "
+        f"(probability of a false alarm in any plant: {words.number(100 * check.false_alarm, 2)} %)."
+    )
     pieces: list[Piece] = [Paragraph(text, "verdict", passed == len(check.plants)), _plants(check)]
     if result.loop is not None and (result.loop.companions.loops or result.loop.companions.passive):
         pieces.append(_companions(result.loop.companions))
@@ -39,31 +41,50 @@ def _plants(check: SimulationCheck) -> Table:
     loop = check.first.loop
     limits = dict(zip(loop.rig.equations_of_motion().actuators, loop.limits_V.tolist(), strict=True))
     differ = len(set(limits.values())) > 1
-    rows = [(p.name, Mark("pass", True) if p.passed else Mark("FAIL", False),
-             Mark("diverged", False) if p.diverged else yes_or_no(p.stable), _agreement(p),
-             f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
-             str(p.clipped_dac + p.clipped_adc),
-             ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()))
-            for p in check.plants]
+    rows = [
+        (
+            p.name,
+            Mark("pass", True) if p.passed else Mark("FAIL", False),
+            Mark("diverged", False) if p.diverged else yes_or_no(p.stable),
+            _agreement(p),
+            f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
+            str(p.clipped_dac + p.clipped_adc),
+            ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()),
+        )
+        for p in check.plants
+    ]
     nearest = "of the drive that comes closest to its limit;" if differ else "limit"
-    return table(f"Every simulated plant. Commanded voltages, {nearest} {words.limits(limits)}; clipped samples of "
-                 "drives and converter together.",
-                 ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped",
-                  "velocity r.m.s. [µm/s]"), rows, "lcccrrl")
+    return table(
+        f"Every simulated plant. Commanded voltages, {nearest} {words.limits(limits)}; clipped samples of "
+        "drives and converter together.",
+        ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped", "velocity r.m.s. [µm/s]"),
+        rows,
+        "lcccrrl",
+    )
 
 
 def _companions(companions: Companions) -> Table:
     asked, low = companions.settings.modulus_margin, companions.below_margin()
     rows: list[tuple[Cell, ...]] = [
-        (words.axis(one.axis), f"{words.number(one.gain)} N s/m", f"{words.number(one.tilt_corner_Hz)} Hz",
-         f"{words.number(one.roll_off_Hz)} Hz", Mark(words.number(one.modulus_margin, 2), one not in low))
-        for one in companions.loops]
+        (
+            words.axis(one.axis),
+            f"{words.number(one.gain)} N s/m",
+            f"{words.number(one.tilt_corner_Hz)} Hz",
+            f"{words.number(one.roll_off_Hz)} Hz",
+            Mark(words.number(one.modulus_margin, 2), one not in low),
+        )
+        for one in companions.loops
+    ]
     rows += [(words.axis(axis), "passive", "", "", why) for axis, why in companions.passive]
-    return table("Axes that the mu controller does not control. Each has a skyhook loop, designed for this rig's "
-                 "sensors with all other loops closed, or remains passive. The modulus margin is the smallest distance "
-                 "of the Nyquist curve from the critical point, for the nominal plant; at least "
-                 f"{asked:g} is required. sampled_controller.json contains these loops and the mu controller.",
-                 ("axis", "gain", "tilt corner", "roll-off", "modulus margin"), rows, "lrrrr")
+    return table(
+        "Axes that the mu controller does not control. Each has a skyhook loop, designed for this rig's "
+        "sensors with all other loops closed, or remains passive. The modulus margin is the smallest distance "
+        "of the Nyquist curve from the critical point, for the nominal plant; at least "
+        f"{asked:g} is required. sampled_controller.json contains these loops and the mu controller.",
+        ("axis", "gain", "tilt corner", "roll-off", "modulus margin"),
+        rows,
+        "lrrrr",
+    )
 
 
 def _agreement(p: PlantCheck) -> Mark | str:
@@ -76,13 +97,22 @@ def _agreement(p: PlantCheck) -> Mark | str:
 def _spectrum(name: str, s: SpectrumAgreement) -> Figure:
     panels = []
     for k, axis in enumerate(s.axes):
-        curves = (Curve(s.frequency_Hz, np.sqrt(s.estimated_psd[k]), "simulated", Style("#e69f00", "solid", 1.2)),
-                  Curve(s.frequency_Hz, np.sqrt(s.predicted_psd[k]), "predicted", STYLES["mu"]))
-        panels.append(Panel(hertz(float(s.frequency_Hz[0]), 100.0), Axis("velocity [m/s/√Hz]", "log"), curves, (),
-                            words.axis(axis)))
-    return Figure("spectrum", f"Spectral density of the payload velocity for the plant \"{name}\": simulated (Welch's "
-                  "method), and predicted by the linear model of the sampled loop.", tuple(panels),
-                  min(2, len(panels)))
+        curves = (
+            Curve(s.frequency_Hz, np.sqrt(s.estimated_psd[k]), "simulated", Style("#e69f00", "solid", 1.2)),
+            Curve(s.frequency_Hz, np.sqrt(s.predicted_psd[k]), "predicted", STYLES["mu"]),
+        )
+        panels.append(
+            Panel(
+                hertz(float(s.frequency_Hz[0]), 100.0), Axis("velocity [m/s/√Hz]", "log"), curves, (), words.axis(axis)
+            )
+        )
+    return Figure(
+        "spectrum",
+        f'Spectral density of the payload velocity for the plant "{name}": simulated (Welch\'s '
+        "method), and predicted by the linear model of the sampled loop.",
+        tuple(panels),
+        min(2, len(panels)),
+    )
 
 
 def _ratios(check: SimulationCheck) -> Figure:
@@ -92,25 +122,49 @@ def _ratios(check: SimulationCheck) -> Figure:
         curves = []
         for p in check.plants:
             if p.spectrum is not None:
-                curves.append(Curve(p.spectrum.midband_Hz, 10 * np.log10(p.spectrum.ratio[k]), "each plant",
-                                    Style("#0072b2", "solid", 0.7), points=True, line=False))
+                curves.append(
+                    Curve(
+                        p.spectrum.midband_Hz,
+                        10 * np.log10(p.spectrum.ratio[k]),
+                        "each plant",
+                        Style("#0072b2", "solid", 0.7),
+                        points=True,
+                        line=False,
+                    )
+                )
         s = next(p.spectrum for p in check.plants if p.spectrum is not None)
         for edge in (s.lower, s.upper):
             curves.append(Curve(s.midband_Hz, 10 * np.log10(edge[k]), "limits of random scatter", STYLES["limit"]))
-        panels.append(Panel(hertz(0.8, 100.0), Axis("simulated over predicted [dB]", "linear"), tuple(curves), (),
-                            words.axis(axis)))
-    return Figure("spectrum_ratio", "Power in third octaves, simulated over predicted, for every plant. The dashed "
-                  "lines are the limits of the first plant; each plant is tested against its own.", tuple(panels),
-                  min(2, len(panels)))
+        panels.append(
+            Panel(
+                hertz(0.8, 100.0), Axis("simulated over predicted [dB]", "linear"), tuple(curves), (), words.axis(axis)
+            )
+        )
+    return Figure(
+        "spectrum_ratio",
+        "Power in third octaves, simulated over predicted, for every plant. The dashed "
+        "lines are the limits of the first plant; each plant is tested against its own.",
+        tuple(panels),
+        min(2, len(panels)),
+    )
 
 
 def _record(check: SimulationCheck) -> Figure:
     first = check.first
     part = slice(0, min(5000, len(first.time)))
-    motion = [Curve(first.time[part], 1e6 * first.velocity(axis)[part], words.axis(axis),
-                    Style(("#0072b2", "#d55e00", "#009e73")[k % 3], "solid", 0.9))
-              for k, axis in enumerate(first.loop.axes)]
+    motion = [
+        Curve(
+            first.time[part],
+            1e6 * first.velocity(axis)[part],
+            words.axis(axis),
+            Style(("#0072b2", "#d55e00", "#009e73")[k % 3], "solid", 0.9),
+        )
+        for k, axis in enumerate(first.loop.axes)
+    ]
     span = (float(first.time[part][0]), float(first.time[part][-1]))
-    return Figure("record", f"The first seconds of the simulation of the plant \"{check.plants[0].name}\": payload "
-                  "velocity, rotations at the edge.",
-                  (Panel(Axis("time [s]", "linear", span), Axis("velocity [µm/s]"), tuple(motion)),))
+    return Figure(
+        "record",
+        f'The first seconds of the simulation of the plant "{check.plants[0].name}": payload '
+        "velocity, rotations at the edge.",
+        (Panel(Axis("time [s]", "linear", span), Axis("velocity [µm/s]"), tuple(motion)),),
+    )

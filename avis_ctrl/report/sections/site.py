@@ -15,10 +15,13 @@ from avis_ctrl.study.design_result import ControllerResult, DesignResult
 def site(result: DesignResult) -> Section:
     """The section on the site."""
     floor = result.plant.floor
-    text = Paragraph(f"The floor moves independently along each kept axis, each time with the spectrum {floor.name} "
-                     f"({floor.source}); sensor noise is added. Nominal plant, linear model.")
-    return Section("On the site", "site", (text, _third_octaves(result), _motion(result), _volts(result),
-                                           _compliance(result)))
+    text = Paragraph(
+        f"The floor moves independently along each kept axis, each time with the spectrum {floor.name} "
+        f"({floor.source}); sensor noise is added. Nominal plant, linear model."
+    )
+    return Section(
+        "On the site", "site", (text, _third_octaves(result), _motion(result), _volts(result), _compliance(result))
+    )
 
 
 def _settled(result: DesignResult) -> list[ControllerResult]:
@@ -32,41 +35,66 @@ def _third_octaves(result: DesignResult) -> Figure:
     curves = []
     for c in CRITERIA:
         limit = c.limit(bands)
-        curves.append(Curve(bands, np.where(np.isfinite(limit), 1e6 * limit, np.nan),
-                            "VC-A (top) to VC-G" if c.name == "VC-A" else "", STYLES["faint"]))
+        curves.append(
+            Curve(
+                bands,
+                np.where(np.isfinite(limit), 1e6 * limit, np.nan),
+                "VC-A (top) to VC-G" if c.name == "VC-A" else "",
+                STYLES["faint"],
+            )
+        )
     curves.append(Curve(bands, 1e6 * first.floor_third_octaves, "floor", STYLES["plain"]))
     for one in _settled(result):
-        curves.append(Curve(bands, 1e6 * one.site.payload_third_octaves.max(axis=1), one.title,
-                            controller_style(one.name)))
+        curves.append(
+            Curve(bands, 1e6 * one.site.payload_third_octaves.max(axis=1), one.title, controller_style(one.name))
+        )
     ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in _settled(result))
     panel = Panel(hertz(1.0, 100.0), Axis("velocity [µm/s r.m.s.]", "log"), tuple(curves))
-    return Figure("third_octaves", "Velocity in third octaves: the site's floor, and the worst axis of the payload, "
-                  "compared with the generic vibration criteria. Criterion met: floor "
-                  f"{first.floor_rating or 'none'}; {ratings}."
-                  + left_out(result),
-                  (panel,))
+    return Figure(
+        "third_octaves",
+        "Velocity in third octaves: the site's floor, and the worst axis of the payload, "
+        "compared with the generic vibration criteria. Criterion met: floor "
+        f"{first.floor_rating or 'none'}; {ratings}." + left_out(result),
+        (panel,),
+    )
 
 
 def _motion(result: DesignResult) -> Table:
     axes, shown = result.plant.axes, _settled(result)
     rows = [(words.axis(a), *(words.number(1e6 * c.site.velocity_rms[a]) for c in shown)) for a in axes]
-    rows += [(f"{words.axis(a)}, from sensor noise", *(words.number(1e6 * c.site.noise_rms[a]) for c in shown))
-             for a in axes]
+    rows += [
+        (f"{words.axis(a)}, from sensor noise", *(words.number(1e6 * c.site.noise_rms[a]) for c in shown)) for a in axes
+    ]
     rows.append(("criterion", *(c.site.rating or "none" for c in shown)))
     low, high = result.design.floor.band_Hz
-    return table(f"Payload velocity r.m.s. [µm/s] from {low:g} to {high:g} Hz, from floor and sensor noise together "
-                 "and from the noise alone.", ("axis", *(c.title for c in shown)), rows)
+    return table(
+        f"Payload velocity r.m.s. [µm/s] from {low:g} to {high:g} Hz, from floor and sensor noise together "
+        "and from the noise alone.",
+        ("axis", *(c.title for c in shown)),
+        rows,
+    )
 
 
 def _volts(result: DesignResult) -> Table:
-    rows = [(c.title, *(f"{words.number(rms)} / {words.number(c.site.volts_peak[name])}"
-                        for name, rms in c.site.volts_rms.items()))
-            for c in _settled(result) if c.K is not None]
+    rows = [
+        (
+            c.title,
+            *(
+                f"{words.number(rms)} / {words.number(c.site.volts_peak[name])}"
+                for name, rms in c.site.volts_rms.items()
+            ),
+        )
+        for c in _settled(result)
+        if c.K is not None
+    ]
     names = result.plant.actuators
     limits = dict(zip(names, result.rig.limits_of(names).tolist(), strict=True))
-    return table("Voltages on the site by channel, r.m.s. / peak [V]. The peak is the level that a Gaussian signal "
-                 f"exceeds once in ten minutes; the limit is {words.limits(limits)}.",
-                 ("controller", *names), rows)
+    return table(
+        "Voltages on the site by channel, r.m.s. / peak [V]. The peak is the level that a Gaussian signal "
+        f"exceeds once in ten minutes; the limit is {words.limits(limits)}.",
+        ("controller", *names),
+        rows,
+    )
 
 
 def _compliance(result: DesignResult) -> Figure:
@@ -74,6 +102,9 @@ def _compliance(result: DesignResult) -> Figure:
     for c in _settled(result):
         style: Style = controller_style(c.name)
         curves.append(Curve(c.transmissibility.omega / (2 * np.pi), 1e6 * c.compliance, c.title, style))
-    return Figure("compliance", "Compliance: displacement of the payload relative to the floor per force on the "
-                  "payload, largest singular value, floor at rest; nominal plant." + left_out(result),
-                  (Panel(hertz(0.1, 200.0), Axis("compliance [µm/N]", "log"), tuple(curves)),))
+    return Figure(
+        "compliance",
+        "Compliance: displacement of the payload relative to the floor per force on the "
+        "payload, largest singular value, floor at rest; nominal plant." + left_out(result),
+        (Panel(hertz(0.1, 200.0), Axis("compliance [µm/N]", "log"), tuple(curves)),),
+    )

@@ -15,9 +15,19 @@ def synthesis(result: DesignResult) -> Section:
     history = result.dk_history
     if not history:
         return Section("D-K iteration", "synthesis", (Paragraph("No iteration was run."),))
-    rows = [(str(h.iteration), h.kind, words.bound(h.gamma, 4), words.bound(h.mu_upper, 4), str(h.order),
-             str(h.d_order), f"{words.number(100 * h.d_fit_error, 2)} %", f"{words.number(h.seconds, 2)} s")
-            for h in history]
+    rows = [
+        (
+            str(h.iteration),
+            h.kind,
+            words.bound(h.gamma, 4),
+            words.bound(h.mu_upper, 4),
+            str(h.order),
+            str(h.d_order),
+            f"{words.number(100 * h.d_fit_error, 2)} %",
+            f"{words.number(h.seconds, 2)} s",
+        )
+        for h in history
+    ]
     steps = np.array([h.iteration for h in history], float)
     marked = Axis("iteration", "linear", (steps[0] - 0.5, steps[-1] + 0.5))
     gamma, mu = np.array([h.gamma for h in history]), np.array([h.mu_upper for h in history])
@@ -25,24 +35,49 @@ def synthesis(result: DesignResult) -> Section:
     both = both[np.isfinite(both) & (both > 0)]
     low, top = float(np.min(both, initial=1.0)), float(np.max(both, initial=1.0))
     # The first gamma, before any scaling, is often a hundred times the final one.
-    shown = Axis("gamma, mu", "log", (0.7 * low, 1.5 * top)) if top > 8 * low else \
-        Axis("gamma, mu", "linear", (0.0, 1.1 * top))
-    values = Panel(marked, shown, (
-        Curve(steps, gamma, "gamma of the scaled loop", numbered(1), points=True),
-        Curve(steps, mu, "peak of the upper bound of mu", STYLES["mu"], points=True),
-        level(steps[0] - 0.5, steps[-1] + 0.5, 1.0, "limit 1")))
+    shown = (
+        Axis("gamma, mu", "log", (0.7 * low, 1.5 * top))
+        if top > 8 * low
+        else Axis("gamma, mu", "linear", (0.0, 1.1 * top))
+    )
+    values = Panel(
+        marked,
+        shown,
+        (
+            Curve(steps, gamma, "gamma of the scaled loop", numbered(1), points=True),
+            Curve(steps, mu, "peak of the upper bound of mu", STYLES["mu"], points=True),
+            level(steps[0] - 0.5, steps[-1] + 0.5, 1.0, "limit 1"),
+        ),
+    )
     order = np.array([h.order for h in history], float)
-    orders = Panel(marked, Axis("states", "linear", (0.0, 1.15 * float(order.max()))), (
-        Curve(steps, order, "states of the controller", STYLES["plain"], points=True),
-        Curve(steps, np.array([h.d_order for h in history], float), "states of the scalings", numbered(3),
-              points=True)))
+    orders = Panel(
+        marked,
+        Axis("states", "linear", (0.0, 1.15 * float(order.max()))),
+        (
+            Curve(steps, order, "states of the controller", STYLES["plain"], points=True),
+            Curve(
+                steps, np.array([h.d_order for h in history], float), "states of the scalings", numbered(3), points=True
+            ),
+        ),
+    )
     total = sum(h.seconds for h in history)
-    caption = (f"Course of the mu synthesis: {len(history)} iterations in {words.number(total)} s. gamma is the norm "
-               "of the scaled loop, an upper bound of mu with every block taken as complex.")
-    return Section("D-K iteration", "synthesis", (
-        table("The iterations. Kind: \"H-infinity\", \"nominal\" (plant without uncertainty) and \"given\" are initial "
-              "controllers; \"D-K\" alternates synthesis and scalings; the others improve the best controller. Fit: "
-              "increase of the bound caused by realising the scalings as rational functions, compared with the best "
-              "scalings at each frequency. The best controller of all iterations is used.",
-              ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"), rows, "rlrrrrrr"),
-        Figure("dk_history", caption, (values, orders), 2)))
+    caption = (
+        f"Course of the mu synthesis: {len(history)} iterations in {words.number(total)} s. gamma is the norm "
+        "of the scaled loop, an upper bound of mu with every block taken as complex."
+    )
+    return Section(
+        "D-K iteration",
+        "synthesis",
+        (
+            table(
+                'The iterations. Kind: "H-infinity", "nominal" (plant without uncertainty) and "given" are initial '
+                'controllers; "D-K" alternates synthesis and scalings; the others improve the best controller. Fit: '
+                "increase of the bound caused by realising the scalings as rational functions, compared with the best "
+                "scalings at each frequency. The best controller of all iterations is used.",
+                ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"),
+                rows,
+                "rlrrrrrr",
+            ),
+            Figure("dk_history", caption, (values, orders), 2),
+        ),
+    )

@@ -26,12 +26,22 @@ def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece
         return []
     moved = np.array([one.moved for one in found])
     far = int(np.sum(np.abs(moved) > shown.far))
-    rms = words.number(float(np.sqrt(np.mean(moved ** 2))), 2)
-    rows = [(one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2f}")
-            for one in found[:shown.rows]]
+    rms = words.number(float(np.sqrt(np.mean(moved**2))), 2)
+    rows = [
+        (one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2f}")
+        for one in found[: shown.rows]
+    ]
     return [
         Heading("Tolerances"),
-        Paragraph(f"{len(found)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
-                  f"(r.m.s.), {far or 'none'} of them by more than {shown.far:g} tolerances."),
-        table(f"The {len(rows)} values of the rig file that moved most, in units of their tolerance. The JSON file of "
-              "results lists all.", ("parameter", "value", "± 1 σ", "unit", "moved by"), rows, "lrrlr")]
+        Paragraph(
+            f"{len(found)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
+            f"(r.m.s.), {far or 'none'} of them by more than {shown.far:g} tolerances."
+        ),
+        table(
+            f"The {len(rows)} values of the rig file that moved most, in units of their tolerance. The JSON file of "
+            "results lists all.",
+            ("parameter", "value", "± 1 σ", "unit", "moved by"),
+            rows,
+            "lrrlr",
+        ),
+    ]

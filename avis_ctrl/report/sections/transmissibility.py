@@ -22,12 +22,18 @@ def transmissibility(result: DesignResult) -> Section:
 
 def _against_skyhook(result: DesignResult) -> Table:
     low, high = result.design.transmissibility.band_Hz
-    rows = [(words.axis(one.axis), words.decibel(one.mu), words.decibel(one.skyhook), words.decibel(one.advantage))
-            for one in result.by_axis]
-    return table(f"Worst case of each axis over {low:g} to {high:g} Hz, for a floor that moves in any direction: upper "
-                 "bound of the mu controller over the whole set, and lower bound of the tuned skyhook, which a plant "
-                 "of the set reaches.",
-                 ("axis", "mu synthesis, at most", "skyhook, at least", "improvement, at least"), rows, "lrrr")
+    rows = [
+        (words.axis(one.axis), words.decibel(one.mu), words.decibel(one.skyhook), words.decibel(one.advantage))
+        for one in result.by_axis
+    ]
+    return table(
+        f"Worst case of each axis over {low:g} to {high:g} Hz, for a floor that moves in any direction: upper "
+        "bound of the mu controller over the whole set, and lower bound of the tuned skyhook, which a plant "
+        "of the set reaches.",
+        ("axis", "mu synthesis, at most", "skyhook, at least", "improvement, at least"),
+        rows,
+        "lrrr",
+    )
 
 
 def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
@@ -57,8 +63,7 @@ def upper_bound(c: ControllerResult, label: str) -> Curve:
     """Upper bound of the worst case, marked at the computed frequencies; between them it may be higher."""
     b = c.worst_peak
     order = np.argsort(b.frequencies)
-    return Curve(b.frequencies[order] / (2 * np.pi), in_dB(b.upper_curve[order]), label, STYLES["plain"],
-                 points=True)
+    return Curve(b.frequencies[order] / (2 * np.pi), in_dB(b.upper_curve[order]), label, STYLES["plain"], points=True)
 
 
 def _hz(c: ControllerResult) -> np.ndarray:
@@ -72,18 +77,26 @@ def _panel(curves: list[Curve], bands: list[Band], title: str, ranged: tuple[flo
 def summary_figure(result: DesignResult) -> Figure:
     """The delivered controller compared with the table without control, and its bound over the whole set."""
     mu, passive = result.controller("mu"), result.controller("passive")
-    curves = [*(_sigma(c) for c in (passive, mu) if c.stable), upper_bound(mu, "mu synthesis, worst case of the set"),
-              _limit(result)]
-    return Figure("summary", "Transmissibility from floor to payload, largest gain: without control, with the mu "
-                  "controller on the nominal plant, and its upper bound over every plant of the uncertainty set.",
-                  (_panel(curves, [], ""),))
+    curves = [
+        *(_sigma(c) for c in (passive, mu) if c.stable),
+        upper_bound(mu, "mu synthesis, worst case of the set"),
+        _limit(result),
+    ]
+    return Figure(
+        "summary",
+        "Transmissibility from floor to payload, largest gain: without control, with the mu "
+        "controller on the nominal plant, and its upper bound over every plant of the uncertainty set.",
+        (_panel(curves, [], ""),),
+    )
 
 
 def _nominal(result: DesignResult) -> Figure:
     mu, passive = result.controller("mu"), result.controller("passive")
-    caption = (f"Largest singular value from floor velocity to payload velocity, nominal plant. Without control the "
-               f"table peaks at {words.decibel(passive.peak_transmissibility)}, under the mu controller at "
-               f"{words.decibel(mu.peak_transmissibility)}.")
+    caption = (
+        f"Largest singular value from floor velocity to payload velocity, nominal plant. Without control the "
+        f"table peaks at {words.decibel(passive.peak_transmissibility)}, under the mu controller at "
+        f"{words.decibel(mu.peak_transmissibility)}."
+    )
     curves = [_sigma(c) for c in result.controllers if c.stable]
     return Figure("transmissibility_nominal", caption + left_out(result), (_panel([*curves, _limit(result)], [], ""),))
 
@@ -107,32 +120,49 @@ def _uncertain(result: DesignResult) -> Figure:
 def _spread_words(result: DesignResult) -> str:
     parts = []
     for c in _with_bounds(result):
-        parts.append(f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
-                     f"bound at {words.decibel(c.worst_peak.upper)}")
-    return ("Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
-            f"and the upper bound that no plant of the set exceeds at the marked frequencies. The lines between the "
-            f"marks only guide the eye; the bound of the peak is also proved between them. {'; '.join(parts)}.")
+        parts.append(
+            f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
+            f"bound at {words.decibel(c.worst_peak.upper)}"
+        )
+    return (
+        "Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
+        f"and the upper bound that no plant of the set exceeds at the marked frequencies. The lines between the "
+        f"marks only guide the eye; the bound of the peak is also proved between them. {'; '.join(parts)}."
+    )
 
 
 def _by_axis(result: DesignResult) -> Figure:
     panels = []
     for k, axis in enumerate(result.plant.axes):
-        curves = [Curve(_hz(c), in_dB(c.transmissibility.nominal[:, k, k]), c.title, controller_style(c.name))
-                  for c in result.controllers if c.stable]
-        panels.append(Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (),
-                            words.axis(axis)))
-    return Figure("transmissibility_axes", "Each axis alone, nominal plant: payload velocity over floor velocity along "
-                  "the same axis, without the coupling between axes." + left_out(result), tuple(panels),
-                  min(2, len(panels)))
+        curves = [
+            Curve(_hz(c), in_dB(c.transmissibility.nominal[:, k, k]), c.title, controller_style(c.name))
+            for c in result.controllers
+            if c.stable
+        ]
+        panels.append(
+            Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (), words.axis(axis))
+        )
+    return Figure(
+        "transmissibility_axes",
+        "Each axis alone, nominal plant: payload velocity over floor velocity along "
+        "the same axis, without the coupling between axes." + left_out(result),
+        tuple(panels),
+        min(2, len(panels)),
+    )
 
 
 def _six_dof(result: DesignResult) -> Figure:
     check, mu = result.six_dof, result.controller("mu")
     f = check.omega / (2 * np.pi)
-    curves = [_sigma(mu), Curve(f, in_dB(check.kept), "six degrees of freedom, sampled", STYLES["plain"]),
-              Curve(f, in_dB(check.others), "from the floor's other coordinates", STYLES["limit"])]
-    caption = (f"Check of the design model: the sampled mu controller on all six degrees of freedom, with the skyhook "
-               f"loops of the other axes. In the band the largest gain differs by at most {check.deviation_dB:.2g} dB "
-               "from that of the design model. The third line shows how floor motion along the other coordinates "
-               "reaches the kept axes.")
+    curves = [
+        _sigma(mu),
+        Curve(f, in_dB(check.kept), "six degrees of freedom, sampled", STYLES["plain"]),
+        Curve(f, in_dB(check.others), "from the floor's other coordinates", STYLES["limit"]),
+    ]
+    caption = (
+        f"Check of the design model: the sampled mu controller on all six degrees of freedom, with the skyhook "
+        f"loops of the other axes. In the band the largest gain differs by at most {check.deviation_dB:.2g} dB "
+        "from that of the design model. The third line shows how floor motion along the other coordinates "
+        "reaches the kept axes."
+    )
     return Figure("transmissibility_six_dof", caption, (_panel(curves, [], ""),))

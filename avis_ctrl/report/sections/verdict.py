@@ -16,13 +16,34 @@ from avis_ctrl.study.verdict import all_axes, first_sentence
 
 def verdict(result: DesignResult) -> Section:
     """Summary page: the task, the verdict on each requirement, the certificate, and one figure."""
-    rows = [(r.name, Mark("met" if r.met else "NOT MET", r.met), words.quantity(r.value, r.unit),
-             f"{r.comparison} {words.quantity(r.limit, r.unit)}") for r in result.requirements]
-    met = [table("Requirements of the design and the results of the mu controller. Values in dB are the largest "
-                 "singular value from floor to payload, rotations as displacement of the edge.",
-                 ("requirement", "verdict", "result", "limit"), rows, "lcrr")] if rows else []
-    return Section("Summary", "verdict", (_sentence(result), _asked(result, bool(met)), *met, certificate(result),
-                                          summary_figure(result)), alone=True)
+    rows = [
+        (
+            r.name,
+            Mark("met" if r.met else "NOT MET", r.met),
+            words.quantity(r.value, r.unit),
+            f"{r.comparison} {words.quantity(r.limit, r.unit)}",
+        )
+        for r in result.requirements
+    ]
+    met = (
+        [
+            table(
+                "Requirements of the design and the results of the mu controller. Values in dB are the largest "
+                "singular value from floor to payload, rotations as displacement of the edge.",
+                ("requirement", "verdict", "result", "limit"),
+                rows,
+                "lcrr",
+            )
+        ]
+        if rows
+        else []
+    )
+    return Section(
+        "Summary",
+        "verdict",
+        (_sentence(result), _asked(result, bool(met)), *met, certificate(result), summary_figure(result)),
+        alone=True,
+    )
 
 
 def _sentence(result: DesignResult) -> Paragraph:
@@ -44,20 +65,25 @@ def _asked(result: DesignResult, judged: bool) -> Paragraph:
         f"{result.rig.name}, stable for {members}. Its target, the weight of the synthesis, is a transmissibility of "
         f"at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and of at most "
         f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
-        + (" The result is judged by the requirements of the design file:" if judged else ""))
+        + (" The result is judged by the requirements of the design file:" if judged else "")
+    )
 
 
 def _achieved(result: DesignResult) -> str:
     mu = result.controller("mu")
     low, high = result.design.transmissibility.band_Hz
     if not np.isfinite(mu.worst_peak.upper):
-        return ("The mu controller is not proved to be stable for every plant of the uncertainty set, so no worst-case "
-                "transmissibility can be stated.")
+        return (
+            "The mu controller is not proved to be stable for every plant of the uncertainty set, so no worst-case "
+            "transmissibility can be stated."
+        )
     sure = "" if mu.worst_peak.guaranteed and mu.worst_band.guaranteed else " at the computed frequencies"
-    return (f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
-            f"{words.decibel(mu.worst_peak.upper)} at any frequency and {words.decibel(mu.worst_band.upper)} from "
-            f"{low:g} to {high:g} Hz{sure}; without control the table amplifies by "
-            f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance. {all_axes(result)}")
+    return (
+        f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
+        f"{words.decibel(mu.worst_peak.upper)} at any frequency and {words.decibel(mu.worst_band.upper)} from "
+        f"{low:g} to {high:g} Hz{sure}; without control the table amplifies by "
+        f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance. {all_axes(result)}"
+    )
 
 
 def comparison(result: DesignResult) -> Section:
@@ -76,8 +102,10 @@ def comparison(result: DesignResult) -> Section:
         ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
         ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
         (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
-        (f"payload velocity r.m.s., {start:g} to {stop:g} Hz, worst axis",
-         lambda c: _settled(c, _micro(c.site.velocity_rms))),
+        (
+            f"payload velocity r.m.s., {start:g} to {stop:g} Hz, worst axis",
+            lambda c: _settled(c, _micro(c.site.velocity_rms)),
+        ),
         ("of which from sensor noise", lambda c: _settled(c, _micro(c.site.noise_rms))),
         ("vibration criterion met", lambda c: _settled(c, c.site.rating or "none")),
         ("largest voltage r.m.s.", lambda c: _settled(c, _volts(c.site.volts_rms))),
@@ -90,11 +118,21 @@ def comparison(result: DesignResult) -> Section:
     notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
     notes += [Paragraph(f"The controller {c.title!r} is not in the table: {c.reason}", "note") for c in result.failed]
     floor = controllers[0].site.floor_rating
-    return Section("Controllers compared", "comparison", (
-        table("All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
-              "whole uncertainty set; \"unstable\" means that the controller is not proved to stabilise every plant of "
-              f"the set. The floor itself meets {floor or 'no criterion'}.",
-              ("", *(c.title for c in controllers)), body), *_remarks(result), *notes))
+    return Section(
+        "Controllers compared",
+        "comparison",
+        (
+            table(
+                "All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
+                'whole uncertainty set; "unstable" means that the controller is not proved to stabilise every plant of '
+                f"the set. The floor itself meets {floor or 'no criterion'}.",
+                ("", *(c.title for c in controllers)),
+                body,
+            ),
+            *_remarks(result),
+            *notes,
+        ),
+    )
 
 
 def _remarks(result: DesignResult) -> list[Piece]:

@@ -29,8 +29,10 @@ class Late(UnnamedFault):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         what = "motor" if place in model.actuators else "sensor"
-        return (EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
-                EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3))
+        return (
+            EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
+            EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3),
+        )
 
     def factor(self, s: np.ndarray, values: Values) -> np.ndarray:
         return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])

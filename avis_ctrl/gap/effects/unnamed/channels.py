@@ -49,8 +49,11 @@ class SensorCrosstalkOfAll(UnnamedFault):
         return model.sensors.names if len(model.sensors.names) > 2 else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
-                     for name in model.sensors.names if name != place)
+        return tuple(
+            EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
+            for name in model.sensors.names
+            if name != place
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         mix(ops, place, {name.removeprefix("share_of_"): share for name, share in values.items()})
@@ -94,11 +97,22 @@ class SensorResonance(UnnamedFault):
         return model.sensors.names
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return (EffectParameter("share", "1", "of the resonance in the output", 0.0, -5.0, 5.0, 0.01),
-                EffectParameter("frequency_Hz", "Hz", "of the resonance", 0.0, 0.5, 400.0, 1.0, False,
-                                tuple(np.geomspace(8.0, 90.0, 10))),
-                EffectParameter("damping", "1", "its damping ratio", 0.0, 1e-3, 1.0, 0.02, False, (0.05,), True))
+        return (
+            EffectParameter("share", "1", "of the resonance in the output", 0.0, -5.0, 5.0, 0.01),
+            EffectParameter(
+                "frequency_Hz",
+                "Hz",
+                "of the resonance",
+                0.0,
+                0.5,
+                400.0,
+                1.0,
+                False,
+                tuple(np.geomspace(8.0, 90.0, 10)),
+            ),
+            EffectParameter("damping", "1", "its damping ratio", 0.0, 1e-3, 1.0, 0.02, False, (0.05,), True),
+        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        shape = ops.s ** 2 * receptance(ops.s, values["frequency_Hz"], values["damping"])
+        shape = ops.s**2 * receptance(ops.s, values["frequency_Hz"], values["damping"])
         ops.sense[:, ops.sensor(place)] *= 1 + values["share"] * shape

@@ -25,6 +25,15 @@ from avis_ctrl.gap.effects.unnamed.table import Gyroscope, QuadraticDrag, Quadra
 
 def unnamed_faults() -> dict[str, UnnamedFault]:
     """All unnamed faults by name."""
-    every = (SensorCrosstalk(), SensorCrosstalkOfAll(), SensorLate(), SensorResonance(), MotorLate(), *ADDED.values(),
-             QuadraticStiffness(), QuadraticDrag(), Gyroscope())
+    every = (
+        SensorCrosstalk(),
+        SensorCrosstalkOfAll(),
+        SensorLate(),
+        SensorResonance(),
+        MotorLate(),
+        *ADDED.values(),
+        QuadraticStiffness(),
+        QuadraticDrag(),
+        Gyroscope(),
+    )
     return {one.name: one for one in every}
