@@ -19,7 +19,8 @@ WHAT = {"u": "actuators", "y": "sensors"}
 def with_rig_names(
     rig: Rig, measured: Campaign | FrequencyResponse, columns: Mapping[str, Sequence[str]] | None = None
 ) -> Campaign | FrequencyResponse:
-    """The measurement with the rig's name, if the file states none, and the rig's channels, if only numbered.
+    """The measurement with the rig's name, if the file states none, and the rig's channels, if only numbered. A note
+    names drives and sensors of the rig that the file does not have.
 
     Numbered channels, if as many as the rig has, are assumed to be in the order of the rig. A note of the campaign
     states this, and the gate that compares the channels with the model reports a wrong order. The function is
@@ -41,6 +42,9 @@ def with_rig_names(
     for role, own in of_rig.items():
         stems = (*USUAL[role], *(columns or {}).get(role, ()))
         if set(had[role]) <= set(known[role]):
+            if missing := [name for name in own if name not in had[role]]:
+                what = "sensors" if role == "y" else "drives"
+                notes.append(f"the file has no column for the rig's {what} {', '.join(missing)}")
             continue
         if len(had[role]) == len(own) and any(had[role] == numbered(stem, len(own)) for stem in stems):
             changes[role] = own
@@ -59,7 +63,8 @@ def with_rig_names(
         notes.append(f"the file does not name its rig; assumed to be {rig.name}")
     renamed = {f"{role}_names": names for role, names in changes.items()}
     records = tuple(with_header(record, **renamed) for record in measured.records) if renamed else measured.records
-    return replace(measured, records=records, notes=(*measured.notes, *notes))
+    new = tuple(note for note in notes if note not in measured.notes)
+    return replace(measured, records=records, notes=(*measured.notes, *new))
 
 
 def numbered(stem: str, count: int) -> tuple[str, ...]:

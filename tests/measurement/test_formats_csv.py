@@ -23,6 +23,13 @@ def path(tmp_path):
     return tmp_path / "a.csv"
 
 
+def test_columns_that_are_not_used_are_stated(path):
+    path.write_text("t,A1,Sz1,SZ_2\n0,1,2,3\n0.001,2,3,4\n")
+    campaign = read_measurements(path, excitation="noise", level_V=1.0)
+    assert campaign.y_names == ("Sz1",)
+    assert "record a: columns without a usual name are not used: SZ_2" in campaign.notes
+
+
 @given(
     arrays(float, st.tuples(st.integers(2, 30), st.just(2)), elements=FINITE),
     st.sampled_from(",;\t"),

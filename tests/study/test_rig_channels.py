@@ -41,7 +41,11 @@ def test_numbered_channels_are_the_rigs_own_in_its_order(rig):
 def test_what_has_names_stays_as_it_is(rig):
     stated = campaign(("Az4", "Ay1"), ("Sz3", "Sy1"), "another")
     same = with_rig_names(rig, stated)
-    assert digest(same) == digest(stated) and same.notes == ()
+    assert digest(same) == digest(stated) and with_rig_names(rig, same).notes == same.notes
+    assert same.notes == (
+        "the file has no column for the rig's drives Az1, Ax2, Az2, Ay3, Az3, Ax4",
+        "the file has no column for the rig's sensors Sz1, Sx2, Sz2, Sy3",
+    )
 
 
 @pytest.mark.parametrize("y_names", [numbered("y", 5), numbered("S", 6), ("y2", "y1", "y3", "y4", "y5", "y6")])

@@ -215,6 +215,9 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
     rate, start, note = _clock(table[:, at[time]] if time else None, unit.get(time), hints)
     record, notes = record_from(path.stem, parts, rate, start, hints)
     notes += [f"record {path.stem}: {note}"] if note else []
+    unused = [name for k, name in enumerate(layout.names) if k not in use]
+    if unused and columns is None:
+        notes.append(f"record {path.stem}: columns without a usual name are not used: {', '.join(unused)}")
     return record, notes, layout.stated.get("rig", "")
 
 
