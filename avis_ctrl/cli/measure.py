@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -65,11 +65,10 @@ def excite(
     with Progress(console) as progress:
         progress(f"{kind} for {len(names)} drives, {band_Hz[0]:g} to {band_Hz[1]:g} Hz")
         if kind == "multisine":
+            words: dict[str, Any] = {"lines": lines, "scheme": scheme}  # the settings refuse unknown ones
             signals = multisine(
-                MultisineSettings(
-                    names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V, lines, scheme=scheme, seed=seed
-                )
-            )  # type: ignore[arg-type]
+                MultisineSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V, **words, seed=seed)
+            )
         elif kind == "noise":
             signals = noise(NoiseSettings(names, table.sample_rate_Hz, period_s, band_Hz, limit_V, rms_V, seed=seed))
         else:
