@@ -82,6 +82,11 @@ class HeldOut:
         """Whether chi-square is not above its interval. Below it, the record has less noise than the fitted ones."""
         return self.chi2_per_dof <= self.chi2_interval[1]
 
+    @property
+    def tests_nothing(self) -> bool:
+        """Whether noise alone would leave more than the start model does: the estimate of the noise is too large."""
+        return self.nrms_all_start < self.nrms_all_interval[0]
+
 
 @dataclass(frozen=True, eq=False)
 class Validation:
@@ -107,8 +112,12 @@ class Validation:
 
     @property
     def passed(self) -> bool:
-        """Chi-square not above its interval and residuals white, in every held-out record."""
-        return all(one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out)
+        """Chi-square not above its interval and residuals white in every held-out record, one of which tests the
+        model."""
+        tested = not all(one.tests_nothing for one in self.held_out)
+        return tested and all(
+            one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Values for a file, without the arrays of figures."""
@@ -381,7 +390,12 @@ def verdict_of(figures: list[HeldOut]) -> str:
     off = [one for one in figures if ratio(one) > 1]
     beyond = [one for one in off if one.nrms_all > one.nrms_all_interval[1]]
     worst = max(beyond or off or figures, key=ratio)
-    if beyond:
+    if all(one.tests_nothing for one in figures):
+        judged = (
+            "the held-out data do not test the model, because the noise estimated from the records would leave more "
+            "than the start model does; the records are probably too short"
+        )
+    elif beyond:
         judged = "the identified model does not agree with the held-out data (avis gap searches for the cause)"
     elif off:
         judged = (

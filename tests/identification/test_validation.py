@@ -94,6 +94,14 @@ def test_one_record_beyond_its_noise_is_enough(checked):
     assert "does not agree" in verdict_of([first, second]) and "record 05" in verdict_of([first, second])
 
 
+def test_noise_larger_than_the_error_of_the_start_model_tests_nothing(checked):
+    one = checked.held_out[0]
+    assert not one.tests_nothing
+    noisy = replace(one, nrms_all_interval=(1.5 * one.nrms_all_start, 3.0 * one.nrms_all_start))
+    assert "do not test the model" in verdict_of([noisy]) and not replace(checked, held_out=(noisy,)).passed
+    assert "do not test the model" not in verdict_of([noisy, one])
+
+
 def test_a_residual_that_is_not_white_is_in_the_verdict(checked):
     """The colour of the verdict is that of `passed`, and the words say the same."""
     one = checked.held_out[0]

@@ -27,9 +27,9 @@ def _against_skyhook(result: DesignResult) -> Table:
         for one in result.by_axis
     ]
     return table(
-        f"Worst case of each axis over {low:g} to {high:g} Hz, for a floor that moves in any direction: upper "
-        "bound of the mu controller over the whole set, and lower bound of the tuned skyhook, which a plant "
-        "of the set reaches.",
+        f"Worst case of each axis over {low:g} to {high:g} Hz, for floor motion in any combination of the "
+        "kept axes: upper bound of the mu controller over the whole set, and lower bound of the tuned skyhook, "
+        "which a plant of the set reaches.",
         ("axis", "mu synthesis, at most", "skyhook, at least", "improvement, at least"),
         rows,
         "lrrr",
