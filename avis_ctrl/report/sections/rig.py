@@ -56,7 +56,7 @@ def _parameters(one: Rig) -> list[Piece]:
         if match := _NUMBERED.fullmatch(name):
             rows = grouped.setdefault(match["group"], {})
             rows.setdefault(match["rest"], {})[int(match["number"])] = p
-        elif not name.startswith("actuator."):  # the force constants are in the table of drives
+        elif not name.startswith(("actuator.", "place.", "direction.")):  # these are in the tables that follow
             plain.append((name, _value(p.value), words.unit(p.unit), p.description))
     found: list[Piece] = [table("Parameters of the rig.", ("name", "value", "unit", "what it is"), plain, "lrll")]
     for group, rows in grouped.items():
