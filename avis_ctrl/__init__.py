@@ -85,6 +85,29 @@ _PLACES = {
 # Subpackages that are public names as well; `gap` is callable.
 _PACKAGES = ("gap", "plot")
 
+# Names of the same thing in MATLAB's Robust Control Toolbox and in python-control (docs/reference/index.md).
+_ELSEWHERE = {
+    "ureal": "real",
+    "ucomplex": "complex_disk",
+    "ultidyn": "dynamics",
+    "umat": "matrix",
+    "uss": "ss",
+    "robstab": "robust_stability",
+    "robgain": "robust_performance",
+    "wcgain": "worst_case_gain",
+    "mussv": "mu",
+    "mixsyn": "mixed_sensitivity",
+    "dksyn": "musyn",
+    "diskmargin": "disk_margin",
+    "disk_margins": "disk_margin",
+    "ucover": "uncertainty_weight",
+    "bode": "plot.bode",
+    "bode_plot": "plot.bode",
+    "sigma": "plot.sigma",
+    "singular_values_plot": "plot.sigma",
+    "interconnect": "connect",
+}
+
 __all__ = ["__version__", *_PACKAGES, *_PLACES]
 
 
@@ -92,7 +115,8 @@ def __getattr__(name: str) -> Any:
     if name in _PACKAGES:
         return importlib.import_module(f"avis_ctrl.{name}")
     if name not in _PLACES:
-        raise AttributeError(f"module 'avis_ctrl' has no attribute {name!r}")
+        hint = f"; here its name is {_ELSEWHERE[name]}" if name in _ELSEWHERE else ""
+        raise AttributeError(f"module 'avis_ctrl' has no attribute {name!r}{hint}")
     return getattr(importlib.import_module(_PLACES[name]), name)
 
 

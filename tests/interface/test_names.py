@@ -53,3 +53,12 @@ def test_gap_is_a_package_that_can_be_called():
 def test_an_unknown_name_is_refused():
     with pytest.raises(AttributeError, match="no attribute 'desing'"):
         _ = ac.desing
+
+
+@pytest.mark.parametrize(
+    ("name", "here"), [("wcgain", "worst_case_gain"), ("mixsyn", "mixed_sensitivity"), ("bode", "plot.bode")]
+)
+def test_names_of_other_tools_are_translated(name, here):
+    with pytest.raises(AttributeError, match=f"here its name is {here}"):
+        getattr(ac, name)
+    assert here.partition(".")[0] in dir(ac)
