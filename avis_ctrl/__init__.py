@@ -85,7 +85,7 @@ _PLACES = {
 # Subpackages that are public names as well; `gap` is callable.
 _PACKAGES = ("gap", "plot")
 
-# Names of the same thing in MATLAB's Robust Control Toolbox and in python-control (docs/reference/index.md).
+# Names of the same functions in MATLAB and in python-control (docs/reference/index.md).
 _ELSEWHERE = {
     "ureal": "real",
     "ucomplex": "complex_disk",
@@ -95,7 +95,7 @@ _ELSEWHERE = {
     "robstab": "robust_stability",
     "robgain": "robust_performance",
     "wcgain": "worst_case_gain",
-    "mussv": "mu",
+    "mussv": "mu or mu_peak",
     "mixsyn": "mixed_sensitivity",
     "dksyn": "musyn",
     "diskmargin": "disk_margin",

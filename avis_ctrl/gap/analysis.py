@@ -36,7 +36,7 @@ from avis_ctrl.gap.search import (
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.tolerances import BEYOND, credible, moved, of_effect, with_tolerance
+from avis_ctrl.gap.tolerances import BEYOND, credible, moved, of_effect, tolerances_behind, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
@@ -138,7 +138,7 @@ def _fits(
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
     starts: list[ActiveEffect] = []
     if not credible(tolerant, settings):
-        progress("search with all values as in the rig file: tolerances stand in for an effect")
+        progress("search without tolerances: with them, values of the rig file move too far")
         step = next_effect(base, data, [*effects, *unnamed_faults().values()], settings, each)
         starts = [one.model.effects[-1] for one in step.tried.values()] if step else []
     return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings, starts)
@@ -313,7 +313,7 @@ def _gap(
     verdict = _verdict(reported, closed, closed or small, remainder, settings)
     where, remaining = places(before), places(after)
     onward = separating_measurement(reported, fits)
-    imitated = "" if credible(updated, settings) else _far(_moved(updated, settings), settings)
+    imitated = "" if credible(updated, settings) else _far(updated, settings)
     if onward is None and (imitated or verdict in ("unexplained", "partly explained")):
         onward = of_unexplained(remaining, records)
     limits: tuple[Detectable, ...] = ()
@@ -323,6 +323,7 @@ def _gap(
         limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
     sentences = (
         _opening(verdict, reported, traces, stages, remainder, after),
+        imitated,
         *names.refused.values(),
         _remains(remainder, remaining),
         prepared.noise,
@@ -431,14 +432,19 @@ def separating_measurement(reported: Sequence[NamedEffect], fits: Fits) -> str |
     return None
 
 
-def _far(shifts: Sequence[Tolerance], settings: GapSettings) -> str:
-    """Values of the rig file that moved further, as a whole, than their tolerances allow."""
-    far = [one for one in shifts if abs(one.moved) > settings.beyond_least]
+def _far(fitted: Fitted, settings: GapSettings) -> str:
+    """Values of the rig file that moved further, as a whole, than their tolerances allow; those that an effect
+    represents are not among them."""
+    names = fitted.priors.names
+    named = {names[k] for one in fitted.model.effects for k in tolerances_behind(one, names)}
+    shifts = [one for one in _moved(fitted, settings) if one.parameter not in named]
+    far = sum(abs(one.moved) > settings.beyond_least for one in shifts)
     size = float(np.sqrt(np.mean([one.moved**2 for one in shifts])))
     return (
-        f"the fit moves {len(far)} of {len(shifts)} values of the rig file by more than {settings.beyond_least:g} "
-        f"tolerances, {shifts[0].parameter} by {abs(shifts[0].moved):.3g}, all by {size:.2g} r.m.s.: the rig file "
-        "is wrong there, its tolerances are too small, or an effect is missing that these values imitate"
+        f"the fit moves the values of the rig file further than their tolerances allow ({shifts[0].parameter} by "
+        f"{abs(shifts[0].moved):.3g} tolerances; {far} of {len(shifts)} by more than {settings.beyond_least:g}; r.m.s. "
+        f"{size:.2g}): the rig file is wrong there, its tolerances are too small, or an effect is missing that these "
+        "values imitate"
     )
 
 

@@ -319,7 +319,8 @@ def next_effect(
     begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, settings, each)
     tried = _tried(begun, shortlist(found, settings), data, settings, each)
-    tried = _likelier([*tried.values(), *_joint_fits(begun, starts, data, settings, each)])
+    again = [active(one.effect, begun.model, one.place, one.values) for one in starts]
+    tried = _likelier([*tried.values(), *_joint_fits(begun, again, data, settings, each)])
     if not tried:
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)
@@ -336,7 +337,7 @@ def next_effect(
             or (label == best and one.log_evidence - before[label].log_evidence > settings.certain)
         }
     start = tried[best]
-    if start.log_evidence - now.log_evidence < settings.certain + math.log(len(found)):
+    if start.log_evidence - now.log_evidence < settings.certain + math.log(max(len(found), len(tried))):
         return None
     full = fit(start.model, start.priors, start.z, data, start.variances, settings)
     return Step(now.bare(), full, tried, len(found))

@@ -25,8 +25,8 @@ class GapSettings(FitSettings):
     determined : fraction of a tolerance's prior variance that the data must remove for the value to count as determined
         [1].
     credible : p-value of the sum of squares of all shifts in tolerances, below which they represent a missing effect
-        [1]: the search then also starts from the values of the rig file. It costs a minute, and is in vain once in ten
-        thousand campaigns without an effect.
+        [1]: effects are then also fitted from the values that they have without tolerances. It costs a minute, in vain
+        in one of ten thousand campaigns without an effect.
     least_spread : smallest credible spread of these values, in tolerances [1]: there are some tens of them, and the
         model has errors of this size.
     narrow : spread below which outliers from it are searched [1]: an outlier raises the log evidence by half its

@@ -58,12 +58,20 @@ def with_tolerance(fitted: Fitted) -> list[str]:
 
 
 def credible(fitted: Fitted, settings: GapSettings) -> bool:
-    """Whether values of the rig file moved no further, as a whole, than their tolerances allow (chi-square test).
+    """Whether values of the rig file moved no further, as a whole, than their tolerances allow.
 
-    Otherwise they represent something that the model lacks, at wrong values of everything else.
+    Otherwise they represent something that the model lacks, at wrong values of everything else. Without a missing
+    effect, the estimates z (in tolerances) have the covariance I - S, with S that of the fit; z^T z is compared with a
+    scaled chi-square variable of the same mean and variance (Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
+    Values whose tolerance is held by an effect do not move and have no weight.
     """
-    z = fitted.z[[fitted.priors.names.index(name) for name in with_tolerance(fitted)]]
-    return bool(chi2.sf(float(z @ z), z.size) >= settings.credible)
+    rows = [fitted.priors.names.index(name) for name in with_tolerance(fitted)]
+    determined = np.linalg.eigvalsh(np.eye(len(rows)) - fitted.covariance[np.ix_(rows, rows)]).clip(0.0)
+    mean, square = float(determined.sum()), float(determined @ determined)
+    if not square:
+        return True
+    z = fitted.z[rows]
+    return bool(chi2.sf(float(z @ z) * mean / square, mean**2 / square) >= settings.credible)
 
 
 def spread(fitted: Fitted, settings: GapSettings) -> tuple[list[int], float]:

@@ -84,8 +84,8 @@ class HeldOut:
 
     @property
     def tests_nothing(self) -> bool:
-        """Whether noise alone would leave more than the start model does: the estimate of the noise is too large."""
-        return self.nrms_all_start < self.nrms_all_interval[0]
+        """Whether noise alone would leave more than the start model does, in r.m.s. and in chi-square."""
+        return self.nrms_all_start < self.nrms_all_interval[0] and self.chi2_start < self.chi2_interval[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +112,8 @@ class Validation:
 
     @property
     def passed(self) -> bool:
-        """Chi-square not above its interval and residuals white in every held-out record, one of which tests the
-        model."""
+        """Chi-square not above its interval and residuals white in every held-out record, at least one of which
+        tests the model."""
         tested = not all(one.tests_nothing for one in self.held_out)
         return tested and all(
             one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out
@@ -390,10 +390,10 @@ def verdict_of(figures: list[HeldOut]) -> str:
     off = [one for one in figures if ratio(one) > 1]
     beyond = [one for one in off if one.nrms_all > one.nrms_all_interval[1]]
     worst = max(beyond or off or figures, key=ratio)
-    if all(one.tests_nothing for one in figures):
+    if not off and all(one.tests_nothing for one in figures):
         judged = (
-            "the held-out data do not test the model, because the noise estimated from the records would leave more "
-            "than the start model does; the records are probably too short"
+            "the held-out data do not test the model, because noise alone, as estimated from the fitted records, would "
+            "exceed the error of the start model; the records are too short, or the held-out ones are quieter"
         )
     elif beyond:
         judged = "the identified model does not agree with the held-out data (avis gap searches for the cause)"

@@ -214,7 +214,7 @@ def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> 
 
 
 # Relative to the largest pole: real part below which a pole may be on the imaginary axis.
-ROUND_OFF = 1e-14
+ROUND_OFF = 1e-15
 
 
 def _checked(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,7 +130,12 @@ def six_dof_check(
     slow = np.geomspace(2 * np.pi * SETTINGS.slowest_Hz, T2.omega[0], SETTINGS.points, endpoint=False)
     whole = np.unique(np.concatenate([slow, T2.omega, [low, high]]))
     band = whole[(whole >= low) & (whole <= high)]
-    omega = np.unique(np.concatenate([refine_maxima(sigma, part, sigma(part))[0] for part in (whole, band)]))
+
+    def alone(k: int) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda omega: np.abs(every(omega)[:, k, k])
+
+    curves = [(sigma, whole), (sigma, band), *((alone(k), band) for k in others)]
+    omega = np.unique(np.concatenate([refine_maxima(curve, part, curve(part))[0] for curve, part in curves]))
     if not np.any(inside):  # a band between two of the design model's frequencies
         inside = np.arange(T2.omega.size) == np.argmin(np.abs(np.log(T2.omega**2 / (low * high))))
     deviation = 20 * np.max(np.abs(np.log10(sigma(T2.omega[inside]) / T2.sigma[inside])))

@@ -61,13 +61,13 @@ def all_axes(result: DesignResult) -> str:
 def _outside(result: DesignResult, most: np.ndarray, inside_band: str) -> str:
     """What the axes outside the design do: most (6,), largest gain of each axis in the band."""
     rows = [
-        f"{name} {decibels(most[k]):+.1f} dB" for k, name in enumerate(COORDINATES) if name not in result.design.keep
+        f"{decibels(most[k]):+.1f} dB ({name})" for k, name in enumerate(COORDINATES) if name not in result.design.keep
     ]
     if not rows:
         return ""
     return (
-        f" The axes outside the design have skyhook loops or remain passive: {inside_band} each transmits its own "
-        f"floor motion with at most {listed(rows)} (nominal)."
+        f" The axes outside the design have skyhook loops or remain passive; {inside_band} their gain from the floor "
+        f"to the payload along the same axis is at most {listed(rows)}, nominal."
     )
 
 

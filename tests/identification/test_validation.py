@@ -97,7 +97,9 @@ def test_one_record_beyond_its_noise_is_enough(checked):
 def test_noise_larger_than_the_error_of_the_start_model_tests_nothing(checked):
     one = checked.held_out[0]
     assert not one.tests_nothing
-    noisy = replace(one, nrms_all_interval=(1.5 * one.nrms_all_start, 3.0 * one.nrms_all_start))
+    noisy = replace(
+        one, nrms_all_interval=(1.5 * one.nrms_all_start, 3.0 * one.nrms_all_start), chi2_start=0.1, chi2_per_dof=0.01
+    )
     assert "do not test the model" in verdict_of([noisy]) and not replace(checked, held_out=(noisy,)).passed
     assert "do not test the model" not in verdict_of([noisy, one])
 

@@ -120,7 +120,7 @@ def fabricated() -> DesignResult:
         history,
         requirements,
         reduction_error(rig, design.keep),
-        SixDofCheck(mu.omega, mu.sigma, 0.1 * mu.sigma, 0.0),
+        SixDofCheck(mu.omega, mu.sigma, 0.1 * mu.sigma, np.full((mu.omega.size, 6), 0.5), 0.0),
         None,
         provenance,
         12.5,

@@ -78,7 +78,7 @@ def test_all_six_degrees_of_freedom_stand_beside_the_bounds_of_the_design_model(
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))
     assert said in found and "z and phi_x" in found and "locked" in found
     # Of the band only, and of the axes that the design leaves out.
-    assert "with at most x +6.0 dB, y +0.0 dB, phi_y -6.0 dB and phi_z +12.0 dB" in found
+    assert "is at most +6.0 dB (x), +0.0 dB (y), -6.0 dB (phi_y) and +12.0 dB (phi_z)" in found
 
 
 def test_without_bounds_none_are_said_to_hold():
