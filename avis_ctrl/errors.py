@@ -46,8 +46,8 @@ class ComputationError(AvisError, ArithmeticError):
     >>> try:
     ...     ac.mu_peak(ac.tf([1.0], [1.0, -1.0]), [ac.ComplexScalar(1)])
     ... except ac.ComputationError as error:
-    ...     print(error.measured, "-", error.cause)
-    pole 1+0j - the nominal closed loop is unstable or has a mode that the controller misses
+    ...     print(error.measured, "-", error.failed)
+    pole 1+0j - the bounds of mu need a stable system
     """
 
     exit_code = 3

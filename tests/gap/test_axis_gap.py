@@ -101,6 +101,7 @@ def test_end_stops_begin_behind_their_gap():
     assert names(gap) == ["end_stops"] and gap.effects[0].parameters["gap"].value == pytest.approx(3, rel=0.01)
 
 
+@pytest.mark.slow
 def test_two_effects_are_named_both():
     gap = searched(lambda y, v: 0.01 * y**3 + 2e-6 * abs(v) * v, 2)
     found = {one.name: value(one) for one in (*gap.effects, *gap.traces)}
@@ -161,6 +162,7 @@ def test_a_drive_that_saturates():
     assert gap.effects[0].parameters["level"].value == pytest.approx(2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_same_data_give_the_same_numbers_and_held_out_is_held_out():
     u, y = oscillator(lambda y, v: 0.01 * y**3, 3, n=16_384)
 
@@ -251,6 +253,7 @@ def test_drive_without_a_gap_names_nothing():
     assert gap.verdict == "none" and not gap.effects
 
 
+@pytest.mark.slow
 def test_drive_with_friction_and_an_offset():
     """Wherever the drive moves, an offset and friction that differs between the directions are the same force."""
     gap = friction_gap(drive(lambda v: coulomb(v) + 4))
@@ -269,6 +272,7 @@ def test_drive_whose_friction_differs_between_the_directions():
     assert all(e.probability > 0.9 for e in gap.effects)
 
 
+@pytest.mark.slow
 def test_drive_that_slows_down_in_one_direction_only():
     gap = friction_gap(drive(lambda v: coulomb(v) + (40 * v if v < 0 else 0)))
     assert set(names(gap)) == {"coulomb_friction", "viscous_asymmetry"}

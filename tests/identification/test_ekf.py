@@ -251,6 +251,7 @@ def test_the_covariance_stays_definite_over_1e5_samples(rig, wrong, R):
 # -- consistency ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_filter_says():
     """NEES and NIS over 60 draws of parameters, states and noise from the filter's own assumptions."""
     model, h, n, runs = two_masses(), 5e-3, 1500, 60

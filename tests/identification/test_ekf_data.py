@@ -190,6 +190,7 @@ def test_white_innovations_are_consistent_and_others_not(rng):
     assert not found.consistent and np.allclose(found.autocorrelation[0], 0.5, atol=0.03)
 
 
+@pytest.mark.slow
 def test_curves_of_the_sources_figures(rig, campaign):
     names = source_parameters(rig)
     result = identify_ekf(rig, campaign, names=names)

@@ -104,6 +104,7 @@ def test_no_frequency_is_bounded_twice_in_a_step(full, monkeypatch):
     assert np.exp(value) >= made.mu_upper_complex * 0.98
 
 
+@pytest.mark.slow
 def test_starts_of_fewer_states_are_tried(full):
     """Descent that is cut short does not reach the best of three states; it does if it may start from that."""
     P, _, made = full
@@ -132,6 +133,7 @@ def test_an_added_mode_lowers_the_smoothed_peak(full, most):
     assert smoothed(longer) < smoothed(one.K)
 
 
+@pytest.mark.slow
 def test_a_start_of_fewer_states_gets_all_states_that_are_asked_for(full):
     P, _, made = full
     *_, one = fixed_order(Task(P, ONE_DRIVE), made.K, 1)
@@ -140,6 +142,7 @@ def test_a_start_of_fewer_states_gets_all_states_that_are_asked_for(full):
     assert peak_by_slicot(lft_lower(P, three.K)) <= min(1.03 * made.mu_upper_complex, one.peak)
 
 
+@pytest.mark.slow
 def test_a_slightly_different_start_ends_at_the_same_peak(full):
     """Rounding must not decide between local minima: entries of the start are changed by a thousandth."""
     P, _, made = full
@@ -194,6 +197,7 @@ def test_wrong_order(order):
         musyn(P, blocks, 1, 1, order=order)
 
 
+@pytest.mark.slow
 def test_decentralised_loops_see_their_own_signal_alone():
     """Two tables whose sensors hear each other by a tenth; off the diagonal K is exactly zero."""
     one, two = barely_known_table(0.5), barely_known_table(0.4)

@@ -69,6 +69,7 @@ def test_a_small_optimum_that_is_proved_is_not_called_zero():
     assert not any("zero to working" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_no_perturbation_where_round_off_is_all_that_is_singular():
     """A repeated real scalar on a sampled system whose mu is zero: a perturbation of 1e13 proves nothing."""
     assert solve(2026, 7933)["wrong"] == []

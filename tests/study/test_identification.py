@@ -51,6 +51,7 @@ def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
     assert np.max(np.abs(start / truth - 1)) > 0.04
 
 
+@pytest.mark.slow
 def test_a_design_whose_weights_nobody_stated_says_for_which_table_they_are(found):
     text = design_start(found)[0][DESIGN_FILE]
     assert text.startswith("# No weights were specified for this table.")
