@@ -139,9 +139,14 @@ def _fits(
     starts: list[ActiveEffect] = []
     if not credible(tolerant, settings):
         progress("search without tolerances: with them, values of the rig file move too far")
-        step = next_effect(base, data, [*effects, *unnamed_faults().values()], settings, each)
+        step = next_effect(base, data, _with_unnamed(effects), settings, each)
         starts = [one.model.effects[-1] for one in step.tried.values()] if step else []
     return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings, starts)
+
+
+def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
+    """The candidates, and faults that are fitted for comparison only."""
+    return [*effects, *unnamed_faults().values()]
 
 
 def _refitted(
@@ -171,7 +176,7 @@ def _searched(
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
 
-    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough, starts)
+    steps = search(fits.best, data, _with_unnamed(effects), settings, progress, each, enough, starts)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 

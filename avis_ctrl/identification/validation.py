@@ -83,7 +83,7 @@ class HeldOut:
         return self.chi2_per_dof <= self.chi2_interval[1]
 
     @property
-    def tests_nothing(self) -> bool:
+    def uninformative(self) -> bool:
         """Whether noise alone would leave more than the start model does, in r.m.s. and in chi-square."""
         return self.nrms_all_start < self.nrms_all_interval[0] and self.chi2_start < self.chi2_interval[0]
 
@@ -114,7 +114,7 @@ class Validation:
     def passed(self) -> bool:
         """Chi-square not above its interval and residuals white in every held-out record, at least one of which
         tests the model."""
-        tested = not all(one.tests_nothing for one in self.held_out)
+        tested = not all(one.uninformative for one in self.held_out)
         return tested and all(
             one.consistent and (one.whiteness is None or one.whiteness.white) for one in self.held_out
         )
@@ -390,7 +390,7 @@ def verdict_of(figures: list[HeldOut]) -> str:
     off = [one for one in figures if ratio(one) > 1]
     beyond = [one for one in off if one.nrms_all > one.nrms_all_interval[1]]
     worst = max(beyond or off or figures, key=ratio)
-    if not off and all(one.tests_nothing for one in figures):
+    if not off and all(one.uninformative for one in figures):
         judged = (
             "the held-out data do not test the model, because noise alone, as estimated from the fitted records, would "
             "exceed the error of the start model; the records are too short, or the held-out ones are quieter"

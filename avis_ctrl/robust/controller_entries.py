@@ -10,10 +10,19 @@ import scipy.linalg as la
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.robust.mu_lmi import Array
 
-# Condition of the eigenvectors of the balanced A above which A counts as defective, and the relative changes of A
-# that are tried in this case.
-DEFECTIVE = 1e12
-SEPARATION = (0.0, 1e-8, 1e-6, 1e-4, 1e-2)
+
+@dataclass(frozen=True)
+class ModalSettings:
+    """defective : condition number of the eigenvectors of the balanced A above which A counts as defective [1]: they
+        lose twelve of sixteen digits.
+    changes : relative changes of A that are tried in turn until it is not [1]; none for other A.
+    """
+
+    defective: float = 1e12
+    changes: tuple[float, ...] = (0.0, 1e-8, 1e-6, 1e-4, 1e-2)
+
+
+SETTINGS = ModalSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +81,13 @@ def _diagonalisable(K: StateSpace) -> tuple[StateSpace, Array, Array]:
     """K with the eigenvalues and eigenvectors of its A, which is changed slightly if it has too few eigenvectors."""
     size = 1e-6 * float(np.max(np.abs(K.poles()), initial=0.0)) or 1.0
     _, (scale, _) = la.matrix_balance(K.A, permute=False, separate=True)
-    for change in SEPARATION:
+    for change in SETTINGS.changes:
         # A different relative change of every row separates repeated poles and keeps decoupled channels decoupled.
         rows = change * np.linspace(-1, 1, K.nstates)[:, None]
         made = replace(K, A=K.A + rows * (K.A + size * np.eye(K.nstates)))
         values, V = la.eig(made.A)
         balanced = V / scale[:, None]
-        if not V.size or np.linalg.cond(balanced / np.linalg.norm(balanced, axis=0)) < DEFECTIVE:
+        if not V.size or np.linalg.cond(balanced / np.linalg.norm(balanced, axis=0)) < SETTINGS.defective:
             break
     return made, values, V
 

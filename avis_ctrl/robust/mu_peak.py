@@ -49,6 +49,18 @@ class CurveSettings:
 CURVES = CurveSettings()
 
 
+@dataclass(frozen=True)
+class StabilitySettings:
+    """round_off : real part over the largest magnitude of all poles above which a pole may lie on the imaginary axis
+    [1]: a few rounding errors of an eigenvalue.
+    """
+
+    round_off: float = 1e-15
+
+
+STABILITY = StabilitySettings()
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class MuPeak(Shown):
     """Bounds of a supremum over frequency.
@@ -213,10 +225,6 @@ def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> 
         return _in_rad_s(system, part, _mu_peak(part.N, part.structure, ALL_FREQUENCIES, SLACK, dt=system.dt))
 
 
-# Relative to the largest pole: real part below which a pole may be on the imaginary axis.
-ROUND_OFF = 1e-15
-
-
 def _checked(
     N: StateSpace, blocks: BlockStructure | Sequence[Block], slack: float
 ) -> tuple[StateSpace, BlockStructure]:
@@ -227,7 +235,7 @@ def _checked(
     poles = N.poles()
     # Positive for an unstable pole; eigenvalues are known to round-off of the largest one.
     growth = np.abs(poles) - 1 if N.dt else poles.real / max(float(np.max(np.abs(poles), initial=0.0)), 1e-300)
-    if poles.size and np.max(growth) >= -ROUND_OFF:
+    if poles.size and np.max(growth) >= -STABILITY.round_off:
         raise ComputationError(
             "the bounds of mu need a stable system",
             measured=f"pole {poles[np.argmax(growth)]:.6g}",

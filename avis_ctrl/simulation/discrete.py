@@ -65,7 +65,7 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
     names = (*loop.axes, *loop.loops)
     if not names:  # nothing is controlled; the sensors need not be decoded
         return gain(np.zeros((loop.n_drives, len(bank.chains))), dt=T)
-    arms = lever_arms(rig)[[COORDINATES.index(name) for name in names]]
+    arms = lever_arms(rig, names)
     allocation, decoding = loop_axes(rig, loop.axes, tuple(loop.loops))
     decoding = arms[:, None] * decoding / bank.gain_V
     forces = append(*(sampled(part, T) for part in (loop.K, *loop.loops.values())))

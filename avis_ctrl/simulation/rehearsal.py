@@ -14,7 +14,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.avis import INERTIA, AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
-from avis_ctrl.rigs.instruments import Triple, unit_vector
+from avis_ctrl.rigs.instruments import Triple, triple, unit_vector
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -145,14 +145,13 @@ def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
     def placed(position: Triple, direction: Triple) -> dict[str, Triple]:
         moved = np.add(position, t.place_m * rng.standard_normal(3))
         turned = direction + np.cross(t.direction_rad * rng.standard_normal(3), direction)
-        return {"position": _triple(moved), "direction": unit_vector(_triple(turned), "direction")}
+        return {"position": triple(moved), "direction": unit_vector(triple(turned), "direction")}
 
     def moved_along(one: Any) -> Any:
         return replace(one, **placed(one.position, one.direction))
 
     isolators = tuple(
-        replace(one, position=_triple(np.add(one.position, t.place_m * rng.standard_normal(3))))
-        for one in rig.isolators
+        replace(one, position=triple(np.add(one.position, t.place_m * rng.standard_normal(3)))) for one in rig.isolators
     )
     drives, instruments = (tuple(moved_along(one) for one in some) for some in (rig.drives, rig.instruments))
     moved = replace(rig, isolators=isolators, drives=drives, instruments=instruments)
@@ -165,8 +164,3 @@ def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
         changes[name] = known[name].value + t.product_of_inertia_kgm2 * float(rng.standard_normal())
     gains = {one.name: one.gain * off(t.sensor_gain_percent) for one in moved.sensors()}
     return moved.with_parameters(changes).with_sensor_gains(gains)
-
-
-def _triple(values: np.ndarray) -> Triple:
-    x, y, z = np.asarray(values, float).tolist()
-    return x, y, z

@@ -321,6 +321,6 @@ class SampledLoop:
         )
 
 
-def lever_arms(rig: Rig) -> np.ndarray:
-    """(6,) factors from q to displacements: 1 for translations, the edge [m] for rotations."""
-    return np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in COORDINATES])
+def lever_arms(rig: Rig, names: Sequence[str] = COORDINATES) -> np.ndarray:
+    """(n,) factors from coordinates to displacements: 1 for translations, the edge [m] for rotations."""
+    return np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in names])

@@ -48,8 +48,18 @@ NAMED_HERE = (
     "spikes",
     "missing samples",
 )
-# Minimum number of samples of a record; with fewer, neither the gates nor a held-out third give any information.
-MIN_SAMPLES = 300
+
+
+@dataclass(frozen=True)
+class RecordSettings:
+    """samples : minimum number of samples of a record; with fewer, neither the gates nor a held-out third give any
+    information.
+    """
+
+    samples: int = 300
+
+
+RECORDS = RecordSettings()
 
 
 @dataclass(frozen=True)
@@ -161,9 +171,9 @@ def _require_records(measured: Campaign, rig: Rig) -> None:
             f"expected the rig's own {rig.sample_rate_Hz:g} Hz", field="sample_rate_Hz", value=measured.sample_rate_Hz
         )
     for record in measured.records:
-        if record.header.samples < MIN_SAMPLES:
+        if record.header.samples < RECORDS.samples:
             raise InputError(
-                f"expected at least {MIN_SAMPLES} samples",
+                f"expected at least {RECORDS.samples} samples",
                 field=f"record {record.header.name}: samples",
                 value=record.header.samples,
             )

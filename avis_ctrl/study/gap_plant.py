@@ -26,8 +26,9 @@ from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant, edge_levers
+from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.generalized_plant import Part
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
@@ -146,7 +147,7 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
         list(old.inputs),
     )
     _, rows = model.effective.rig.sensor_rows()
-    own = plant.decoding @ (rows[:, [COORDINATES.index(name) for name in keep]] * (1 / edge_levers(model.rig, keep)))
+    own = plant.decoding @ (rows[:, [COORDINATES.index(name) for name in keep]] * (1 / lever_arms(model.rig, keep)))
     left = np.block([[own, decoding, np.zeros_like(decoding)], [np.zeros((n, n)), np.zeros_like(decoding), decoding]])
     C, D = np.vstack([plain.C, left @ dot.C]), np.vstack([plain.D, left @ dot.D])
     outputs = (*old.outputs, *(f"sensed_{a}_dot" for a in plant.axes), *(f"tilt_{a}" for a in plant.axes))

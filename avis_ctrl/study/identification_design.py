@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,8 +32,17 @@ from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_
 if TYPE_CHECKING:
     from avis_ctrl.study.identification import Identification
 
-# Minimum uncertainty of the drives: changes between a campaign and the use of its model are not in the measurement.
-MIN_PERCENT = 1.0
+
+@dataclass(frozen=True)
+class DriveUncertaintySettings:
+    """low_percent : minimum uncertainty of the drives at low frequency [%]: changes between a campaign and the use of
+    its model are not in the measurement.
+    """
+
+    low_percent: float = 1.0
+
+
+DRIVES = DriveUncertaintySettings()
 # Designs for z and phi_x by kind of rig, as in designs/*.toml; rig and uncertainty are filled in.
 _COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
 _AVIS: dict[str, Any] = _COMMON | {
@@ -222,5 +231,5 @@ def _chains(asked: ChainUncertainty, content: UncertaintyFile, template: Design)
     spread = next(one for one in content.spread if sorted(one.keep) == keep).values()
     median = 100 * float(np.median(spread.bound(template.uncertainty.confidence_percent / 100)))
     digit = 10 ** np.floor(np.log10(max(median, 1e-9)))
-    low = float(max(np.ceil(median / digit - 1e-9) * digit, MIN_PERCENT))
+    low = float(max(np.ceil(median / digit - 1e-9) * digit, DRIVES.low_percent))
     return asked.model_copy(update={"low_percent": round(min(low, asked.low_percent), 12)})

@@ -139,7 +139,7 @@ def build_plant(
     directions = identified.directions if identified else ()
     uncertain = uncertain_rig(rig, [*design.uncertainty.of(rig), *directions, *fit], design.keep)
     axes = uncertain.coordinates
-    lever = edge_levers(rig, design.keep)
+    lever = lever_arms(rig, design.keep)
     allocation = actuator_axes(rig, design.keep)
     # An edge force F at lever e is a moment F e.
     matrix = allocation.allocation * lever
@@ -216,18 +216,13 @@ def _identified(design: Design, rig: Rig) -> InDesign | None:
     return in_design(content, rig, design.keep, design.uncertainty.confidence_percent / 100, declared, factor)
 
 
-def edge_levers(rig: Rig, keep: Sequence[str]) -> np.ndarray:
-    """(n,) displacement of the edge per unit of each coordinate: the edge lever for rotations, otherwise 1."""
-    return lever_arms(rig)[[COORDINATES.index(name) for name in keep]]
-
-
 def channels_gain(rig: Rig, keep: Sequence[str]) -> float:
     """Largest joint error of the axes' forces for independent errors of at most 1 in the channels: |T| |A|.
 
     With T A = I, any errors E = diag(e_k), |e_k| <= 1, give |T E A| <= |T| |A|; this is 1 if every channel serves the
     axes alike.
     """
-    lever = edge_levers(rig, keep)
+    lever = lever_arms(rig, keep)
     found = actuator_axes(rig, keep)
     used = np.any(np.abs(found.allocation) > 1e-9 * np.abs(found.allocation).max(), axis=1)
     T = found.matrix[[COORDINATES.index(name) for name in keep]][:, used] / lever[:, None]

@@ -19,14 +19,14 @@ from avis_ctrl.robust.mu_scan import refine_maxima
 from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.design_check import check_designs
 from avis_ctrl.simulation.discrete import digital_controller
-from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
+from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, lever_arms, rig_bank
 from avis_ctrl.simulation.sampled_response import predict_transmissibility_6dof
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.companions import Companions, design_companions, until_stable
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import ControllerResult, Simulated, SixDofCheck
 from avis_ctrl.study.identified_uncertainty import RESPONSE
-from avis_ctrl.study.plant import DesignPlant, edge_levers
+from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.random_plants import random_perturbations
 
 
@@ -221,7 +221,7 @@ def _response_error(
     n = len(keep)
     W = append(*[plant.weights[RESPONSE].system(f"f{k}", f"z{k}") for k in range(n)])
     axes = actuator_axes(rig, keep)
-    lever = edge_levers(rig, keep)
+    lever = lever_arms(rig, keep)
     T = axes.matrix[[COORDINATES.index(name) for name in keep]] / lever[:, None]
     error = delta.renamed([f"z{k}" for k in range(n)], [f"w{k}" for k in range(n)]) @ W
     volts = list(axes.actuators)

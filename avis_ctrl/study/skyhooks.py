@@ -18,10 +18,11 @@ from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
+from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.analysis import SETTINGS, SLACK
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
-from avis_ctrl.study.plant import DesignPlant, edge_levers
+from avis_ctrl.study.plant import DesignPlant
 
 # Tilt corner well below the table's modes, roll-off well above the bandwidth of its loops.
 CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
@@ -219,7 +220,7 @@ def critical_gains(rig: Rig, axes: Sequence[str]) -> tuple[float, ...]:
     """Classical gains [N s/m] of some axes, rotations at the edge."""
     equations = rig.equations_of_motion()
     kept = [equations.coordinates.index(name) for name in axes]
-    scale = 1 / edge_levers(rig, axes) ** 2
+    scale = 1 / lever_arms(rig, axes) ** 2
     return tuple(critical_damping(*(np.diag(X)[kept] * scale for X in (equations.M, equations.K, equations.C))))
 
 

@@ -42,20 +42,18 @@ def all_axes(result: DesignResult) -> str:
         for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
         if np.isfinite(bound.upper) and value > decibels(bound.upper)
     ]
-    outside = _outside(result, six.alone[inside].max(axis=0), inside_band)
     locked = f"The worst-case bounds hold for {listed(result.design.keep)} with the other coordinates locked"
-    if beyond:
-        return (
-            f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
-            f"{outside}"
-        )
     reached = (
         "With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
         f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}"
     )
-    if not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
-        return f"{reached}. For the other plants of the uncertainty set there is no bound.{outside}"
-    return f"{locked}. {reached}.{outside}"
+    if beyond:
+        compared = f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
+    elif not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
+        compared = f"{reached}. For the other plants of the uncertainty set there is no bound."
+    else:
+        compared = f"{locked}. {reached}."
+    return compared + _outside(result, six.alone[inside].max(axis=0), inside_band)
 
 
 def _outside(result: DesignResult, most: np.ndarray, inside_band: str) -> str:

@@ -150,8 +150,8 @@ def _page(sweep: Sweep, front: list[int], png: bytes | None) -> str:
         ]
         for k, row in enumerate(sweep.rows)
     ]
-    told = [k for k in range(len(head)) if any(row[k] for row in rows)]
-    table = html_table([[row[k] for k in told] for row in rows], [head[k] for k in told])
+    shown = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    table = html_table([[row[k] for k in shown] for row in rows], [head[k] for k in shown])
     said = "<p>* on the Pareto front</p>" if front else ""
     return (
         '<!doctype html><html lang="en"><meta charset=utf-8>'

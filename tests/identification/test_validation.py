@@ -94,9 +94,9 @@ def test_one_record_beyond_its_noise_is_enough(checked):
     assert "does not agree" in verdict_of([first, second]) and "record 05" in verdict_of([first, second])
 
 
-def test_noise_larger_than_the_error_of_the_start_model_tests_nothing(checked):
+def test_noise_larger_than_the_error_of_the_start_model_uninformative(checked):
     one = checked.held_out[0]
-    assert not one.tests_nothing
+    assert not one.uninformative
     noisy = replace(
         one, nrms_all_interval=(1.5 * one.nrms_all_start, 3.0 * one.nrms_all_start), chi2_start=0.1, chi2_per_dof=0.01
     )

@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 
-SILENT, JITTER, GAP = 1e-3, 0.1, 1.5  # in samples: limits for rounding, for jitter, for a step without a gap
-SAME_RATE = 1e-3  # relative difference up to which a stated sample rate agrees with the time stamps
+
+@dataclass(frozen=True)
+class TimeAxisSettings:
+    """rounding : deviation from even time stamps that is rounding and not reported [samples].
+    jitter : largest deviation that is accepted [samples].
+    gap : step above which samples are missing [samples].
+    same_rate : relative difference up to which a stated sample rate agrees with the time stamps [1].
+    """
+
+    rounding: float = 1e-3
+    jitter: float = 0.1
+    gap: float = 1.5
+    same_rate: float = 1e-3
+
+
+SETTINGS = TimeAxisSettings()
 
 
 def sample_rate_from(
@@ -45,8 +60,8 @@ def sample_rate_from(
             field=field,
         )
     usual = float(np.median(step))
-    if np.any(step > GAP * usual):
-        bad = np.flatnonzero(step > GAP * usual)
+    if np.any(step > SETTINGS.gap * usual):
+        bad = np.flatnonzero(step > SETTINGS.gap * usual)
         first = int(bad[0]) + 1
         raise InputError(
             f"expected evenly spaced time stamps; gaps: {len(bad)}, the first before {place(first)}: "
@@ -56,20 +71,24 @@ def sample_rate_from(
     mean = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
     off = np.abs(time_s - time_s[0] - mean * np.arange(len(time_s))) / mean
     worst = int(np.argmax(off))
-    if off[worst] > JITTER:
+    if off[worst] > SETTINGS.jitter:
         raise InputError(
-            f"expected evenly spaced time stamps; {np.count_nonzero(off > JITTER)} are more than "
-            f"{JITTER:g} of a sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of "
+            f"expected evenly spaced time stamps; {np.count_nonzero(off > SETTINGS.jitter)} are more than "
+            f"{SETTINGS.jitter:g} of a sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of "
             f"{mean:.6g} s",
             field=field,
         )
-    note = f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even" if off[worst] > SILENT else ""
+    note = (
+        f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even"
+        if off[worst] > SETTINGS.rounding
+        else ""
+    )
     return rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
 
 
 def agreed_rate(stated_Hz: float, measured_Hz: float, field: str = "sample_rate_Hz") -> float:
     """The stated sample rate [Hz]. Raises InputError if it is not the rate of the time stamps."""
-    if abs(stated_Hz / measured_Hz - 1) > SAME_RATE:
+    if abs(stated_Hz / measured_Hz - 1) > SETTINGS.same_rate:
         raise InputError(f"expected {measured_Hz:.9g} Hz, the rate of the time stamps", field=field, value=stated_Hz)
     return stated_Hz
 

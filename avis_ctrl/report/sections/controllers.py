@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
@@ -12,8 +14,19 @@ from avis_ctrl.report.pieces import Piece, Section, Table, table
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 HZ = np.geomspace(0.01, 500.0, 500)
-MOST_POLES = 60
-MOST_ENTRIES = 9  # of a controller whose entries can be told apart in one diagram
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """poles : maximum number of poles in the table, about one page. entries : maximum number of entries of a controller
+    that are distinguishable in one diagram.
+    """
+
+    poles: int = 60
+    entries: int = 9
+
+
+SETTINGS = ControllerSettings()
 
 
 def controllers(result: DesignResult) -> Section:
@@ -95,7 +108,7 @@ def _bode(result: DesignResult) -> Figure:
     K = _system(result.controller("mu"))
     response = K.frequency_response(2 * np.pi * HZ)
     axes = [words.axis(name) for name in result.plant.axes]
-    every = response[0].size <= MOST_ENTRIES
+    every = response[0].size <= SETTINGS.entries
     sizes, phases = [], []
     for i, j in np.ndindex(response.shape[1:]):
         if every or i == j:
@@ -156,11 +169,15 @@ def _poles(mu: ControllerResult) -> Table:
     poles = _system(mu).poles()
     shown = sorted((p for p in poles if p.imag >= 0), key=abs)
     rows = []
-    for p in shown[:MOST_POLES]:
+    for p in shown[: SETTINGS.poles]:
         kind = "pair" if p.imag > 0 else "real"
         damping = -p.real / abs(p) if abs(p) > 0 else 1.0
         rows.append((f"{words.number(abs(p) / (2 * np.pi), 4)} Hz", words.number(damping), kind))
-    left = f" The fastest {len(shown) - MOST_POLES} are listed only in the file." if len(shown) > MOST_POLES else ""
+    left = (
+        f" The fastest {len(shown) - SETTINGS.poles} are listed only in the file."
+        if len(shown) > SETTINGS.poles
+        else ""
+    )
     return table(
         f"Poles of the mu controller, slowest first; a pair counts once.{left}",
         ("frequency", "damping ratio", "kind"),

@@ -14,8 +14,8 @@ from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.instruments import Sensor
 from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.subsystem import ReductionError
+from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_result import DesignResult
-from avis_ctrl.study.plant import edge_levers
 
 # By measured quantity: kind of sensor, unit of its gain, and scale factor and unit of its limit.
 _KINDS = {
@@ -87,7 +87,7 @@ def _value(value: float) -> str:
 
 def _modes(one: Rig) -> Table:
     eom = one.equations_of_motion()
-    edge = edge_levers(one, eom.coordinates)
+    edge = lever_arms(one, eom.coordinates)
     modes = eom.natural_frequencies()
     rows = []
     for frequency, shape in zip(modes.frequencies_Hz, modes.shapes.T, strict=True):
