@@ -58,7 +58,7 @@ _PLACES = {
     "design": "avis_ctrl.interface.workflow",
     "single_axis": "avis_ctrl.interface.workflow",
     "StateSpace": "avis_ctrl.lti",
-    "tf": "avis_ctrl.lti",
+    "tf": "avis_ctrl.uncertainty.uncertain_models",
     "ss": "avis_ctrl.uncertainty.uncertain_models",
     "connect": "avis_ctrl.uncertainty.uncertain_models",
     "real": "avis_ctrl.uncertainty.uncertain_models",

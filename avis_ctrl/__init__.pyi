@@ -9,7 +9,6 @@ from avis_ctrl.interface.workflow import rig as rig
 from avis_ctrl.interface.workflow import simulate_campaign as simulate_campaign
 from avis_ctrl.interface.workflow import single_axis as single_axis
 from avis_ctrl.lti import StateSpace as StateSpace
-from avis_ctrl.lti import tf as tf
 from avis_ctrl.robust.disk_margin import disk_margin as disk_margin
 from avis_ctrl.robust.hinfsyn import hinfsyn as hinfsyn
 from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
@@ -29,6 +28,7 @@ from avis_ctrl.uncertainty.uncertain_models import dynamics as dynamics
 from avis_ctrl.uncertainty.uncertain_models import matrix as matrix
 from avis_ctrl.uncertainty.uncertain_models import real as real
 from avis_ctrl.uncertainty.uncertain_models import ss as ss
+from avis_ctrl.uncertainty.uncertain_models import tf as tf
 from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight as uncertainty_weight
 
 __version__: str

@@ -30,8 +30,9 @@ RESOLVENT_BLOCK = 16
 RESOLVENT_PROBES, RESOLVENT_TOLERANCE = 6, 1e-6
 
 
-def _names(given: Iterable[str] | None, count: int, prefix: str, what: str, different: bool = True) -> Names:
-    names = () if given is None else tuple(str(name) for name in given)
+def signal_names(given: Iterable[str] | None, count: int, prefix: str, what: str, different: bool = True) -> Names:
+    """Checked names of inputs, outputs or states: a string is one name; prefix0, prefix1, ... if none are given."""
+    names = () if given is None else (given,) if isinstance(given, str) else tuple(str(name) for name in given)
     if not names:
         return tuple(f"{prefix}{k}" for k in range(count))
     if len(names) != count:
@@ -97,10 +98,10 @@ class StateSpace:
         if not (np.isfinite(self.dt) and self.dt >= 0):
             raise InputError(f"dt must be 0 (continuous) or a positive number of seconds, not {self.dt!r}")
         object.__setattr__(self, "dt", float(self.dt))
-        object.__setattr__(self, "inputs", _names(self.inputs, n_u, "u", "input"))
-        object.__setattr__(self, "outputs", _names(self.outputs, n_y, "y", "output"))
+        object.__setattr__(self, "inputs", signal_names(self.inputs, n_u, "u", "input"))
+        object.__setattr__(self, "outputs", signal_names(self.outputs, n_y, "y", "output"))
         # State names are informative only: after a connection two parts may have states of the same name.
-        object.__setattr__(self, "states", _names(self.states, n, "x", "state", different=False))
+        object.__setattr__(self, "states", signal_names(self.states, n, "x", "state", different=False))
 
     # -- sizes and properties -------------------------------------------------------------
     @property
@@ -214,8 +215,13 @@ class StateSpace:
         return -self + other
 
     def feedback(self, other: Any = 1.0, sign: int = -1) -> StateSpace:
-        """Closed loop from r to y with y = self u, u = r + sign other y. Raises InputError if it is not well posed."""
+        """Closed loop from r to y with y = self u, u = r + sign other y; a number stands for this gain in each channel.
+
+        Raises InputError if the loop is not well posed.
+        """
         K = operand(other)
+        if K is not None and not K.nstates and K.D.shape == (1, 1) and self.ninputs == self.noutputs:
+            K = gain(K.D * np.eye(self.noutputs), dt=K.dt)
         if K is None or K.D.shape != self.D.shape[::-1] or sign not in (-1, 1):
             raise InputError(
                 f"expected {self.noutputs} inputs and {self.ninputs} outputs, and sign -1 or 1",
@@ -248,17 +254,7 @@ class StateSpace:
         outputs: Sequence[str] | dict[str, str] | None = None,
     ) -> StateSpace:
         """The same system with new signal names (a full list, or a dict from old to new names)."""
-
-        def new(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:
-            if given is None:
-                return old
-            if isinstance(given, dict):
-                if missing := [name for name in given if name not in old]:
-                    raise InputError(f"no signal {missing} among {old}")
-                return tuple(given.get(name, name) for name in old)
-            return tuple(given)
-
-        return replace(self, inputs=new(self.inputs, inputs), outputs=new(self.outputs, outputs))
+        return replace(self, inputs=new_names(self.inputs, inputs), outputs=new_names(self.outputs, outputs))
 
     def select(self, outputs: Selector | None = None, inputs: Selector | None = None) -> StateSpace:
         """The subsystem of the selected inputs and outputs, by name or position, in the order given."""
@@ -275,6 +271,10 @@ class StateSpace:
             self.states,
         )
 
+    def __getitem__(self, key: tuple[Selector, Selector]) -> StateSpace:
+        rows, cols = key
+        return self.select(rows, cols)
+
     def similar(self, T: np.ndarray) -> StateSpace:
         """The same transfer matrix in the state coordinates x_new = inv(T) x."""
         return replace(self, A=np.linalg.solve(T, self.A @ T), B=np.linalg.solve(T, self.B), C=self.C @ T, states=())
@@ -283,10 +283,14 @@ class StateSpace:
     def to_control(self) -> Any:
         """Convert to a python-control StateSpace (imports control, which takes about two seconds).
 
-        Dots in signal names become underscores, because python-control forbids dots.
+        Dots in names become underscores, because python-control forbids dots; repeated names of states become its
+        default names.
         """
         import control
 
+        inputs, outputs, states = (
+            [name.replace(".", "_") for name in names] for names in (self.inputs, self.outputs, self.states)
+        )
         return control.ss(
             self.A,
             self.B,
@@ -294,13 +298,16 @@ class StateSpace:
             self.D,
             self.dt,
             remove_useless_states=False,
-            inputs=[name.replace(".", "_") for name in self.inputs],
-            outputs=[name.replace(".", "_") for name in self.outputs],
+            inputs=inputs,
+            outputs=outputs,
+            states=states if len(set(states)) == len(states) else None,
         )
 
     @staticmethod
     def from_control(system: Any) -> StateSpace:
         """Convert a python-control StateSpace or TransferFunction."""
+        if system.dt is True:
+            raise InputError("expected a sample time in seconds; True leaves it open", field="dt", value=True)
         if not hasattr(system, "A"):
             import control
 
@@ -313,6 +320,7 @@ class StateSpace:
             float(system.dt or 0.0),
             tuple(system.input_labels),
             tuple(system.output_labels),
+            tuple(system.state_labels),
         )
 
     def __repr__(self) -> str:
@@ -320,33 +328,43 @@ class StateSpace:
         return f"StateSpace({count_of(self.nstates, 'state')}, {clock}, {list(self.inputs)} -> {list(self.outputs)})"
 
 
+def new_names(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:
+    """Names after `renamed`: a full list, or a dict from old to new names."""
+    if given is None:
+        return old
+    if isinstance(given, dict):
+        if missing := [name for name in given if name not in old]:
+            raise InputError(f"no signal {missing} among {old}")
+        return tuple(given.get(name, name) for name in old)
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
 def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] = (), dt: float = 0.0) -> StateSpace:
     """Static gain, as a system without states."""
     D = np.atleast_2d(np.asarray(matrix, dtype=float))
     return StateSpace(
-        np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D, dt, tuple(inputs), tuple(outputs)
+        np.zeros((0, 0)),
+        np.zeros((0, D.shape[1])),
+        np.zeros((D.shape[0], 0)),
+        D,
+        dt,
+        new_names((), inputs),
+        new_names((), outputs),
     )
 
 
-def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> StateSpace:
-    """System in balanced companion form from a proper transfer function (coefficients in descending powers of s).
+def tf(
+    numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Sequence[str] = (), *, dt: float = 0.0
+) -> StateSpace:
+    """System in balanced companion form from a proper transfer function (coefficients in descending powers of s, or of
+    z if it is sampled with the sample time dt [s]).
 
-    For a matrix of transfer functions, numerator[i][k] and denominator[i][k] are the coefficients from input k to
-    output i, as in python-control. A common denominator may be given once. Entries of a column with the same
-    denominator share their states.
+    Tables as for `avis_ctrl.uncertainty.uncertain_models.tf`. Entries of a column with the same denominator share their
+    states.
 
     Raises
     ------
     InputError : an improper entry (more zeros than poles), a zero denominator, tables of different shapes.
-
-    Examples
-    --------
-    >>> ac.tf([25.0], [1.0, 10.0, 10.0, 10.0]).dcgain()
-    array([[2.5]])
-    >>> G = ac.tf([[[1.0], [2.0]], [[1.0, 0.0], [3.0]]], [1.0, 3.0, 2.0])        # 2 outputs, 2 inputs
-    >>> G.nstates, G.dcgain()
-    (4, array([[0.5, 1. ],
-           [0. , 1.5]]))
     """
     nums = _table(numerator, "numerator")
     dens = _table(denominator, "denominator")
@@ -365,7 +383,9 @@ def tf(numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Se
             A.append(part.A)
             B.append(part.B @ np.eye(shape[1])[[k]])
             C.append(np.eye(shape[0])[:, sharing] @ part.C)
-    return StateSpace(la.block_diag(*A), np.vstack(B), np.hstack(C), D, 0.0, tuple(inputs), tuple(outputs))
+    return StateSpace(
+        la.block_diag(*A), np.vstack(B), np.hstack(C), D, dt, new_names((), inputs), new_names((), outputs)
+    )
 
 
 def _table(given: Any, field: str) -> list[list[np.ndarray]]:

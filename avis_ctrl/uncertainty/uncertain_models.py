@@ -10,6 +10,8 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import connect as connect_systems
 from avis_ctrl.lti.interchange import as_system
+from avis_ctrl.lti.statespace import StateSpace, new_names
+from avis_ctrl.lti.statespace import tf as tf_of_numbers
 from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealParameter
 from avis_ctrl.uncertainty.uncertain_system import (
     STATES,
@@ -124,12 +126,21 @@ def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
 
 
 def ss(
-    A: Any, B: Any, C: Any, D: Any = None, *, dt: float = 0.0, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
+    A: Any,
+    B: Any,
+    C: Any,
+    D: Any = None,
+    *,
+    dt: float = 0.0,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    states: Sequence[str] = (),
 ) -> Any:
     """A system x' = A x + B u, y = C x + D u whose matrices may have uncertain entries; D zero by default.
 
-    Each matrix is an array, nested lists with uncertain numbers, or a result of `matrix`. Returns a StateSpace if
-    nothing is uncertain, otherwise an `UncertainSystem`. dt : sample time [s], 0 for continuous time.
+    Each matrix is an array, nested lists with uncertain numbers, or a result of `matrix`; A, B and C are [] for a
+    static gain D. Returns a StateSpace if nothing is uncertain, otherwise an `UncertainSystem`. dt : sample time [s],
+    0 for continuous time.
 
     Raises InputError for shapes that do not fit.
 
@@ -146,25 +157,70 @@ def ss(
     >>> len(plant.sample(20, seed=1))
     20
     """
-    a, b, c = (_matrix(one) for one in (A, B, C))
-    d = as_uncertain(np.zeros((c.shape[0], b.shape[1]))) if D is None else _matrix(D)
+    a, b, c = (_matrix(one, name) for one, name in ((A, "A"), (B, "B"), (C, "C")))
+    d = as_uncertain(np.zeros((c.shape[0], b.shape[1]))) if D is None else _matrix(D, "D")
     n = a.shape[0]
+    if not n:
+        b, c = (
+            as_uncertain(np.zeros(shape)) if not one.d.size else one
+            for one, shape in ((b, (0, d.shape[1])), (c, (d.shape[0], 0)))
+        )
+    elif d.shape == (1, 1) and not d.uncertain and not np.any(d.d):
+        # D = 0 stands for a zero matrix of any size, as in python-control.
+        d = as_uncertain(np.zeros((c.shape[0], b.shape[1])))
     if a.shape != (n, n) or b.shape[0] != n or c.shape[1] != n or d.shape != (c.shape[0], b.shape[1]):
         raise InputError(f"shapes do not fit: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}")
     M = reduced(vstacked([hstacked([a, b]), hstacked([c, d])]))
-    inner = np.block([[M.d[:n, :n], M.c[:n]], [M.b[:, :n], M.a]])
-    system = UncertainSystem(
-        inner,
-        np.vstack([M.d[:n, n:], M.b[:, n:]]),
-        np.hstack([M.d[n:, :n], M.c[n:]]),
-        M.d[n:, n:],
-        (STATES, *M.elements),
-        (n, *M.copies),
-        float(dt),
-        tuple(inputs),
-        tuple(outputs),
-    )
-    return system if system.uncertain else system._certain()
+    return _of_matrix(M, n, dt, inputs, outputs, states)
+
+
+def tf(
+    numerator: Any, denominator: Any, inputs: Sequence[str] = (), outputs: Sequence[str] = (), *, dt: float = 0.0
+) -> Any:
+    """System from a proper transfer function (coefficients in descending powers of s, or of z if dt is given).
+
+    For a matrix of transfer functions, numerator[i][k] and denominator[i][k] are the coefficients from input k to
+    output i, as in python-control. A common denominator may be given once. Entries of a column with the same
+    denominator share their states.
+
+    With one input and one output, coefficients may be uncertain; the result is then an `UncertainSystem`. dt : sample
+    time [s], 0 for continuous time.
+
+    Raises
+    ------
+    InputError : an improper entry (more zeros than poles), a zero denominator, tables of different shapes.
+
+    Examples
+    --------
+    >>> ac.tf([25.0], [1.0, 10.0, 10.0, 10.0]).dcgain()
+    array([[2.5]])
+    >>> G = ac.tf([[[1.0], [2.0]], [[1.0, 0.0], [3.0]]], [1.0, 3.0, 2.0])        # 2 outputs, 2 inputs
+    >>> G.nstates, G.dcgain()
+    (4, array([[0.5, 1. ],
+           [0. , 1.5]]))
+
+    A mass on a spring, with uncertain mass:
+
+    >>> m = ac.real("m", 2.0, percent=10)
+    >>> ac.tf([1.0], [m, 0.4, 8.0])
+    UncertainSystem(2 states, ['u0'] -> ['y0']: m = 2 +-10 %, 1 copy)
+    """
+    if not any(_has_uncertain(one) for one in (numerator, denominator)):
+        return tf_of_numbers(numerator, denominator, inputs, outputs, dt=dt)
+    num, den = (_coefficients(*one) for one in ((numerator, "numerator"), (denominator, "denominator")))
+    n = len(den) - 1
+    if len(num) > len(den):
+        raise InputError(f"improper: numerator of degree {len(num) - 1} over denominator of degree {n}")
+    num = [as_uncertain(0.0)] * (len(den) - len(num)) + num
+    # Controllable canonical form; state k is scaled by the k-th power of the geometric mean of the nominal poles.
+    size = abs(float(den[-1].nominal.item()) / float(den[0].nominal.item() or 1.0)) ** (1 / max(n, 1)) or 1.0
+    powers = size ** np.arange(n)
+    last = powers[-1] if n else 1.0
+    highest = den[0].inverse() @ matrix([[*(-a * p / last for a, p in zip(den[:0:-1], powers, strict=True)), 1 / last]])
+    output = num[0] * last * highest + matrix([[*(b * p for b, p in zip(num[:0:-1], powers, strict=True)), 0.0]])
+    shift = [as_uncertain(size * np.eye(n - 1, n + 1, 1))] if n > 1 else []
+    state = [highest] if n else []
+    return _of_matrix(reduced(vstacked([*shift, *state, output])), n, dt, inputs, outputs, ())
 
 
 def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], outputs: Sequence[str]) -> Any:
@@ -190,6 +246,7 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
     >>> ac.connect({"plant": G, "controller": K, "error": error}, ["r"], ["x"]).is_stable()
     True
     """
+    inputs, outputs = new_names((), inputs), new_names((), outputs)
     named = dict(parts) if isinstance(parts, Mapping) else {f"part {k}": one for k, one in enumerate(parts)}
     whole, elements, w, z = {}, list[tuple[Element, int]](), list[str](), list[str]()
     for key, part in named.items():
@@ -212,7 +269,7 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
         P.D[nz:, nw:],
     )
     kinds = [(STATES, n), *elements] if n else elements
-    return reduced(ordered(parts_, kinds, P.dt, tuple(inputs), tuple(outputs)))
+    return reduced(ordered(parts_, kinds, P.dt, P.inputs[nw:], P.outputs[nz:], P.states))
 
 
 def of_element(element: Element, lft: np.ndarray) -> UncertainSystem:
@@ -220,16 +277,63 @@ def of_element(element: Element, lft: np.ndarray) -> UncertainSystem:
     return UncertainSystem(lft[:1, :1], lft[:1, 1:], lft[1:, :1], lft[1:, 1:], (element,), (1,))
 
 
-def _matrix(given: Any) -> UncertainSystem:
-    """An uncertain matrix without states, from a two-dimensional array or a single number."""
+def _matrix(given: Any, name: str) -> UncertainSystem:
+    """An uncertain matrix without states, from a two-dimensional array, rows or a single number; [] has no entries."""
     if isinstance(given, np.ndarray) and given.dtype != object:
         made = as_uncertain(given) if given.ndim in (0, 2) else None
+    elif not isinstance(given, UncertainSystem) and np.size(given) == 0:
+        made = as_uncertain(np.zeros((0, 0)))
     else:
         made = matrix([[given]]) if np.isscalar(given) else matrix(given)
     if made is None or made.nstates:
         raise InputError(
             "expected a matrix: numbers or uncertain numbers in rows",
-            field="matrix",
+            field=name,
             value=np.shape(given) if isinstance(given, np.ndarray) else "a system with states",
         )
     return made
+
+
+def _of_matrix(
+    M: UncertainSystem, n: int, dt: float, inputs: Sequence[str], outputs: Sequence[str], states: Sequence[str]
+) -> Any:
+    """The system with n states from M = [A B; C D]: a StateSpace if nothing is uncertain."""
+    system = UncertainSystem(
+        np.block([[M.d[:n, :n], M.c[:n]], [M.b[:, :n], M.a]]),
+        np.vstack([M.d[:n, n:], M.b[:, n:]]),
+        np.hstack([M.d[n:, :n], M.c[n:]]),
+        M.d[n:, n:],
+        (*[STATES] * bool(n), *M.elements),
+        (*[n] * bool(n), *M.copies),
+        float(dt),
+        new_names((), inputs),
+        new_names((), outputs),
+        new_names((), states),
+    )
+    if system.uncertain:
+        return system
+    return StateSpace(*system.matrices, system.dt, system.inputs, system.outputs, system.states)
+
+
+def _has_uncertain(given: Any) -> bool:
+    if isinstance(given, (list, tuple)) or (isinstance(given, np.ndarray) and given.dtype == object):
+        return any(_has_uncertain(one) for one in given)
+    return isinstance(given, UncertainSystem)
+
+
+def _coefficients(given: Any, field: str) -> list[UncertainSystem]:
+    """Uncertain coefficients of a polynomial, without leading zeros."""
+    every = list(given) if isinstance(given, (list, tuple, np.ndarray)) else [given]
+    if any(isinstance(one, (list, tuple)) for one in every):
+        raise InputError(
+            "expected one input and one output: a matrix of uncertain transfer functions is matrix([[tf(...), ...]])",
+            field=field,
+        )
+    found = [as_uncertain(one) for one in every]
+    if any(one.shape != (1, 1) or one.nstates for one in found):
+        raise InputError("expected numbers and uncertain numbers", field=field, value=repr(given))
+    while found and not found[0].uncertain and not found[0].d.item():
+        found = found[1:]
+    if not found and field == "denominator":
+        raise InputError("the denominator is zero")
+    return found or [as_uncertain(0.0)]

@@ -20,7 +20,7 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
 from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
-from avis_ctrl.lti.statespace import StateSpace, positions
+from avis_ctrl.lti.statespace import StateSpace, new_names, positions, signal_names
 from avis_ctrl.summary import count_of, html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
@@ -52,9 +52,11 @@ class UncertainSystem:
 
     Created by the functions of `uncertain_models` and by arithmetic: + - and integer powers; * and / by a scalar act on
     each entry; @ (and * between matrices) is the product, or series connection. The other operand may be a number, an
-    array, a StateSpace or a python-control system.
+    array, a StateSpace or a python-control system. Names are kept as by StateSpace: a product has the inputs of its
+    right factor and the outputs of its left one; numbers change no names.
 
     a, b, c, d : the matrices above. elements, copies : the blocks in order, the states first if there are any.
+    inputs, outputs, states : names; u0.., y0.., x0.. by default.
     """
 
     a: np.ndarray
@@ -66,15 +68,20 @@ class UncertainSystem:
     dt: float = 0.0
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
 
     # NumPy defers `array * system` to this class.
     __array_ufunc__ = None
 
     def __post_init__(self) -> None:
-        for which, count, letter in (("inputs", self.d.shape[1], "u"), ("outputs", self.d.shape[0], "y")):
-            names = tuple(getattr(self, which))
-            if len(names) != count or len(set(names)) != count:
-                object.__setattr__(self, which, tuple(f"{letter}{k}" for k in range(count)))
+        object.__setattr__(self, "inputs", signal_names(self.inputs, self.shape[1], "u", "input"))
+        object.__setattr__(self, "outputs", signal_names(self.outputs, self.shape[0], "y", "output"))
+        object.__setattr__(self, "states", signal_names(self.states, self.nstates, "x", "state", different=False))
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(StateSpace, name):
+            raise AttributeError(f"an uncertain system has no {name!r}: use .nominal.{name} or .substitute(...).{name}")
+        raise AttributeError(f"'UncertainSystem' object has no attribute {name!r}")
 
     # -- properties --------------------------------------------------------------------------
     @property
@@ -91,6 +98,21 @@ class UncertainSystem:
     def nstates(self) -> int:
         """Number of states."""
         return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
+
+    @property
+    def _unnamed(self) -> bool:
+        """Whether all signals have their default names."""
+        default = UncertainSystem(self.a, self.b, self.c, self.d, self.elements, self.copies)
+        return (self.inputs, self.outputs) == (default.inputs, default.outputs)
+
+    @property
+    def _plain(self) -> bool:
+        """A matrix or number without names of its own."""
+        return not self.nstates and self._unnamed
+
+    @property
+    def _number(self) -> bool:
+        return self.shape == (1, 1) and self._plain
 
     @property
     def uncertain(self) -> dict[str, Element]:
@@ -127,6 +149,7 @@ class UncertainSystem:
             self.dt,
             (*w, *self.inputs),
             (*z, *self.outputs),
+            self.states,
         )
         return P, len(w), len(z)
 
@@ -216,14 +239,15 @@ class UncertainSystem:
     def _certain(self) -> Any:
         if not self.nstates:
             return self.d
-        return StateSpace(self.a, self.b, self.c, self.d, self.dt, self.inputs, self.outputs)
+        return StateSpace(self.a, self.b, self.c, self.d, self.dt, self.inputs, self.outputs, self.states)
 
     # -- arithmetic --------------------------------------------------------------------------
     def __add__(self, other: Any) -> UncertainSystem:
         X, Y = self, as_uncertain(other)
         if X.shape != Y.shape:
             raise InputError(f"sum of shapes {X.shape} and {Y.shape}")
-        return _of_both(parallel(X.matrices, Y.matrices), X, Y, X.inputs, X.outputs)
+        named = Y if X._plain else X
+        return _of_both(parallel(X.matrices, Y.matrices), X, Y, named.inputs, named.outputs)
 
     def __neg__(self) -> UncertainSystem:
         return replace(self, c=-self.c, d=-self.d)
@@ -238,7 +262,7 @@ class UncertainSystem:
 
     def __matmul__(self, other: Any) -> UncertainSystem:
         X, Y = self, as_uncertain(other)
-        inputs, outputs = Y.inputs, X.outputs
+        inputs, outputs = X.inputs if Y._number else Y.inputs, Y.outputs if X._number else X.outputs
         if X.shape == Y.shape == (1, 1) and not (X.nstates or Y.nstates):
             # Numbers commute. Divisors act last, as a mass divides a sum of forces, so that the entries of a row share
             # them; and equal products of parameters get the same order.
@@ -252,9 +276,9 @@ class UncertainSystem:
 
     def __mul__(self, other: Any) -> UncertainSystem:
         X, Y = self, as_uncertain(other)
-        if Y.shape == (1, 1) and X.shape != (1, 1):
-            return X @ _repeated(Y, X.shape[1])
-        return X @ Y if X.shape != (1, 1) else _repeated(X, Y.shape[0]) @ Y
+        if X.shape == (1, 1) != Y.shape:
+            return _repeated(X, Y.shape[0], Y.outputs) @ Y
+        return X @ (Y if X.shape == (1, 1) or Y.shape != (1, 1) else _repeated(Y, X.shape[1], X.inputs))
 
     def __rmul__(self, other: Any) -> UncertainSystem:
         return as_uncertain(other) * self
@@ -277,8 +301,8 @@ class UncertainSystem:
             b=self.b @ inv,
             c=-inv @ self.c,
             d=inv,
-            inputs=self.outputs,
-            outputs=self.inputs,
+            inputs=self.inputs if self._unnamed else self.outputs,
+            outputs=self.outputs if self._unnamed else self.inputs,
         )
 
     def __truediv__(self, other: Any) -> UncertainSystem:
@@ -291,8 +315,8 @@ class UncertainSystem:
         if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
             raise InputError("expected a whole number", field="power", value=power)
         base = self if power >= 0 else self.inverse()
-        result = as_uncertain(np.eye(self.shape[0]))
-        for _ in range(abs(int(power))):
+        result = base if power else as_uncertain(np.eye(self.shape[0]))
+        for _ in range(abs(int(power)) - 1):
             result = result @ base
         return result
 
@@ -301,7 +325,7 @@ class UncertainSystem:
         """Closed loop with `other` from outputs to inputs, negative feedback by default: (I + X Y)^-1 X."""
         X, Y = self, as_uncertain(other)
         if Y.shape == (1, 1) and X.shape[0] == X.shape[1]:
-            Y = _repeated(Y, X.shape[0])
+            Y = _repeated(Y, X.shape[0], X.inputs)
         if Y.shape != (X.shape[1], X.shape[0]):
             raise InputError(f"feedback of shape {Y.shape} around {X.shape}")
         loop = return_difference(X.matrices, Y.matrices, sign)
@@ -331,13 +355,13 @@ class UncertainSystem:
         rows, cols = key
         return self.select(rows, cols)
 
-    def renamed(self, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> UncertainSystem:
-        """The same system with other signal names."""
-        given = {"inputs": tuple(inputs or self.inputs), "outputs": tuple(outputs or self.outputs)}
-        for which, count in (("inputs", self.shape[1]), ("outputs", self.shape[0])):
-            if len(given[which]) != count or len(set(given[which])) != count:
-                raise InputError(f"expected {count} different names", field=which, value=given[which])
-        return replace(self, inputs=given["inputs"], outputs=given["outputs"])
+    def renamed(
+        self,
+        inputs: Sequence[str] | dict[str, str] | None = None,
+        outputs: Sequence[str] | dict[str, str] | None = None,
+    ) -> UncertainSystem:
+        """The same system with new signal names (a full list, or a dict from old to new names)."""
+        return replace(self, inputs=new_names(self.inputs, inputs), outputs=new_names(self.outputs, outputs))
 
     # -- display -----------------------------------------------------------------------------
     def _rows(self) -> list[tuple[str, str]]:
@@ -366,20 +390,20 @@ def as_uncertain(given: Any) -> UncertainSystem:
         return given
     P = as_system(given)
     n = P.nstates
-    return UncertainSystem(P.A, P.B, P.C, P.D, (STATES,) * bool(n), (n,) * bool(n), P.dt, P.inputs, P.outputs)
+    return UncertainSystem(P.A, P.B, P.C, P.D, (STATES,) * bool(n), (n,) * bool(n), P.dt, P.inputs, P.outputs, P.states)
 
 
 def _diagonal(X: UncertainSystem, Y: UncertainSystem) -> UncertainSystem:
     parts = tuple(la.block_diag(p, q) for p, q in ((X.a, Y.a), (X.b, Y.b), (X.c, Y.c), (X.d, Y.d)))
-    return ordered(parts, _kinds(X, Y), _clock(X, Y), (), ())
+    return ordered(parts, _kinds(X, Y), _clock(X, Y), (), (), X.states + Y.states)
 
 
-def _repeated(X: UncertainSystem, n: int) -> UncertainSystem:
-    """X I_n of a system with one input and one output."""
+def _repeated(X: UncertainSystem, n: int, names: tuple[str, ...]) -> UncertainSystem:
+    """X I_n of a system with one input and one output; names : (n,) of both sides."""
     result = X
     for _ in range(n - 1):
         result = _diagonal(result, X)
-    return result
+    return replace(result, inputs=names, outputs=names)
 
 
 def hstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
@@ -394,7 +418,7 @@ def hstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
             np.hstack([result.c, X.c]),
             np.hstack([result.d, X.d]),
         )
-        result = ordered(parts, _kinds(result, X), _clock(result, X), (), ())
+        result = ordered(parts, _kinds(result, X), _clock(result, X), (), (), result.states + X.states)
     return result
 
 
@@ -410,7 +434,7 @@ def vstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
             la.block_diag(result.c, X.c),
             np.vstack([result.d, X.d]),
         )
-        result = ordered(parts, _kinds(result, X), _clock(result, X), (), ())
+        result = ordered(parts, _kinds(result, X), _clock(result, X), (), (), result.states + X.states)
     return result
 
 
@@ -428,11 +452,16 @@ def _clock(*systems: UncertainSystem) -> float:
 def _of_both(
     parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str], outputs: Sequence[str]
 ) -> UncertainSystem:
-    return reduced(ordered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs)))
+    return reduced(ordered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs), X.states + Y.states))
 
 
 def ordered(
-    parts: Any, kinds: Sequence[tuple[Element, int]], dt: float, inputs: tuple[str, ...], outputs: tuple[str, ...]
+    parts: Any,
+    kinds: Sequence[tuple[Element, int]],
+    dt: float,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    states: tuple[str, ...],
 ) -> UncertainSystem:
     """System with the states first, then one block per element, in order of first occurrence."""
     places: dict[str, tuple[Element, list[int], list[int]]] = {}
@@ -459,6 +488,7 @@ def ordered(
         dt,
         inputs,
         outputs,
+        states,
     )
 
 
@@ -496,6 +526,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
         _clock(system, inner),
         system.inputs,
         system.outputs,
+        system.states + inner.states,
     )
 
 
@@ -534,7 +565,7 @@ def reduced(system: UncertainSystem) -> UncertainSystem:
     )
     kinds = [(one, n_one) for k, (one, n_one, _, _) in enumerate(slices) if k not in scalar]
     kinds += [(slices[k][0], n_one) for k, n_one in zip(scalar, kept, strict=True) if n_one]
-    return ordered(parts, kinds, system.dt, system.inputs, system.outputs)
+    return ordered(parts, kinds, system.dt, system.inputs, system.outputs, system.states)
 
 
 def _power_of_two(size: np.ndarray) -> np.ndarray:

@@ -207,3 +207,16 @@ def test_a_wrong_number_of_state_names_is_refused():
 def test_gain_at_a_pole_is_infinite_as_in_python_control():
     G = tf([1.0], [1.0, 0.0])
     assert G.dcgain() == control.dcgain(G.to_control()) == np.inf and np.isinf(G(0.0))
+
+
+def test_a_string_is_one_name_and_a_number_closes_each_channel(rng):
+    G = StateSpace(-np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2)), 0.0, ("a", "b"), ("c", "d"))
+    np.testing.assert_allclose(G.feedback(3.0).A, -4 * np.eye(2))
+    assert G["d", "b"].inputs == ("b",) and G[0, :].D.shape == (1, 2)
+    one = tf([1.0], [1.0, -0.5], "force", "x", dt=0.1)
+    assert (one.inputs, one.outputs, one.dt) == (("force",), ("x",), 0.1) and one.is_stable()
+
+
+def test_a_sample_time_that_is_open_is_refused():
+    with pytest.raises(InputError, match="expected a sample time in seconds"):
+        StateSpace.from_control(control.tf([1.0], [1.0, -0.5], True))

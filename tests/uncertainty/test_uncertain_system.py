@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, tf
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
+from avis_ctrl.uncertainty import uncertain_models
 from avis_ctrl.uncertainty.uncertain_models import complex_disk, connect, dynamics, matrix, real, ss
 
 NAMES = ("p", "q", "r")
@@ -304,6 +305,11 @@ def test_two_parameters_of_one_name_are_refused():
         (lambda: ELEMENTS["p"].substitute(p="wide"), InputError, "expected a number"),
         (lambda: matrix([[1.0, 2.0], [ELEMENTS["p"]]]), InputError, "rows of one length"),
         (lambda: ss([[ELEMENTS["p"]]], [[1.0], [1.0]], [[1.0]]), InputError, "shapes do not fit"),
+        (lambda: ss([[ELEMENTS["p"]]], [[1.0]], [[1.0]], inputs=["a", "b"]), InputError, "expected 1 input names"),
+        (lambda: ss([[ELEMENTS["p"]]], [], [[1.0]]), InputError, "shapes do not fit"),
+        (lambda: uncertain_models.tf([1, 1, 1], [1, ELEMENTS["p"]]), InputError, "improper"),
+        (lambda: uncertain_models.tf([1], [0, 0 * ELEMENTS["p"]]), InputError, "denominator is zero"),
+        (lambda: uncertain_models.tf([[[ELEMENTS["p"]]]], [1, 1]), InputError, "expected one input and one output"),
         (lambda: matrix([[1, 2]]) @ matrix([[ELEMENTS["p"], 1]]), InputError, "product of shapes"),
         (lambda: (ELEMENTS["p"] - 3).inverse().substitute(p=3.0), ComputationError, "has no value here"),
     ],
@@ -336,6 +342,77 @@ def test_sampled_dynamics_are_all_pass_up_to_their_gain():
 def test_short_and_rich_texts():
     G = mass_spring_damper()
     assert "\n" not in repr(G) and "m = 3 +-40 %, 1 copy" in repr(G) and "<table>" in G._repr_html_()
+
+
+def named_plant():
+    k = real("k", 2.0, percent=10)
+    return ss(
+        [[0, 1], [-k, -1]], [[0, 0], [1, 2]], np.eye(2), 0, inputs=["f", "g"], outputs=["x", "v"], states=["p", "q"]
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda G: 3 * G,
+        lambda G: G / 2,
+        lambda G: real("m", 1.0, percent=5) * G,
+        lambda G: G * real("m", 1.0, percent=5),
+        lambda G: np.eye(2) - G,
+        lambda G: -G,
+        lambda G: G + G.nominal,
+        lambda G: G.feedback(),
+        lambda G: G.renamed({"f": "a"}).renamed({"a": "f"}),
+    ],
+)
+def test_numbers_and_feedback_change_no_names(change):
+    made = change(named_plant())
+    assert (made.inputs, made.outputs) == (("f", "g"), ("x", "v")) and made.states[:2] == ("p", "q")
+
+
+def test_names_of_products_are_those_of_certain_systems():
+    G, W = named_plant(), tf([1.0], [1.0, 1.0], ["e"], ["f"])
+    made, certain = G[:, "f"] @ W, G.nominal[:, "f"] @ W
+    assert (made.inputs, made.outputs, made.states) == (certain.inputs, certain.outputs, certain.states)
+    assert (G[0, 0] ** 2).inputs == ("f",) and (1 - G[0, 0]).outputs == ("x",)
+    assert connect([G], ["f", "g"], "v").states == ("p", "q") == G.substitute(k=2.1).states
+    back = StateSpace.from_control(G.nominal.to_control())
+    assert (back.inputs, back.outputs, back.states) == (G.inputs, G.outputs, G.states)
+
+
+def test_an_attribute_of_members_says_where_it_is():
+    with pytest.raises(AttributeError, match=r"use \.nominal\.poles"):
+        _ = named_plant().poles
+
+
+@pytest.mark.parametrize("empty", [[], [[]], np.zeros((0, 0))], ids=["list", "row", "array"])
+def test_a_static_gain_has_empty_matrices(empty):
+    G = ss(empty, empty, empty, [[1.0, 2.0]], inputs=["a", "b"], outputs="c")
+    np.testing.assert_array_equal(G.dcgain(), [[1.0, 2.0]])
+    assert (G.nstates, G.inputs, G.outputs) == (0, ("a", "b"), ("c",))
+    assert ss(empty, empty, empty, [[ELEMENTS["p"]]]).substitute(p=2.5) == [[2.5]]
+
+
+@pytest.mark.parametrize(
+    "num, den",
+    [
+        (lambda m, c, k: [1.0], lambda m, c, k: [m, c, k]),
+        (lambda m, c, k: [c, k], lambda m, c, k: [m, c, k]),
+        (lambda m, c, k: [m, 0, 0], lambda m, c, k: [m, c, k]),
+        (lambda m, c, k: [0, k], lambda m, c, k: [1.0, m, c, 2.0, 1e4 * k]),
+        (lambda m, c, k: k, lambda m, c, k: [1e-6, c, 1e6 * m]),
+    ],
+)
+def test_a_transfer_function_with_uncertain_coefficients(num, den):
+    elements = [real(name, 1.0, percent=50) for name in "mck"]
+    values = {"m": 1.3, "c": 0.6, "k": 1.1}
+    for dt in (0.0, 0.1):
+        G = uncertain_models.tf(num(*elements), den(*elements), "f", "x", dt=dt)
+        exact = control.tf(num(*values.values()), den(*values.values()), dt)
+        member = G.substitute({name: values[name] for name in G.uncertain})
+        assert member(0.3 + 0.7j)[0, 0] == pytest.approx(exact(0.3 + 0.7j), rel=1e-9)
+        assert G.dt == dt and max(n for one, n in zip(G.elements, G.copies, strict=True) if one.name in values) <= 2
+        assert (G.inputs, G.outputs) == (("f",), ("x",))
 
 
 def test_sampled_systems_keep_their_clock():
