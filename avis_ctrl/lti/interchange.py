@@ -33,10 +33,12 @@ def as_system(given: Any, field: str = "system") -> StateSpace:
         raise InputError(f"expected a proper system: {' '.join(str(error).split())}", field=field) from None
     if found is not None:
         return found
+    kind = type(given).__name__
     raise InputError(
-        "expected a StateSpace (avis_ctrl or python-control), a TransferFunction, a number or a matrix",
+        "expected a StateSpace (avis_ctrl or python-control), a TransferFunction, a real number or a real matrix"
+        + ("; its nominal system is .nominal" if hasattr(given, "nominal") else ""),
         field=field,
-        value=type(given).__name__,
+        value=f"complex {kind}" if np.iscomplexobj(given) and kind != "complex" else kind,
     )
 
 

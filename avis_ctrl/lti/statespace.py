@@ -448,13 +448,16 @@ def append(*systems: StateSpace) -> StateSpace:
 
 
 def operand(given: Any) -> StateSpace | None:
-    """Convert a number, a matrix, or a system of this package or python-control to a StateSpace; None for other types.
+    """Convert a number, a matrix, or a system of this package or python-control to a StateSpace; None for other types
+    and for complex numbers.
 
     The types of python-control are recognised by their attributes, because importing the library takes two seconds.
     """
     if isinstance(given, StateSpace):
         return given
     if isinstance(given, (int, float, np.number, np.ndarray)):
+        if np.iscomplexobj(given):
+            return None
         return gain(np.atleast_2d(np.asarray(given, float)))
     if hasattr(given, "A") or hasattr(given, "num"):
         return StateSpace.from_control(given)
@@ -468,7 +471,7 @@ def _as_matrix(factor: np.ndarray | float, size: int) -> np.ndarray:
 
 def _common_dt(*systems: StateSpace) -> float:
     # A static gain is compatible with any sample time.
-    clocks = {s.dt for s in systems if s.nstates} or {s.dt for s in systems}
+    clocks = {s.dt for s in systems if s.nstates} or {s.dt for s in systems if s.dt} or {0.0}
     if len(clocks) > 1:
         raise InputError(f"systems of different sample times cannot be connected: {sorted(clocks)} s")
     return clocks.pop()

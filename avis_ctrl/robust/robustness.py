@@ -6,20 +6,22 @@ every Delta of norm below 1/mu(M11), and its gain is also at most mu(M) for ever
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust import mu_peak as peaks
 from avis_ctrl.robust.mu_peak import ALL_FREQUENCIES, SLACK, MuPeak, mu_peak
+from avis_ctrl.robust.mu_realise import realise_delta
 from avis_ctrl.summary import Shown
-from avis_ctrl.uncertainty.blocks import Block, BlockStructure
-from avis_ctrl.uncertainty.elements import RealParameter
+from avis_ctrl.uncertainty.blocks import Block, BlockStructure, ComplexFull, ComplexScalar
 from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 
@@ -30,7 +32,9 @@ class Robustness(Shown):
     lower : the loop is robust for all uncertainty below `lower` times the declared uncertainty (at every frequency if
         `guaranteed`, otherwise at the computed frequencies). upper : the perturbation `delta` of this size violates
         robustness at `omega` [rad/s]; inf if none was found.
-    worst : `delta` by name: values of real parameters, normalised matrices of other elements.
+    worst : `delta` as values for `system.substitute`: numbers for real parameters; for complex ones and dynamics,
+        stable systems of constant norm, equal to `delta` at `omega` (a matrix of rank above one stays a matrix). With
+        `blocks`: normalised, by the names of the blocks ("block 0" and so on if they have none).
     mu : the underlying bounds of mu.
     """
 
@@ -50,6 +54,33 @@ class Robustness(Shown):
         if self.lower > 1 and self.guaranteed:
             return True
         return False if self.upper <= 1 else None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WorstCaseGain(MuPeak):
+    """Bounds of the largest gain over the declared uncertainty; fields of `MuPeak`.
+
+    worst : the perturbation that attains `lower` at `omega`, as for `Robustness`.
+    """
+
+    in_line = ("upper", "lower", "omega", "guaranteed", "worst")
+
+    worst: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RobustnessSettings:
+    """beside : frequency that stands for 0, relative to the slowest pole, and inverse of that for infinity relative to
+        the fastest one [1]: the response there differs by this fraction.
+    real : imaginary part, relative to delta, below which delta is taken as real at 0 and infinity [1]: the phase that
+        the search leaves undetermined, since the gain depends on its square.
+    """
+
+    beside: float = 1e-5
+    real: float = 1e-3
+
+
+SETTINGS = RobustnessSettings()
 
 
 def robust_stability(
@@ -77,7 +108,7 @@ def robust_stability(
     """
     P, structure, elements = _opened(system, blocks)
     inner = P.select(slice(structure.n_z), slice(structure.n_w))
-    return _robustness(mu_peak(inner, structure, slack=slack), structure, elements)
+    return _robustness(mu_peak(inner, structure, slack=slack), P, structure, elements)
 
 
 def robust_performance(
@@ -101,7 +132,7 @@ def robust_performance(
     if n_d < 1 or n_e < 1:
         raise InputError("expected inputs d and outputs e beside the uncertainty", field="system", value=P.D.shape)
     whole = structure.with_performance(n_d, n_e)
-    return _robustness(mu_peak(P, whole, slack=slack), structure, elements)
+    return _robustness(mu_peak(P, whole, slack=slack), P, structure, elements)
 
 
 def worst_case_gain(
@@ -110,25 +141,32 @@ def worst_case_gain(
     *,
     band: tuple[float, float] = ALL_FREQUENCIES,
     slack: float = SLACK,
-) -> MuPeak:
+) -> WorstCaseGain:
     """Largest gain from d to e over the declared uncertainty; `avis_ctrl.robust.mu_peak.worst_case_gain`.
 
     system, blocks : as for `robust_stability`. band : (low, high) in rad/s. slack : as for `mu_peak`.
-    `upper` is proved, `lower` is attained by `delta`; both are inf if a perturbation destabilises the loop. Raises the
-    errors of `robust_performance`, and InputError for an empty band.
+    `upper` is proved, `lower` is attained by `system.substitute(result.worst)`; both are inf if a perturbation
+    destabilises the loop. Raises the errors of `robust_performance`, and InputError for an empty band.
 
     Examples
     --------
     The peak of 1/(s^2 + c s + k) is about 1/(c sqrt(k)), so the worst case has the smallest c and k:
 
     >>> k, c = ac.real("k", 4.0, percent=20), ac.real("c", 0.4, percent=20)
-    >>> found = ac.worst_case_gain(ac.ss([[0, 1], [-k, -c]], [[0], [1]], [[1, 0]]))
+    >>> plant = ac.ss([[0, 1], [-k, -c]], [[0], [1]], [[1, 0]])
+    >>> found = ac.worst_case_gain(plant)
     >>> peak = 1 / (0.32 * np.sqrt(3.2 - 0.16**2))
     >>> bool(peak <= found.upper < 1.001 * peak), round(found.upper, 2)
     (True, 1.75)
+    >>> found.worst
+    {'k': 3.2, 'c': 0.32}
+    >>> plant.substitute(found.worst).dcgain()
+    array([[0.3125]])
     """
-    P, structure, _ = _opened(system, blocks)
-    return peaks.worst_case_gain(P, structure, band=band, slack=slack)
+    P, structure, elements = _opened(system, blocks)
+    found = peaks.worst_case_gain(P, structure, band=band, slack=slack)
+    facts = {one.name: getattr(found, one.name) for one in fields(found)}
+    return WorstCaseGain(**facts, worst=worst_values(found, P, structure, elements))
 
 
 def _opened(
@@ -152,25 +190,39 @@ def _opened(
     return P, structure, elements
 
 
-def _robustness(peak: MuPeak, structure: BlockStructure, elements: dict[str, Any]) -> Robustness:
-    worst: dict[str, Any] = {}
-    if peak.delta is not None:
-        part = peak.delta[: structure.n_w, : structure.n_z]
-        for block, value in zip(structure.blocks, structure.values(part), strict=True):
-            one = elements.get(block.name)
-            worst[block.name] = (
-                one.value(float(np.real(value)))
-                if isinstance(one, RealParameter)
-                else float(np.real(value))
-                if block.kind == "real"
-                else value
-            )
+def _robustness(peak: MuPeak, P: StateSpace, structure: BlockStructure, elements: dict[str, Any]) -> Robustness:
     return Robustness(
         1 / peak.upper if peak.upper > 0 else np.inf,
         1 / peak.lower if peak.lower > 0 else np.inf,
         peak.omega,
         peak.guaranteed,
-        worst,
+        worst_values(peak, P, structure, elements),
         peak.delta,
         peak,
     )
+
+
+def worst_values(peak: MuPeak, P: StateSpace, structure: BlockStructure, elements: dict[str, Any]) -> dict[str, Any]:
+    """`delta` by name: numbers for real blocks, systems of constant norm for complex ones."""
+    if peak.delta is None:
+        return {}
+    # No real system is complex at frequency 0 or infinity: such a delta is attained beside them.
+    sizes = np.abs(continuous_image(P).poles())
+    sizes = sizes[sizes > 0] if np.any(sizes) else np.ones(1)
+    at = image_frequency(peak.omega, P.dt)
+    inside = np.clip(at, SETTINGS.beside * sizes.min(), sizes.max() / SETTINGS.beside)
+    omega = float(sampled_frequency(inside, P.dt))
+    worst: dict[str, Any] = {}
+    values = structure.values(peak.delta[: structure.n_w, : structure.n_z])
+    for k, (block, value) in enumerate(zip(structure.blocks, values, strict=True)):
+        if inside != at and np.max(np.abs(np.imag(value))) <= SETTINGS.real * np.max(np.abs(value)):
+            value = np.real(value)
+        name = block.name or f"block {k}"
+        if block.kind == "real":
+            delta: Any = float(np.real(value))
+        else:
+            delta, one = value, ComplexFull(block.rows, block.cols) if block.kind == "full" else ComplexScalar()
+            with contextlib.suppress(ComputationError):  # a full block that is not a dyad
+                delta = realise_delta(np.atleast_2d(value), omega, [one], P.dt)
+        worst[name] = elements[name].value(delta) if name in elements else delta
+    return worst

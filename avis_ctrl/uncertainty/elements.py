@@ -7,6 +7,7 @@ value.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,10 @@ class Element:
     def block(self, copies: int) -> Block:
         """The block of a number of copies."""
         return ComplexScalar(copies, self.name)
+
+    def value(self, delta: Any) -> Any:
+        """The value of a normalised delta: a number, or a system for complex elements."""
+        return delta
 
 
 @dataclass(frozen=True)
@@ -107,6 +112,9 @@ class ComplexDisk(Element):
         """(2, 2): value = F_u of this matrix and delta."""
         size = np.sqrt(self.radius)
         return np.array([[0.0, size], [size, self.centre]])
+
+    def value(self, delta: Any) -> Any:
+        return self.centre + self.radius * delta
 
     def __str__(self) -> str:
         return f"{self.name} within {self.radius:.5g} of {self.centre:.5g} (complex)"

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, tf
 from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity
-from avis_ctrl.robust.robustness import robust_performance, robust_stability, worst_case_gain
-from avis_ctrl.uncertainty.blocks import RealScalar
-from avis_ctrl.uncertainty.uncertain_models import dynamics, real, ss
+from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.robust.robustness import robust_performance, robust_stability, worst_case_gain, worst_values
+from avis_ctrl.uncertainty.blocks import ComplexScalar, RealScalar
+from avis_ctrl.uncertainty.uncertain_models import complex_disk, dynamics, real, ss
 from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight
 
 # Skogestad and Postlethwaite, Multivariable Feedback Control, 2005: plant of section 2.6, weights of example 2.17.
@@ -46,6 +50,46 @@ def test_performance_at_its_own_margin_is_the_worst_case_gain():
     assert scaled.upper <= 1 / a * (1 + 2e-3) and scaled.lower >= 1 / found.upper * (1 - 1e-2)
     assert found.robust is False  # the resonance has a gain above 1 with the declared uncertainty
     assert robust_stability(oscillator()).robust is True
+
+
+def four_elements(seed, dt):
+    """A random system with a real parameter, a disk, and dynamics of one channel (three copies) and of two."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((4, 4))
+    A -= (np.linalg.eigvals(A).real.max() + 0.5) * np.eye(4)
+    A = (la.expm(A * dt) if dt else A).astype(object)
+    A[1, 0], A[2, 3] = A[1, 0] * real("k", 1.0, percent=20), A[2, 3] * complex_disk("z", 1.0, 0.1)
+    G = ss(A, rng.standard_normal((4, 2)), rng.standard_normal((3, 4)), dt=dt)
+    return G @ (np.eye(2) + dynamics("f", 0.3, (2, 2))) * (1 + dynamics("s", 0.2))
+
+
+@pytest.mark.parametrize(("seed", "dt"), [(2, 0.0), (6, 0.0), (10, 0.1), (7, 0.1)])
+def test_the_worst_case_can_be_substituted_and_has_the_reported_gain(seed, dt):
+    G = four_elements(seed, dt)
+    found = worst_case_gain(G)
+    worst = G.substitute(found.worst)
+    assert worst.is_stable() and set(found.worst) == {"k", "z", "f", "s"}
+    assert found.lower * (1 - 1e-5) <= hinf_norm(worst).gain <= found.upper * (1 + 1e-5)
+    for name in "fs":
+        assert found.worst[name].is_stable() and hinf_norm(found.worst[name]).gain <= 1 + 1e-6
+    margin = robust_stability(G)
+    poles = G.substitute(margin.worst).poles()
+    assert np.max(np.abs(poles) - 1 if dt else poles.real) == pytest.approx(0.0, abs=1e-8)
+    performance = robust_performance(G)
+    gain = np.linalg.norm(G.substitute(performance.worst).frequency_response(performance.omega)[0], 2)
+    assert gain >= (1 - 1e-5) / performance.upper
+
+
+def test_a_complex_worst_case_at_zero_frequency_is_attained_beside_it():
+    lag = tf([1.0], [1.0, 1.0])
+    G = lag * (1 + dynamics("d", 0.5))
+    peak = mu_peak(G.lft()[0].select([0], [0]), [ComplexScalar(1, "d")])
+    P, blocks = G.lft()
+    made = worst_values(replace(peak, delta=np.array([[0.6 + 0.8j]]), omega=0.0), P, blocks, G.uncertain)
+    beside = G.substitute(made).frequency_response([1e-5])[0, 0, 0]
+    assert beside == pytest.approx(1 + 0.5 * (0.6 + 0.8j), rel=1e-4)
+    unnamed = worst_case_gain(P, [ComplexScalar()])
+    assert set(unnamed.worst) == {"block 0"} and unnamed.lower == pytest.approx(1.5, rel=1e-3)
 
 
 def test_an_lft_with_blocks_is_the_same_as_the_system():
