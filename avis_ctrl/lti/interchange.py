@@ -17,7 +17,8 @@ from avis_ctrl.lti.statespace import StateSpace, operand
 def as_system(given: Any, field: str = "system") -> StateSpace:
     """Convert a python-control StateSpace or TransferFunction, a number or a matrix to a StateSpace.
 
-    A StateSpace is returned unchanged. An object with a method `system` is replaced by the result of that method.
+    A StateSpace is returned unchanged; an UncertainSystem must have no uncertainty left. An object with a method
+    `system` is replaced by the result of that method.
 
     Raises
     ------
@@ -27,6 +28,8 @@ def as_system(given: Any, field: str = "system") -> StateSpace:
         raise InputError("expected a system with states; a frequency response has none", field=field)
     if hasattr(given, "system") and callable(given.system):
         return given.system()
+    if getattr(given, "uncertain", None) == {}:
+        given = given.nominal
     try:
         found = operand(np.asarray(given, float) if isinstance(given, list) else given)
     except (TypeError, ValueError) as error:

@@ -53,7 +53,7 @@ def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = N
     omega : frequencies [rad/s] to evaluate; default: 400 over the range of the plant poles, with two decades beyond.
     Raises the errors of `hinfsyn`.
     """
-    P = as_plant(P, nmeas, ncon)
+    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     plant = posed_plant(P, nmeas, ncon)
     best = pointwise_bound(plant, omega)
     if min(rank_margins(plant)) >= SETTINGS.rank_tolerance:

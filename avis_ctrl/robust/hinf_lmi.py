@@ -52,7 +52,7 @@ def lmi_gamma(P: Any, nmeas: int, ncon: int) -> LmiOptimum:
 
     Arguments and input errors as in `hinfsyn`; ComputationError if the solver fails.
     """
-    P = as_plant(P, nmeas, ncon)
+    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     plant = Plant.of(continuous_image(P), nmeas, ncon)
     check_stabilisable(plant)
     first = size = float(plant.size(plant.B1, plant.C1, plant.D11))

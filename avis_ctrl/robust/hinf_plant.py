@@ -11,6 +11,7 @@ Robust and Optimal Control, 1996, section 16.2.1).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,13 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, minimal
 from avis_ctrl.lti.bilinear import continuous_image
+from avis_ctrl.lti.interchange import as_system
+from avis_ctrl.lti.statespace import Names, positions
 from avis_ctrl.robust.hinf_settings import SETTINGS
+from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
+
+# Number of measurements or controls, which are the last signals of the plant, or their names.
+Signals = int | str | Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -85,26 +92,42 @@ class Plant:
         return np.where(size > 1e-100, size, 1.0)
 
 
-def as_plant(P: Any, nmeas: int, ncon: int) -> StateSpace:
-    """Convert an avis_ctrl or python-control system to StateSpace and check the partition (InputError)."""
+def as_plant(P: Any, nmeas: Signals, ncon: Signals) -> tuple[StateSpace, int, int]:
+    """The generalized plant with y and u last, and their numbers; InputError for a wrong partition.
+
+    P : an avis_ctrl or python-control system; of an `UncertainSystem` the nominal one. nmeas, ncon : numbers, or names
+    of the measurements and controls, which become the last signals in this order.
+    """
+    if isinstance(P, UncertainSystem):
+        P = as_system(P.nominal).renamed(P.inputs, P.outputs)
     if not isinstance(P, StateSpace):
         if not hasattr(P, "A") and not hasattr(P, "num"):
-            raise InputError("expected an avis_ctrl or python-control StateSpace", field="P", value=type(P).__name__)
+            raise InputError("expected a system of avis_ctrl or python-control", field="P", value=type(P).__name__)
         P = StateSpace.from_control(P)
-    for field, count, total, what in (
-        ("nmeas", nmeas, P.noutputs, "outputs (z, y)"),
-        ("ncon", ncon, P.ninputs, "inputs (w, u)"),
-    ):
-        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
-            raise InputError("expected a whole number of at least 1", field=field, value=count)
-        if count >= total:
-            raise InputError(
-                f"expected less than {total}: the plant has {total} {what} and one must be left "
-                "for the performance channel",
-                field=field,
-                value=count,
-            )
-    return P
+    rows, n_y = _order("nmeas", nmeas, P.outputs, "output", "outputs (z, y)")
+    cols, n_u = _order("ncon", ncon, P.inputs, "input", "inputs (w, u)")
+    return P if rows == sorted(rows) and cols == sorted(cols) else P.select(rows, cols), n_y, n_u
+
+
+def _order(field: str, given: Signals, names: Names, kind: str, what: str) -> tuple[list[int], int]:
+    """Positions of all signals, the named ones last, and the number of these."""
+    every, total = list(range(len(names))), len(names)
+    count: Any = given
+    if isinstance(given, (str, list, tuple)):
+        last = positions(names, given, kind)
+        every, count = [k for k in every if k not in last] + last, len(last)
+        if len(set(last)) != count:
+            raise InputError("expected different names", field=field, value=given)
+    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+        raise InputError("expected a whole number of at least 1, or names", field=field, value=given)
+    if count >= total:
+        raise InputError(
+            f"expected less than {total}: the plant has {total} {what} and one must be left "
+            "for the performance channel",
+            field=field,
+            value=given,
+        )
+    return every, int(count)
 
 
 def check_stabilisable(plant: Plant) -> None:

@@ -22,7 +22,16 @@ from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import sampled_image
 from avis_ctrl.robust.hinf_bounds import pointwise_bound
-from avis_ctrl.robust.hinf_plant import NormalForm, Plant, as_plant, normal_form, posed_plant, rank_margins, regularised
+from avis_ctrl.robust.hinf_plant import (
+    NormalForm,
+    Plant,
+    Signals,
+    as_plant,
+    normal_form,
+    posed_plant,
+    rank_margins,
+    regularised,
+)
 from avis_ctrl.robust.hinf_riccati import GammaBracket, central_controller, find_gamma, gamma_test, natural_gamma
 from avis_ctrl.robust.hinf_settings import SETTINGS
 from avis_ctrl.robust.reduction import residualise_fast
@@ -82,8 +91,8 @@ class Synthesis(Shown):
 
 def hinfsyn(
     P: Any,
-    nmeas: int,
-    ncon: int,
+    nmeas: Signals,
+    ncon: Signals,
     *,
     backoff: float = 0.01,
     tolerance: float = 1e-3,
@@ -96,8 +105,9 @@ def hinfsyn(
 
     Parameters
     ----------
-    P : StateSpace (avis_ctrl or python-control) from (w, u) to (z, y), u and y last.
-    nmeas, ncon : number of measurements y and of controls u.
+    P : StateSpace (avis_ctrl or python-control) from (w, u) to (z, y), u and y last; of an `UncertainSystem` the
+        nominal system is taken (`musyn` takes its uncertainty into account).
+    nmeas, ncon : number of measurements y and of controls u; or their names, wherever they stand in P.
     backoff : relative distance of the controller from the optimum.
     tolerance : relative width to which the optimum is bracketed.
     method : "riccati" (Glover and Doyle 1988), or "lmi" (Gahinet and Apkarian 1994) as a slow independent check of the
@@ -123,7 +133,7 @@ def hinfsyn(
     >>> low <= 2**0.5 <= high < 1.416, made.gamma <= 1.01 * high
     (True, True)
     """
-    P = as_plant(P, nmeas, ncon)
+    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     _check_options(backoff, tolerance, method, gamma_hint, far_poles)
     problem = _Problem.of(P, nmeas, ncon)
     form, bracket, notes = problem.solve(tolerance, gamma_hint)
@@ -164,7 +174,7 @@ def hinf_controller(
     P: Any, nmeas: int, ncon: int, backoff: float, gamma_hint: float | None = None, tolerance: float = 1e-3
 ) -> Synthesis:
     """The controller of `hinfsyn` with the same parameters, without a lower bound of the optimum; for iterations."""
-    problem = _Problem.of(as_plant(P, nmeas, ncon), nmeas, ncon)
+    problem = _Problem.of(*as_plant(P, nmeas, ncon))
     form, bracket, notes = problem.solve(tolerance, gamma_hint, proved=False)
     result, raised = problem.realise(form, bracket.upper.gamma, backoff, False)
     # With extra channels, or if the target was missed, only the measured gamma is known to be feasible.
@@ -180,7 +190,7 @@ def hinf_suboptimal(P: Any, nmeas: int, ncon: int, gamma: float) -> Synthesis:
     ComputationError if gamma cannot be achieved (with the condition that fails), or if the measured norm of the closed
     loop exceeds it.
     """
-    P = as_plant(P, nmeas, ncon)
+    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     if not (np.isfinite(gamma) and gamma > 0):
         raise InputError("expected a positive number", field="gamma", value=gamma)
     problem = _Problem.of(P, nmeas, ncon)

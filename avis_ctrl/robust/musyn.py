@@ -31,9 +31,11 @@ from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
+from avis_ctrl.robust.robustness import opened
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
+from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 # Largest relative difference between the certificate and mu of the final loop that is accepted.
 TIGHT = 0.003
@@ -78,9 +80,9 @@ class MuSynthesis(Shown):
 
 def musyn(
     P: Any,
-    blocks: BlockStructure | Sequence[Block],
-    nmeas: int,
-    ncon: int,
+    blocks: Any = None,
+    nmeas: Any = None,
+    ncon: Any = None,
     *,
     callback: Callable[[Iteration], Any] | None = None,
     target: float | None = None,
@@ -94,15 +96,16 @@ def musyn(
     order: int | None = None,
     structure: Literal["full", "decentralised"] = "full",
 ) -> MuSynthesis:
-    """Controller u = K y that minimises the peak of mu, by D-K iteration.
+    """Controller u = K y that minimises the peak of mu, by D-K iteration: `musyn(P, nmeas, ncon)` for an uncertain
+    system, `musyn(P, blocks, nmeas, ncon)` for a system with its blocks.
 
     Parameters
     ----------
-    P : StateSpace (avis_ctrl or python-control), inputs (w_delta, w, u), outputs (z_delta, z, y). If P is sampled,
-        K is designed for its continuous image (`lti.bilinear`) and has the same sample rate; all results are computed
-        from the sampled loop.
-    blocks : uncertainty in the order of w_delta; the remaining w and z form the performance block.
-    nmeas, ncon : number of measurements y and controls u.
+    P : `UncertainSystem`, inputs (w, u), outputs (z, y); or StateSpace (avis_ctrl or python-control), inputs
+        (w_delta, w, u), outputs (z_delta, z, y), with `blocks`. If P is sampled, K is designed for its continuous image
+        (`lti.bilinear`) and has the same sample rate; all results are computed from the sampled loop.
+    blocks : uncertainty of a StateSpace in the order of w_delta. w and z form the performance block.
+    nmeas, ncon : number of measurements y and controls u, which are the last signals; or their names.
     callback : called with each `Iteration`; returning False or "stop" ends the iteration.
     target : stop as soon as the norm of the scaled loop is below this value (so is mu, at every frequency).
     max_iterations : maximum number of K-steps, including the first H-infinity controller. There is no time limit, so
@@ -135,12 +138,20 @@ def musyn(
     x' = -x + w + k u with z = (x, u) and y = x + n, the actuator's gain k known to 50 %:
 
     >>> k = ac.real("k", 1.0, percent=50)
-    >>> plant = ac.ss([[-1]], [[1, 0, k]], [[1], [0], [1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
-    >>> P, blocks = plant.lft()
-    >>> made = ac.musyn(P, blocks, nmeas=1, ncon=1, max_iterations=3, polish=False)
+    >>> names = {"inputs": ["w", "n", "u"], "outputs": ["x", "effort", "y"]}
+    >>> plant = ac.ss([[-1]], [[1, 0, k]], [[1], [0], [1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]], **names)
+    >>> made = ac.musyn(plant, nmeas="y", ncon="u", max_iterations=3, polish=False)      # or nmeas=1, ncon=1
     >>> made.guaranteed, round(made.mu_upper, 2)
     (True, 0.91)
+    >>> loop = ac.connect([plant, made.K], ["w", "n"], ["x", "effort"])      # the uncertain closed loop
+    >>> round(ac.robust_performance(loop).lower, 2)
+    1.1
     """
+    if isinstance(P, UncertainSystem) and ncon is None and nmeas is not None:
+        blocks, nmeas, ncon = None, blocks, nmeas
+    if isinstance(P, UncertainSystem) or blocks is None:
+        P, blocks, _ = opened(P, blocks)
+    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     if structure not in ("full", "decentralised"):
         raise InputError("expected 'full' or 'decentralised'", field="structure", value=structure)
     apart = structure == "decentralised"
@@ -230,7 +241,7 @@ def dk_iteration(
 ) -> DKIteration:
     """The iteration of `musyn` alone, with the same parameters and errors, for callers that change the controller
     before its bounds are computed."""
-    P = as_plant(P, nmeas, ncon)
+    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     uncertainty, complexified = _structures(P, blocks, nmeas, ncon)
     cap = P.nstates + 20 if max_added_states is None else max_added_states
     options = _options(target, max_iterations, backoff, polish, cap, callback)

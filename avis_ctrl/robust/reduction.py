@@ -85,7 +85,7 @@ def reduce_controller(
     ------
     InputError : negative growth, or a K that does not fit P or does not stabilise it.
     """
-    P = as_plant(P, K.ninputs, K.noutputs)
+    P, _, _ = as_plant(P, K.ninputs, K.noutputs)
     if not (np.isfinite(growth) and growth >= 0):
         raise InputError("expected a number of at least 0, such as 0.01", field="growth", value=growth)
     figure = measure or (lambda candidate: closed_loop_gamma(P, candidate))

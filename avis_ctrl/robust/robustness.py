@@ -106,7 +106,7 @@ def robust_stability(
     >>> round(found.worst["k"], 3), round(found.upper, 3), round(found.omega, 2)        # at sqrt(10) rad/s
     (3.6, 1.0, 3.16)
     """
-    P, structure, elements = _opened(system, blocks)
+    P, structure, elements = opened(system, blocks)
     inner = P.select(slice(structure.n_z), slice(structure.n_w))
     return _robustness(mu_peak(inner, structure, slack=slack), P, structure, elements)
 
@@ -127,7 +127,7 @@ def robust_performance(
     >>> found.robust, round(found.lower, 2), round(found.upper, 2)
     (False, 0.65, 0.65)
     """
-    P, structure, elements = _opened(system, blocks)
+    P, structure, elements = opened(system, blocks)
     n_d, n_e = P.ninputs - structure.n_w, P.noutputs - structure.n_z
     if n_d < 1 or n_e < 1:
         raise InputError("expected inputs d and outputs e beside the uncertainty", field="system", value=P.D.shape)
@@ -163,15 +163,16 @@ def worst_case_gain(
     >>> plant.substitute(found.worst).dcgain()
     array([[0.3125]])
     """
-    P, structure, elements = _opened(system, blocks)
+    P, structure, elements = opened(system, blocks)
     found = peaks.worst_case_gain(P, structure, band=band, slack=slack)
     facts = {one.name: getattr(found, one.name) for one in fields(found)}
     return WorstCaseGain(**facts, worst=worst_values(found, P, structure, elements))
 
 
-def _opened(
+def opened(
     system: Any, blocks: BlockStructure | Sequence[Block] | None
 ) -> tuple[StateSpace, BlockStructure, dict[str, Any]]:
+    """(P, blocks, uncertain elements by name) of an uncertain system, or of a system with its blocks."""
     if isinstance(system, UncertainSystem):
         if blocks is not None:
             raise InputError("expected no blocks: the system has its own", field="blocks")

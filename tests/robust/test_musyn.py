@@ -25,9 +25,12 @@ from avis_ctrl.robust.hinf_riccati import find_gamma
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn import musyn
+from avis_ctrl.robust.robustness import robust_performance
 from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
+from avis_ctrl.uncertainty import uncertain_models
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar, RealScalar
+from avis_ctrl.uncertainty.uncertain_models import real, ss
 
 
 def distillation() -> StateSpace:
@@ -412,6 +415,52 @@ def test_bad_input_is_named(change, message):
     good = {"P": P, "blocks": blocks, "nmeas": 1, "ncon": 1}
     with pytest.raises(InputError, match=message):
         musyn(**(good | change))
+
+
+def uncertain_lag():
+    """x' = -x + w + k u, z = (x, u), y = x + n, k = 1 +- 50 %; the signals y and u are not the last."""
+    k = real("k", 1.0, percent=50)
+    names = {"inputs": ["u", "w", "n"], "outputs": ["y", "x", "effort"]}
+    return ss([[-1]], [[k, 1, 0]], [[1], [1], [0]], [[0, 0, 1], [0, 0, 0], [1, 0, 0]], **names)
+
+
+def test_an_uncertain_plant_needs_no_blocks():
+    plant, short = uncertain_lag(), {"max_iterations": 2, "polish": False}
+    last = plant.select(["x", "effort", "y"], ["w", "n", "u"])
+    by_blocks = musyn(*last.lft(), 1, 1, **short)
+    for made in (
+        musyn(last, 1, 1, **short),
+        musyn(last, nmeas=1, ncon=1, **short),
+        musyn(plant, "y", ["u"], **short),
+        musyn(plant, nmeas=["y"], ncon="u", **short),
+    ):
+        assert made.mu_upper == pytest.approx(by_blocks.mu_upper, rel=1e-9)
+        assert (made.K.inputs, made.K.outputs) == (("y",), ("u",))
+    loop = uncertain_models.connect([plant, made.K], ["w", "n"], ["x", "effort"])
+    assert robust_performance(loop).lower == pytest.approx(1 / made.mu_upper, rel=2e-3)
+
+
+def test_the_nominal_plant_of_hinfsyn():
+    plant = uncertain_lag()
+    found = hinfsyn(plant, "y", "u")
+    assert found.gamma == hinfsyn(plant.nominal.select([1, 2, 0], [1, 2, 0]), 1, 1).gamma
+    assert (found.K.inputs, found.K.outputs) == (("y",), ("u",))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda P: musyn(P, [RealScalar(1)], 1, 1), "the system has its own"),
+        (lambda P: musyn(P.nominal, nmeas=1, ncon=1), "a system with its blocks"),
+        (lambda P: musyn(P), "nmeas: expected a whole number of at least 1, or names"),
+        (lambda P: musyn(P, "z", "u"), "no output named 'z'"),
+        (lambda P: hinfsyn(P, ["y", "y"], "u"), "expected different names"),
+        (lambda P: hinfsyn(P, ["y", "x", "effort"], "u"), "one must be left"),
+    ],
+)
+def test_a_wrong_partition_is_named(call, words):
+    with pytest.raises(InputError, match=words):
+        call(uncertain_lag())
 
 
 def test_state_of_another_plant_is_refused():

@@ -15,7 +15,7 @@ from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.robustness import robust_performance, robust_stability, worst_case_gain, worst_values
 from avis_ctrl.uncertainty.blocks import ComplexScalar, RealScalar
-from avis_ctrl.uncertainty.uncertain_models import complex_disk, dynamics, real, ss
+from avis_ctrl.uncertainty.uncertain_models import complex_disk, dynamics, matrix, real, ss
 from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight
 
 # Skogestad and Postlethwaite, Multivariable Feedback Control, 2005: plant of section 2.6, weights of example 2.17.
@@ -107,7 +107,7 @@ def test_an_lft_with_blocks_is_the_same_as_the_system():
         (lambda: robust_stability(tf([1.0], [1.0, 1.0]), [RealScalar(3)]), "the blocks need"),
         (lambda: robust_performance(tf([1.0], [1.0, 1.0]), [RealScalar(1)]), "inputs d and outputs e"),
         (lambda: mixed_sensitivity(PLANT), "at least one weight"),
-        (lambda: mixed_sensitivity(PLANT, np.ones((1, 2))), "expected 1 or 1 inputs"),
+        (lambda: mixed_sensitivity(PLANT, np.ones((1, 2))), "expected 1 input"),
         (lambda: uncertainty_weight(PLANT, []), "expected responses"),
         (lambda: uncertainty_weight(PLANT, [PLANT]), "differ from a nominal one"),
         (lambda: uncertainty_weight(PLANT, [np.ones((2, 2))]), "responses of shape"),
@@ -136,6 +136,37 @@ def test_mixed_sensitivity_of_the_textbook():
 def test_mixed_sensitivity_against_python_control():
     *_, (gamma, _) = control.mixsyn(control.ss(PLANT), control.ss(W_P), control.ss([], [], [], [[1.0]]))
     assert mixed_sensitivity(PLANT, W_P, 1.0, backoff=1e-4).gamma == pytest.approx(gamma, rel=2e-3)
+
+
+@pytest.mark.parametrize("names", [("W1", "W2"), ("w1", "w2"), ("W_S", "W_KS"), ("w_s", "wks")])
+def test_weights_under_the_names_of_mixsyn(names):
+    assert mixed_sensitivity(PLANT, **dict(zip(names, (W_P, 1.0), strict=True))).gamma == pytest.approx(1.37, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"W_S": W_P, "w4": 1.0}, "w4: unknown; expected the weights W_S, W_KS, W_T, or options of hinfsyn: backoff"),
+        ({"W_S": W_P, "W1": 1.0}, "given twice: W1 is W_S"),
+        ({"W_S": np.ones((1, 2))}, "a weight with 2.*expected 1 input"),
+        ({"W_S": control.tf([1.0], [1.0, 0.0])}, "W_S.*slightly to its left"),
+        ({"W_S": real("k", 1.0, percent=5) * W_P}, r"its nominal system is .nominal"),
+        ({}, "at least one weight"),
+    ],
+)
+def test_wrong_weights_and_options_are_named(options, words):
+    with pytest.raises(InputError, match=words):
+        mixed_sensitivity(PLANT, **options)
+
+
+def test_mixed_sensitivity_takes_the_nominal_plant_and_keeps_its_names():
+    G = (real("k", 1.0, percent=20) * PLANT).renamed(["force"], ["x"])
+    made = mixed_sensitivity(G, W_P, 1.0)
+    assert made.gamma == pytest.approx(1.37, abs=0.02)
+    assert made.K.outputs == made.KS.outputs == ("force",) and made.T.outputs == ("x",)
+    two = matrix([[PLANT, 0.0], [0.0, PLANT]])
+    both = mixed_sensitivity(two, matrix([[W_P, 0.0], [0.0, W_P]]), 1.0)
+    assert both.gamma == pytest.approx(made.gamma, rel=0.02)
 
 
 def test_mixed_sensitivity_of_two_channels():
