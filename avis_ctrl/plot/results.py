@@ -30,6 +30,12 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     peak : `MuPeak` (of `mu_peak` or `worst_case_gain`), a result of `robust_stability` or `robust_performance`, or a
         design's `Bound`. Returns the axes. Raises InputError for a result without these curves, such as a
         `MuSynthesis`.
+
+    Examples
+    --------
+    >>> loop = (ac.real("k", 1.0, percent=20) * ac.tf([25.0], [1.0, 10.0, 10.0, 10.0])).feedback()
+    >>> [text.get_text() for text in ac.plot.mu(ac.robust_stability(loop)).get_legend().get_texts()][-1]
+    'reached: 0.1429 at 0 Hz'
     """
     peak = getattr(peak, "mu", peak)
     if not hasattr(peak, "upper_curve"):
@@ -50,16 +56,13 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
         ax.axhline(
             peak.upper, color=color, linewidth=0.8, linestyle="--", label=f"peak below {peak.upper:.4g}, {worth}"
         )
-    if np.isfinite(peak.lower) and peak.lower > 0 and peak.omega > 0:
-        ax.plot(
-            peak.omega / HERTZ,
-            peak.lower,
-            "o",
-            color=color,
-            markersize=5,
-            fillstyle="none",
-            label=f"reached: {peak.lower:.4g} at {peak.omega / HERTZ:.4g} Hz",
-        )
+    if np.isfinite(peak.lower) and peak.lower > 0 and np.isfinite(peak.omega):
+        at = peak.omega / HERTZ
+        # Zero has no place on the axis. With real parameters alone, mu can be zero at all other frequencies.
+        x, y = ([at], [peak.lower]) if at > 0 else ([], [])
+        ax.vlines(x, 0, y, color=color, linewidth=0.8, linestyle=":")
+        words = f"reached: {peak.lower:.4g} at {at:.4g} Hz"
+        ax.plot(x, y, "o", color=color, markersize=5, fillstyle="none", label=words)
     ax.set_ylim(bottom=0)
     return finish(ax, "frequency [Hz]", label, above=True)
 
@@ -76,6 +79,12 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
     Raises
     ------
     InputError : a controller that is not in the result.
+
+    Examples
+    --------
+    After `study = ac.design(...)`:
+
+    >>> ac.plot.transmissibility(study, controllers=["skyhook", "mu"])        # doctest: +SKIP
     """
     ax = axes_of(ax)
     result = getattr(result, "result", result)
@@ -106,7 +115,16 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
 
 
 def dk_history(history: Any, ax: Any = None) -> Any:
-    """gamma and peak mu by iteration; `history` of a `MuSynthesis`, a design's result, or the rows themselves."""
+    """gamma and peak mu by iteration; `history` of a `MuSynthesis`, a design's result, or the rows themselves.
+
+    Examples
+    --------
+    >>> k = ac.real("k", 1.0, percent=50)
+    >>> plant = ac.ss([[-1]], [[1, 0, k]], [[1], [0], [1]], [[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+    >>> ax = ac.plot.dk_history(ac.musyn(plant, 1, 1, max_iterations=2, polish=False))
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('iteration', 'gamma, mu')
+    """
     ax = axes_of(ax)
     rows = _rows(history)
     steps = [row.iteration for row in rows]
@@ -114,13 +132,19 @@ def dk_history(history: Any, ax: Any = None) -> Any:
     ax.plot(steps, [row.mu_upper for row in rows], "o-", color=COLOURS["mu"], markersize=4, label="peak mu on the grid")
     values = np.array([[row.gamma, row.mu_upper] for row in rows])
     log_if_wide(ax, values)
-    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
+    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":", label="mu = 1")
     whole_numbers(ax)
     return finish(ax, "iteration", "gamma, mu", log=False)
 
 
 def order(history: Any, ax: Any = None) -> Any:
-    """Peak mu of each controller against its number of states; `history` as for `dk_history`, or pairs (order, mu)."""
+    """Peak mu of each controller against its number of states; `history` as for `dk_history`, or pairs (order, mu).
+
+    Examples
+    --------
+    >>> ac.plot.order([(3, 1.2), (5, 0.9), (8, 0.85)]).get_xlabel()
+    'states of the controller'
+    """
     ax = axes_of(ax)
     rows = (
         history
@@ -138,7 +162,7 @@ def order(history: Any, ax: Any = None) -> Any:
         label="least mu up to this order",
     )
     log_if_wide(ax, values)
-    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":")
+    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":", label="mu = 1")
     whole_numbers(ax)
     return finish(ax, "states of the controller", "peak mu", log=False)
 
@@ -147,6 +171,13 @@ def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
     """The criteria VC-A to VC-G, and third-octave spectra by name: (midbands [Hz], r.m.s. velocity [m/s]), each (n,).
 
     Returns the axes. Source of the criteria: `avis_ctrl.rigs.vibration_criteria`.
+
+    Examples
+    --------
+    >>> midbands = np.array([4.0, 8.0, 16.0, 31.5])
+    >>> ax = ac.plot.vc_curves({"floor": (midbands, np.array([4e-6, 3e-6, 2e-6, 1e-6]))})
+    >>> [text.get_text() for text in ax.texts][:2]
+    ['VC-A', 'VC-B']
     """
     ax = axes_of(ax)
     for one in CRITERIA:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,25 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.plot.axes import HERTZ, axes_of, finish
 from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
-# Number of random samples drawn for an uncertain system, and their line style.
-SAMPLES, FAINT = 20, {"color": "#0072b2", "alpha": 0.3, "linewidth": 0.8}
+
+@dataclass(frozen=True)
+class PlotSettings:
+    """samples : number of random systems drawn for an uncertain system: enough to see its range.
+    round_off : a singular value that is at every frequency below this fraction of the largest is zero up to round-off,
+        and is not drawn [1].
+    range_dB : largest range of the magnitude axis below its top [dB]: less than a ten-billionth of the largest value
+        matters to nobody, and would make the rest flat.
+    """
+
+    samples: int = 20
+    round_off: float = 1e-11
+    range_dB: float = 200.0
+
+
+SETTINGS = PlotSettings()
+FAINT = {"alpha": 0.3, "linewidth": 0.8, "zorder": 1.5}
+# Colours of a single uncertain response: the nominal system, and its random samples.
+NOMINAL, SAMPLE = "black", "#0072b2"
 
 
 def bode(
@@ -23,7 +42,7 @@ def bode(
     ax: Any = None,
     *,
     frequency_Hz: np.ndarray | None = None,
-    label: str | None = None,
+    label: str | Sequence[str] | None = None,
     **line: Any,
 ) -> Any:
     """Magnitude [dB] and phase [degrees] over frequency [Hz], one curve for each input-output pair.
@@ -33,29 +52,39 @@ def bode(
     Parameters
     ----------
     system : StateSpace, or python-control's StateSpace, TransferFunction or FRD; for an UncertainSystem the nominal
-        system and 20 random samples are drawn.
+        system and 20 random samples are drawn. A list of systems is drawn into the same axes.
     omega, frequency_Hz : (n,) frequencies [rad/s] or [Hz]; by default a range around the poles, or the frequencies of
         the FRD.
     ax : two axes, magnitude and phase; by default those of a new figure.
-    label : label of the curves in the legend; by default "output / input" if there are several.
+    label : label of the curves in the legend, one for each system of a list ("system 1" and so on by default); with
+        several inputs or outputs followed by "output / input".
     line : options of matplotlib's `plot`.
 
     Raises
     ------
-    InputError : an object that is not a system; both omega and frequency_Hz given.
+    InputError : an object that is not a system; both omega and frequency_Hz given; another number of labels.
+
+    Examples
+    --------
+    >>> G = ac.tf([25.0], [1.0, 10.0, 10.0, 10.0])
+    >>> magnitude, phase = ac.plot.bode([G, G.feedback()], label=["open loop", "closed loop"])
+    >>> [text.get_text() for text in magnitude.get_legend().get_texts()]
+    ['open loop', 'closed loop']
     """
     top, bottom = axes = axes_of(ax, 2)
-    if isinstance(system, UncertainSystem):
-        return _family(bode, system, _rad_s(omega, frequency_Hz), axes, label, line)
-    omega = _rad_s(omega, frequency_Hz, system)
-    H = response_of(system, omega)
-    for i in range(H.shape[1]):
-        for k in range(H.shape[2]):
-            names = f"{_name(system, 'outputs', i)} / {_name(system, 'inputs', k)}" if H[0].size > 1 else None
-            words = " ".join(part for part in (label, names) if part) or None
-            top.plot(omega / HERTZ, in_dB(H[:, i, k]), label=words, **line)
-            bottom.plot(omega / HERTZ, np.degrees(np.unwrap(np.angle(H[:, i, k]))), **line)
-    finish(top, "", "magnitude [dB]")
+    for one in _curves(system, omega, frequency_Hz, label):
+        for i in range(one.nominal.shape[1]):
+            for k in range(one.nominal.shape[2]):
+                pair = f"{_name(one.system, 'outputs', i)} / {_name(one.system, 'inputs', k)}"
+                single = one.nominal[0].size == 1
+                words = " ".join(part for part in (one.label, None if single else pair) if part) or None
+                colour = _draw(top, one, in_dB(one.nominal[:, i, k]), words, line, single)
+                bottom.plot(one.f, _phase(one.nominal[:, i, k]), **(line | {"color": colour}))
+                for H in one.samples:
+                    faint = FAINT | {"color": _of_samples(colour)}
+                    top.plot(one.f, in_dB(H[:, i, k]), label=_once(top, one, single), **faint)
+                    bottom.plot(one.f, _phase(H[:, i, k]), **faint)
+    finish(_in_range(top), "", "magnitude [dB]")
     finish(bottom, "frequency [Hz]", "phase [degrees]")
     low, high = bottom.get_ylim()
     step = 45 if high - low <= 270 else 90 * np.ceil((high - low) / 720)
@@ -69,45 +98,135 @@ def sigma(
     ax: Any = None,
     *,
     frequency_Hz: np.ndarray | None = None,
-    label: str | None = None,
+    label: str | Sequence[str] | None = None,
     **line: Any,
 ) -> Any:
-    """Singular values [dB] over frequency [Hz], in one colour; arguments as for `bode`, but a single axes object."""
+    """Singular values [dB] over frequency [Hz], in one colour for each system.
+
+    Arguments as for `bode`, but a single axes object. Singular values that are zero up to round-off at all frequencies
+    are not drawn.
+
+    Examples
+    --------
+    >>> G = ac.ss([[-1, 0], [0, -2]], [[1, 0], [0, 1]], [[1, 1], [0, 1]])
+    >>> len(ac.plot.sigma(G).lines)
+    2
+    """
     ax = axes_of(ax)
-    if isinstance(system, UncertainSystem):
-        return _family(sigma, system, _rad_s(omega, frequency_Hz), ax, label, line)
-    omega = _rad_s(omega, frequency_Hz, system)
-    values = in_dB(np.linalg.svd(response_of(system, omega), compute_uv=False))
-    for k in range(values.shape[1]):
-        if k:
-            line["color"] = ax.lines[-1].get_color()
-        ax.plot(omega / HERTZ, values[:, k], label=None if k else label, **line)
-    return finish(ax, "frequency [Hz]", "singular values [dB]" if values.shape[1] > 1 else "magnitude [dB]")
+    several = False
+    for one in _curves(system, omega, frequency_Hz, label):
+        values = _singular_values(one.nominal)
+        several = several or one.nominal[0].size > 1
+        colour = None
+        for k in range(values.shape[1]):
+            own = line if colour is None else line | {"color": colour}
+            colour = _draw(ax, one, in_dB(values[:, k]), None if k else one.label, own, True)
+        for H in one.samples:
+            for values in in_dB(_singular_values(H)).T:
+                ax.plot(one.f, values, label=_once(ax, one, True), **(FAINT | {"color": _of_samples(colour)}))
+    return finish(_in_range(ax), "frequency [Hz]", "singular values [dB]" if several else "magnitude [dB]")
 
 
-def _rad_s(omega: Any, frequency_Hz: Any, system: Any = None) -> Any:
-    """(n,) frequencies [rad/s]; if none are given, a range that suits the system (None without a system)."""
+@dataclass(frozen=True, eq=False)
+class _Curves:
+    """A system with its response (n, n_y, n_u) and those of random samples at the frequencies f (n,) [Hz]."""
+
+    system: Any
+    f: np.ndarray
+    nominal: np.ndarray
+    samples: list[np.ndarray]
+    label: str | None
+    alone: bool
+
+
+def _curves(system: Any, omega: Any, frequency_Hz: Any, label: Any) -> list[_Curves]:
+    """The responses of a system, or of those of a list, with labels."""
+    every = list(system) if isinstance(system, (list, tuple)) else [system]
+    alone = len(every) == 1
+    uncertain = [isinstance(one, UncertainSystem) for one in every]
+    if isinstance(label, str) or label is None:
+        default = (
+            ["nominal" if uncertain[0] and every[0].shape == (1, 1) else None]
+            if alone
+            else [f"system {k + 1}" for k in range(len(every))]
+        )
+        labels = default if label is None else [label] if alone else [f"{label} {k + 1}" for k in range(len(every))]
+    else:
+        labels = list(label)
+    if not every or len(labels) != len(every):
+        raise InputError(f"expected a system, or a list of systems and as many labels: {len(every)}", field="label")
+    members = [one.nominal if unsure else one for one, unsure in zip(every, uncertain, strict=True)]
+    grids = _rad_s(omega, frequency_Hz, members)
+    found = []
+    for one, member, grid, text, unsure in zip(every, members, grids, labels, uncertain, strict=True):
+        samples = [response_of(each, grid) for each in one.sample(SETTINGS.samples)] if unsure else []
+        found.append(_Curves(one, grid / HERTZ, response_of(member, grid), samples, text, alone))
+    return found
+
+
+def _rad_s(omega: Any, frequency_Hz: Any, members: list[Any]) -> list[np.ndarray]:
+    """(n,) frequencies [rad/s] for each system; if none are given, a common range that suits all of them."""
     if omega is not None and frequency_Hz is not None:
         raise InputError("expected omega or frequency_Hz", field="omega, frequency_Hz")
-    if frequency_Hz is not None:
-        return HERTZ * np.asarray(frequency_Hz, float)
-    if omega is not None:
-        return np.asarray(omega, float)
-    return None if system is None else plot_frequencies(system)
+    if omega is not None or frequency_Hz is not None:
+        try:
+            given = np.asarray(omega, float) if omega is not None else HERTZ * np.asarray(frequency_Hz, float)
+        except (TypeError, ValueError):
+            raise InputError(
+                "expected frequencies; several systems are given as a list, bode([G, H])", field="omega"
+            ) from None
+        return [given] * len(members)
+    own = [plot_frequencies(one) for one in members]
+    common = np.unique(
+        np.concatenate([grid for grid, one in zip(own, members, strict=True) if not is_response(one)] or own)
+    )
+    return [
+        grid if is_response(one) else common[common <= (np.pi / dt if (dt := getattr(one, "dt", 0)) else np.inf)]
+        for grid, one in zip(own, members, strict=True)
+    ]
 
 
-def _family(
-    draw: Any, system: UncertainSystem, omega: np.ndarray | None, ax: Any, label: str | None, line: dict[str, Any]
-) -> Any:
-    nominal = system.nominal
-    omega = plot_frequencies(nominal) if omega is None else omega
-    for one in system.sample(SAMPLES):
-        draw(one, omega, ax, **FAINT)
-    return draw(nominal, omega, ax, label=label or "nominal", **{"color": "black", **line})
+def _draw(ax: Any, one: _Curves, values: np.ndarray, label: str | None, line: dict[str, Any], single: bool) -> Any:
+    """A curve of the nominal system; returns its colour."""
+    if one.samples and one.alone and single:
+        line = {"color": NOMINAL} | line
+    (drawn,) = ax.plot(one.f, values, label=label, **line)
+    return drawn.get_color()
+
+
+def _of_samples(colour: Any) -> Any:
+    return SAMPLE if colour == NOMINAL else colour
+
+
+def _once(ax: Any, one: _Curves, single: bool) -> str | None:
+    """Label of the first of the random samples of a single uncertain system."""
+    words = f"{len(one.samples)} random samples"
+    return words if single and one.alone and words not in ax.get_legend_handles_labels()[1] else None
+
+
+def _singular_values(H: np.ndarray) -> np.ndarray:
+    """(n, m) singular values without those that are zero up to round-off at all frequencies."""
+    values = np.full((len(H), min(H.shape[1:])), np.nan)
+    finite = np.all(np.isfinite(H), axis=(1, 2))
+    values[finite] = np.linalg.svd(H[finite], compute_uv=False)
+    largest = np.max(values[finite] / np.maximum(values[finite, :1], np.finfo(float).tiny), axis=0, initial=0.0)
+    return values[:, (largest > SETTINGS.round_off) | (np.arange(values.shape[1]) == 0)]
+
+
+def _phase(H: np.ndarray) -> np.ndarray:
+    """Phase [degrees] without jumps; NaN where the response is zero."""
+    return np.where(H == 0, np.nan, np.degrees(np.unwrap(np.angle(H))))
+
+
+def _in_range(ax: Any) -> Any:
+    """The axes with a magnitude axis of at most `range_dB`."""
+    low, high = ax.get_ylim()
+    ax.set_ylim(max(low, high - SETTINGS.range_dB), high)
+    return ax
 
 
 def _name(system: Any, which: str, k: int) -> str:
-    if isinstance(system, StateSpace):
+    if isinstance(system, (StateSpace, UncertainSystem)):
         return getattr(system, which)[k]
     labels = getattr(system, f"{which[:-1]}_labels", None)
     return str(labels[k]) if labels is not None and not is_response(system) else f"{which[0]}{k}"

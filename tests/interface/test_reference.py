@@ -10,6 +10,7 @@ import pytest
 from test_names import NAMES
 
 import avis_ctrl as ac
+from avis_ctrl import plot
 from avis_ctrl.interface import workflow
 
 SLOW = {"identify", "gap", "design"}
@@ -26,3 +27,11 @@ def test_the_examples_of_each_name(name, tmp_path, monkeypatch, request):
     assert test.examples and f"ac.{name}" in test.docstring, "an example of the name"
     result = doctest.DocTestRunner(optionflags=FLAGS).run(test)
     assert not result.failed
+
+
+@pytest.mark.parametrize("name", plot.__all__)
+def test_the_examples_of_each_plot(name):
+    globs = {"ac": ac, "np": np}
+    (test,) = doctest.DocTestFinder(recurse=False).find(getattr(plot, name), name, module=False, globs=globs)
+    assert test.examples and f"ac.plot.{name}" in test.docstring
+    assert not doctest.DocTestRunner(optionflags=FLAGS).run(test).failed

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import control
 import matplotlib
 import numpy as np
@@ -17,7 +19,7 @@ from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
 from avis_ctrl.robust.musyn import musyn
 from avis_ctrl.robust.musyn_state import Iteration
 from avis_ctrl.uncertainty.blocks import ComplexScalar
-from avis_ctrl.uncertainty.uncertain_models import real
+from avis_ctrl.uncertainty.uncertain_models import matrix, real
 
 matplotlib.use("Agg")
 LAG = control.tf([2.0], [0.5, 1.0])
@@ -92,9 +94,50 @@ def test_an_uncertain_system_is_drawn_with_its_family():
     top, _ = plot.bode(G, OMEGA)
     curves = np.array([curve(top, k)[1] for k in range(len(top.lines))])
     assert len(curves) == 21
-    np.testing.assert_allclose(curves[-1], 20 * np.log10(2 / np.sqrt(1 + (0.5 * OMEGA) ** 2)), atol=1e-9)
-    assert np.all(np.abs(curves - curves[-1]) <= -20 * np.log10(0.8) + 1e-9) and np.ptp(curves[:, 0]) > 1.0
+    np.testing.assert_allclose(curves[0], 20 * np.log10(2 / np.sqrt(1 + (0.5 * OMEGA) ** 2)), atol=1e-9)
+    assert np.all(np.abs(curves - curves[0]) <= -20 * np.log10(0.8) + 1e-9) and np.ptp(curves[:, 0]) > 1.0
+    assert words(top) == ["nominal", "20 random samples"]
     assert len(plot.sigma(G).lines) == 21
+
+
+def words(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def test_a_list_of_systems_is_drawn_over_one_another():
+    slow, fast = tf([1.0], [10.0, 1.0]), tf([1.0], [0.01, 1.0])
+    for draw in (plot.bode, plot.sigma):
+        ax = np.ravel(draw([slow, fast]))[0]
+        assert words(ax) == ["system 1", "system 2"] and len({one.get_color() for one in ax.lines}) == 2
+        np.testing.assert_array_equal(curve(ax, 0)[0], curve(ax, 1)[0])  # one range, from the slow to the fast pole
+        assert curve(ax)[0][0] < 0.1 / 60 and curve(ax)[0][-1] > 100 / 7
+        assert words(np.ravel(draw([slow, fast], label=["a", "b"]))[0]) == ["a", "b"]
+        mixed = np.ravel(draw([fast, control.frd(LAG, OMEGA), control.tf([0.1], [1.0, -0.9], 0.1)]))[0]
+        np.testing.assert_allclose(curve(mixed, 1)[0], OMEGA / (2 * np.pi))
+        assert curve(mixed, 2)[0][-1] <= 5.0 < curve(mixed, 0)[0][-1]
+        with pytest.raises(InputError, match="as many labels: 2"):
+            draw([slow, fast], label=["a"])
+        with pytest.raises(InputError, match=r"a list, bode\(\[G, H\]\)"):
+            draw(slow, fast)
+
+
+def test_each_pair_of_an_uncertain_system_has_its_colour_and_one_label():
+    k = real("k", 2.0, percent=20)
+    top, bottom = plot.bode(matrix([[k * tf([1.0], [1.0, 1.0]), 0.0], [tf([1.0], [0.1, 1.0]), 1.0]]))
+    assert words(top) == ["y0 / u0", "y0 / u1", "y1 / u0", "y1 / u1"]
+    assert len({one.get_color() for one in top.lines}) == 4
+    assert np.all(np.isnan(curve(bottom, 21)[1]))  # the phase of zero
+
+
+def test_singular_values_that_are_round_off_are_not_drawn():
+    column, row = np.array([[1.0], [0.3]]), np.array([[0.7, 0.1]])
+    ax = plot.sigma((column @ row) @ tf([[[1.0], [0.0]], [[0.0], [1.0]]], [[[1.0, 1.0], [1.0]], [[1.0], [1.0, 1.0]]]))
+    assert len(ax.lines) == 1 and ax.get_ylim()[0] > -100
+    blocked = plot.sigma(control.tf([1e-13], [1.0, 1e-3, 1.0]) - 0.0)
+    low, high = blocked.get_ylim()
+    assert high - low < 200 + 1e-9
+    steep = plot.bode(tf([1.0], np.poly([-1.0] * 8)), np.geomspace(1e-3, 1e5, 100))[0]
+    assert np.ptp(steep.get_ylim()) == pytest.approx(200)
 
 
 def test_default_frequencies_show_a_narrow_resonance():
@@ -116,11 +159,11 @@ def history():
 
 def test_mu_says_what_its_bound_is_worth():
     ax = plot.mu(peak())
-    words = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert "peak below 0.91, proved between all points" in words
+    assert "peak below 0.91, proved between all points" in words(ax)
     f, upper = curve(ax)
     np.testing.assert_allclose(f, np.array([1.0, 10.0]) / (2 * np.pi))  # zero has no place on a logarithmic axis
     np.testing.assert_allclose(upper, [0.905, 0.2])
+    assert "reached: 0.9 at 0 Hz" in words(plot.mu(replace(peak(), omega=0.0)))
 
 
 def test_history_and_order():
