@@ -26,6 +26,7 @@ RealScalar          block of a (repeated) real parameter
 ComplexScalar       block of a (repeated) complex number
 ComplexFull         block of a full complex matrix
 BlockStructure      the blocks of a structured perturbation
+hinf_norm           largest gain of a system over frequency
 uncertainty_weight  a weighting filter that covers the differences between responses
 hinfsyn             H-infinity controller
 mixed_sensitivity   H-infinity controller for weights on S, KS and T
@@ -58,6 +59,7 @@ _PLACES = {
     "design": "avis_ctrl.interface.workflow",
     "single_axis": "avis_ctrl.interface.workflow",
     "StateSpace": "avis_ctrl.lti",
+    "hinf_norm": "avis_ctrl.lti",
     "tf": "avis_ctrl.uncertainty.uncertain_models",
     "ss": "avis_ctrl.uncertainty.uncertain_models",
     "connect": "avis_ctrl.uncertainty.uncertain_models",
@@ -101,6 +103,8 @@ _ELSEWHERE = {
     "diskmargin": "disk_margin",
     "disk_margins": "disk_margin",
     "ucover": "uncertainty_weight",
+    "hinfnorm": "hinf_norm",
+    "linfnorm": "hinf_norm",
     "bode": "plot.bode",
     "bode_plot": "plot.bode",
     "sigma": "plot.sigma",

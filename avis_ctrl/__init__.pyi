@@ -9,6 +9,7 @@ from avis_ctrl.interface.workflow import rig as rig
 from avis_ctrl.interface.workflow import simulate_campaign as simulate_campaign
 from avis_ctrl.interface.workflow import single_axis as single_axis
 from avis_ctrl.lti import StateSpace as StateSpace
+from avis_ctrl.lti import hinf_norm as hinf_norm
 from avis_ctrl.robust.disk_margin import disk_margin as disk_margin
 from avis_ctrl.robust.hinfsyn import hinfsyn as hinfsyn
 from avis_ctrl.robust.mixed_sensitivity import mixed_sensitivity as mixed_sensitivity

@@ -1,4 +1,4 @@
-"""Series, parallel and feedback connection of quadruples (A, B, C, D).
+"""Series, parallel and feedback connection, and inverse, of quadruples (A, B, C, D).
 
 The internal signals, at A, can be closed by integrators or by uncertain elements.
 """
@@ -43,3 +43,10 @@ def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
     out, n = np.vstack([B @ u, b @ y]), A.shape[1] + a.shape[1]
     out[:, :n] += la.block_diag(A, a)
     return out[:, :n], out[:, n:], y[:, :n], y[:, n:]
+
+
+def inverse(X: Quadruple) -> Quadruple:
+    """X^-1; D must be invertible."""
+    A, B, C, D = X
+    inv = np.linalg.inv(D)
+    return A - B @ inv @ C, B @ inv, -inv @ C, inv

@@ -19,7 +19,7 @@ import scipy.linalg as la
 from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
+from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series
 from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
@@ -184,8 +184,34 @@ class StateSpace:
     def __rmul__(self, other: Any) -> StateSpace:
         return self.scaled(float(other)) if isinstance(other, (int, float, np.number)) else self.__rmatmul__(other)
 
-    def __truediv__(self, factor: Any) -> StateSpace:
-        return self.scaled(1 / float(factor)) if isinstance(factor, (int, float, np.number)) else NotImplemented
+    def inverse(self) -> StateSpace:
+        """The inverse, for S = (1 + L).inverse() or 1/(1 + L). InputError if D cannot be inverted."""
+        if self.ninputs != self.noutputs or np.linalg.cond(self.D) > 1 / np.finfo(float).eps:
+            raise InputError(
+                "expected as many inputs as outputs, and a D that can be inverted: the inverse of a strictly proper "
+                "system is improper",
+                field="inverse",
+                value=f"D = {self.D.tolist()}",
+            )
+        return StateSpace(*inverse(self.matrices), self.dt, self.outputs, self.inputs, self.states)
+
+    def __truediv__(self, divisor: Any) -> StateSpace:
+        if isinstance(divisor, (int, float, np.number)):
+            return self.scaled(1 / float(divisor))
+        divisor = operand(divisor)
+        return NotImplemented if divisor is None else self @ divisor.inverse()
+
+    def __rtruediv__(self, dividend: Any) -> StateSpace:
+        return dividend * self.inverse()
+
+    def __pow__(self, power: int) -> StateSpace:
+        if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
+            raise InputError("expected a whole number", field="power", value=power)
+        base = self if power >= 0 else self.inverse()
+        result = base if power else gain(np.eye(self.noutputs), dt=self.dt)
+        for _ in range(abs(int(power)) - 1):
+            result = result @ base
+        return result
 
     def __add__(self, other: Any) -> StateSpace:
         """Parallel connection of two systems of equal shape; a number can be added to a scalar system."""

@@ -92,6 +92,8 @@ def dynamics(name: str, weight: Any = 1.0, shape: tuple[int, int] = (1, 1)) -> U
     >>> blocks.blocks
     (ComplexScalar(rows=1, cols=1, name='actuator'),)
     """
+    if np.shape(shape) != (2,):
+        raise InputError("expected (outputs, inputs)", field=f"{name}: shape", value=shape)
     element = Dynamics(name, *shape)
     rows, cols = shape
     n = np.zeros((cols, rows)), np.eye(cols), np.eye(rows), np.zeros(shape)
@@ -127,8 +129,8 @@ def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
 
 def ss(
     A: Any,
-    B: Any,
-    C: Any,
+    B: Any = None,
+    C: Any = None,
     D: Any = None,
     *,
     dt: float = 0.0,
@@ -140,7 +142,7 @@ def ss(
 
     Each matrix is an array, nested lists with uncertain numbers, or a result of `matrix`; A, B and C are [] for a
     static gain D. Returns a StateSpace if nothing is uncertain, otherwise an `UncertainSystem`. dt : sample time [s],
-    0 for continuous time.
+    0 for continuous time. ss(G) alone converts a system of python-control, or a matrix of gains.
 
     Raises InputError for shapes that do not fit.
 
@@ -157,6 +159,8 @@ def ss(
     >>> len(plant.sample(20, seed=1))
     20
     """
+    if B is None and C is None:
+        return A if isinstance(A, UncertainSystem) else as_system(A, "A")
     a, b, c = (_matrix(one, name) for one, name in ((A, "A"), (B, "B"), (C, "C")))
     d = as_uncertain(np.zeros((c.shape[0], b.shape[1]))) if D is None else _matrix(D, "D")
     n = a.shape[0]

@@ -19,7 +19,7 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
-from avis_ctrl.lti.interconnection import Quadruple, feedback, parallel, return_difference, series
+from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series
 from avis_ctrl.lti.statespace import StateSpace, new_names, positions, signal_names
 from avis_ctrl.summary import count_of, html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -294,13 +294,13 @@ class UncertainSystem:
                 cause="a division by zero, or by a strictly proper system",
                 next_step="choose a nominal value other than zero",
             )
-        inv = np.linalg.inv(self.d)
+        a, b, c, d = inverse(self.matrices)
         return replace(
             self,
-            a=self.a - self.b @ inv @ self.c,
-            b=self.b @ inv,
-            c=-inv @ self.c,
-            d=inv,
+            a=a,
+            b=b,
+            c=c,
+            d=d,
             inputs=self.inputs if self._unnamed else self.outputs,
             outputs=self.outputs if self._unnamed else self.inputs,
         )

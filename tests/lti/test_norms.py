@@ -58,6 +58,11 @@ def test_sampled_norm_agrees_with_slicot_and_its_own_frequency(seed):
     assert np.linalg.norm(G.frequency_response([peak.omega])[0], 2) == pytest.approx(peak.gain, rel=1e-6)
 
 
+def test_the_norm_of_a_system_of_python_control():
+    peak = hinf_norm(control.tf([1.0], [1.0, 0.2, 1.0]))
+    assert peak.gain == pytest.approx(1 / (0.2 * np.sqrt(0.99)), rel=1e-6)
+
+
 def test_flat_responses():
     """All-pass systems: every frequency is a crossing, and the norm is the gain."""
     zeros = np.array([1.0, 3.0, 3.1, 40.0])

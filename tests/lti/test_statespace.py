@@ -220,3 +220,18 @@ def test_a_string_is_one_name_and_a_number_closes_each_channel(rng):
 def test_a_sample_time_that_is_open_is_refused():
     with pytest.raises(InputError, match="expected a sample time in seconds"):
         StateSpace.from_control(control.tf([1.0], [1.0, -0.5], True))
+
+
+def test_inverse_and_powers_are_those_of_the_transfer_matrix(rng):
+    L = tf([2.0, 1.0], [1.0, 3.0, 2.0])
+    S = 1 / (1 + L)
+    for one, other in ((S, 1 / (1 + L(2j))), (L / (1 + L), L(2j) / (1 + L(2j))), (L**3, L(2j) ** 3), (L**0, 1.0)):
+        np.testing.assert_allclose(one(2j), np.broadcast_to(other, (1, 1)), rtol=1e-12)
+    np.testing.assert_allclose((S / control.tf([1.0], [1.0]))(2j), S(2j))
+    G = StateSpace(-np.eye(2), np.eye(2), rng.standard_normal((2, 2)), np.eye(2), 0.1, ("a", "b"), ("c", "d"))
+    np.testing.assert_allclose((G**-1)(0.5j), np.linalg.inv(G(0.5j)))
+    assert (G**-1).inputs == ("c", "d") and (G**-1).dt == 0.1
+    with pytest.raises(InputError, match="strictly proper"):
+        _ = 1 / L
+    with pytest.raises(InputError, match="whole number"):
+        _ = L**0.5

@@ -297,6 +297,7 @@ def test_two_parameters_of_one_name_are_refused():
         (lambda: real("", 1.0, percent=5), InputError, "expected a name"),
         (lambda: complex_disk("z", 0.0, -1.0), InputError, "positive radius"),
         (lambda: dynamics("d", tf([1.0], [1.0, -1.0])), InputError, "stable weight"),
+        (lambda: dynamics("d", 1.0, 2), InputError, r"expected \(outputs, inputs\)"),
         (lambda: dynamics("d", np.eye(3), (2, 2)), InputError, "expected one output and input, or 2"),
         (lambda: ELEMENTS["p"] / real("z", 0.0, plus_minus=1.0), ComputationError, "cannot be inverted"),
         (lambda: ELEMENTS["p"] ** 0.5, InputError, "whole number"),
@@ -383,6 +384,12 @@ def test_names_of_products_are_those_of_certain_systems():
 def test_an_attribute_of_members_says_where_it_is():
     with pytest.raises(AttributeError, match=r"use \.nominal\.poles"):
         _ = named_plant().poles
+
+
+def test_a_system_of_python_control_is_converted():
+    G = ss(control.tf([1.0], [1.0, 2.0]))
+    assert isinstance(G, StateSpace) and G.dcgain() == pytest.approx(0.5)
+    assert ss([[1.0, 2.0]]).nstates == 0 and ss(named_plant()).uncertain
 
 
 @pytest.mark.parametrize("empty", [[], [[]], np.zeros((0, 0))], ids=["list", "row", "array"])
