@@ -57,6 +57,21 @@ class UncertainSystem:
 
     a, b, c, d : the matrices above. elements, copies : the blocks in order, the states first if there are any.
     inputs, outputs, states : names; u0.., y0.., x0.. by default.
+
+    Examples
+    --------
+    A spring known to 10 %, with an actuator whose dynamics are known to 20 %:
+
+    >>> k = ac.real("k", 4.0, percent=10)
+    >>> G = ac.tf([1.0], [1.0, 0.4, k], "force", "x") * (1 + ac.dynamics("actuator", 0.2))
+    >>> G
+    UncertainSystem(2 states, ['force'] -> ['x']: k = 4 +-10 %, 1 copy; actuator: dynamics of norm 1, 1 copy)
+    >>> G.nominal.dcgain(), G.substitute(k=4.4, actuator=-1.0).dcgain()
+    (array([[0.25]]), array([[0.18181818]]))
+    >>> G.lft()[1].blocks
+    (RealScalar(rows=1, cols=1, name='k'), ComplexScalar(rows=1, cols=1, name='actuator'))
+    >>> sorted(G.values(seed=1)[0]), G.sample(3)[0]
+    (['actuator', 'k'], StateSpace(3 states, continuous, ['force'] -> ['x']))
     """
 
     a: np.ndarray

@@ -12,6 +12,7 @@ from test_names import NAMES
 import avis_ctrl as ac
 from avis_ctrl import plot
 from avis_ctrl.interface import workflow
+from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
 SLOW = {"identify", "gap", "design"}
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -29,9 +30,9 @@ def test_the_examples_of_each_name(name, tmp_path, monkeypatch, request):
     assert not result.failed
 
 
-@pytest.mark.parametrize("name", plot.__all__)
-def test_the_examples_of_each_plot(name):
+@pytest.mark.parametrize("subject", [UncertainSystem, *(getattr(plot, name) for name in plot.__all__)])
+def test_the_examples_of_uncertain_systems_and_plots(subject):
     globs = {"ac": ac, "np": np}
-    (test,) = doctest.DocTestFinder(recurse=False).find(getattr(plot, name), name, module=False, globs=globs)
-    assert test.examples and f"ac.plot.{name}" in test.docstring
+    (test,) = doctest.DocTestFinder(recurse=False).find(subject, subject.__name__, module=False, globs=globs)
+    assert test.examples
     assert not doctest.DocTestRunner(optionflags=FLAGS).run(test).failed
