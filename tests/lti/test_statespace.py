@@ -207,3 +207,12 @@ def test_a_wrong_number_of_state_names_is_refused():
 def test_gain_at_a_pole_is_infinite_as_in_python_control():
     G = tf([1.0], [1.0, 0.0])
     assert G.dcgain() == control.dcgain(G.to_control()) == np.inf and np.isinf(G(0.0))
+
+
+@pytest.mark.parametrize(
+    ("pole", "dt", "said"),
+    [(1.0, 0.0, "1 state, 1 unstable pole, continuous"), (0.0, 0.0, "1 state, continuous"), (1.1, 0.1, "unstable")],
+)
+def test_an_unstable_system_says_so(pole, dt, said):
+    """An integrator is not called unstable: most controllers with integral action would be."""
+    assert said in repr(StateSpace([[pole]], [[1.0]], [[1.0]], [[0.0]], dt))
