@@ -235,7 +235,7 @@ def test_an_interrupt_of_the_iteration_keeps_the_best_controller(tmp_path):
     assert child.returncode == 0
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
     mu = next(one for one in result["controllers"] if one["name"] == "mu")
-    assert "stopped by the caller, before the iteration had ended" in mu["note"]
+    assert "stopped on request (callback or Ctrl-C)" in mu["note"]
     assert len(result["dk_history"]) <= 6 and mu["mu_upper"] < 2
 
 

@@ -52,7 +52,7 @@ def _commands(
 ) -> None:
     """Workbench for active vibration isolation tables.
 
-    Exit codes: 0 done (read the verdict), 2 invalid input, 3 a computation failed.
+    Exit codes: 0 done (read the verdict), 2 invalid input, 3 a computation failed, 130 ended by Ctrl-C.
     """
 
 

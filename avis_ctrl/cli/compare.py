@@ -14,6 +14,7 @@ def compare(
 ) -> None:
     """Compare two designs side by side: differences of the design files, and the results."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from avis_ctrl.study.design_comparison import compare_designs
@@ -21,9 +22,9 @@ def compare(
     console = Console(highlight=False)
     found = compare_designs(first, second)
     for title, rows in (("requested differently", found.requested), ("result", found.found)):
-        table = Table("", *found.titles, title=title)
+        table = Table("", *map(escape, found.titles), title=title)
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))  # a unit in brackets is no markup
         if rows:
             console.print(table)
     if not found.requested:

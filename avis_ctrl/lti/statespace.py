@@ -351,7 +351,12 @@ class StateSpace:
 
     def __repr__(self) -> str:
         clock = f"dt = {self.dt:g} s" if self.dt else "continuous"
-        return f"StateSpace({count_of(self.nstates, 'state')}, {clock}, {list(self.inputs)} -> {list(self.outputs)})"
+        poles = self.poles()
+        growth = np.abs(poles) - 1 if self.dt else poles.real / np.max(np.abs(poles), initial=1e-300)
+        # Not an integrator, whose pole is known only to round-off.
+        unstable = int(np.count_nonzero(growth > 1e-9))
+        size = count_of(self.nstates, "state") + (f", {count_of(unstable, 'unstable pole')}" if unstable else "")
+        return f"StateSpace({size}, {clock}, {list(self.inputs)} -> {list(self.outputs)})"
 
 
 def new_names(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:

@@ -1,8 +1,8 @@
 """Disk margins: gain and phase variations that a feedback loop tolerates, in one channel or in all at once.
 
-Each channel is multiplied by f = (1 + (1 - s)/2 delta)/(1 - (1 + s)/2 delta), |delta| < alpha, a disk of gains and
-phases about 1 with skew s. The largest alpha is 1/mu of S + (s - 1)/2 I, which is (S - T)/2 at s = 0 (Seiler, Packard
-and Gahinet, An introduction to disk margins, IEEE Control Systems 40(5), 2020).
+Each channel is multiplied by f = (1 + (1 - sigma)/2 delta)/(1 - (1 + sigma)/2 delta), |delta| < alpha, a disk of gains
+and phases about 1 with skew sigma. The largest alpha is 1/mu of S + (sigma - 1)/2 I, which is (S - T)/2 at sigma = 0
+(Seiler, Packard and Gahinet, An introduction to disk margins, IEEE Control Systems 40(5), 2020).
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def disk_margin(L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0,
         An `UncertainSystem` gives the worst case over its uncertainty.
     K : controller with negative feedback, u = -K y (for a K of `musyn`, with u = K y, give -K).
     at : location of the factors: plant outputs, plant inputs, or both simultaneously.
-    skew : s of the module docstring; 0 for equal gain increase and reduction. slack : as for `mu_peak`.
+    skew : sigma in f = (1 + (1 - sigma)/2 delta)/(1 - (1 + sigma)/2 delta), the factor of each channel; 0 for equal
+        gain increase and reduction. slack : as for `mu_peak`.
 
     Raises
     ------
@@ -122,7 +123,7 @@ def disk_margin(L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0,
 
 
 def _factors(name: str, n: int, skew: float) -> tuple[UncertainSystem, list[str]]:
-    """diag(f_1 .. f_n): f = 1 + w with w = delta (v + (1 + s)/2 w), since f - 1 = delta/(1 - (1 + s)/2 delta)."""
+    """diag(f_1 .. f_n): f = 1 + w, w = delta (v + (1 + sigma)/2 w), as f - 1 = delta/(1 - (1 + sigma)/2 delta)."""
     names = [f"{name} {k}" for k in range(n)]
     I = np.eye(n)
     return UncertainSystem((1 + skew) / 2 * I, I, I, I, tuple(Dynamics(one) for one in names), (1,) * n), names

@@ -220,7 +220,7 @@ class DKIteration:
         points = self.state.points
         assert points is not None
         if self.state.last is not self.best:
-            points = analysed(self.problem.P, self.best.K, self.problem.structure, points.omega)
+            points = analysed(self.problem.P, self.best.K, self.problem.structure, points.omega, self.best.gamma)
         return float(points.omega[np.argmax(points.mu)])
 
 

@@ -41,7 +41,7 @@ FOLLOWING = {
     "growth": "last start",
     "last start": DONE,
 }
-STOPPED = "stopped by the caller, before the iteration had ended"
+STOPPED = "stopped on request (callback or Ctrl-C), before the iteration had converged"
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,8 @@ def iterate(problem: Problem, state: State, starts: tuple[StateSpace, ...], opti
             state = _moved_on(problem, state)
             continue
         (scalings, cost, kind), synthesis = step
-        points = analysed(problem.P, synthesis.K, problem.structure, _next_grid(state, synthesis.closed_loop))
+        grid = _next_grid(state, synthesis.closed_loop)
+        points = analysed(problem.P, synthesis.K, problem.structure, grid, synthesis.gamma)
         loop = Loop(synthesis.K, scalings, synthesis.gamma, points.peak)
         row = Iteration(
             len(state.history),
@@ -193,8 +194,9 @@ def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
             "a controller to start from does not stabilise the plant",
             measured=f"largest real part of a pole {np.max(closed.poles().real):.3g} rad/s",
         )
-    points = analysed(problem.P, K, problem.structure, frequency_grid(closed))
-    return Loop(K, Scalings.identity(problem.structure), hinf_norm(closed).gain, points.peak), points
+    gamma = hinf_norm(closed).gain
+    points = analysed(problem.P, K, problem.structure, frequency_grid(closed), gamma)
+    return Loop(K, Scalings.identity(problem.structure), gamma, points.peak), points
 
 
 def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal, Synthesis] | None:
@@ -391,5 +393,5 @@ def _moved_on(problem: Problem, state: State) -> State:
         return replace(state, phase=FOLLOWING[state.phase])
     points = state.points
     if state.last is not state.path:
-        points = analysed(problem.P, state.path.K, problem.structure, points.omega)
+        points = analysed(problem.P, state.path.K, problem.structure, points.omega, state.path.gamma)
     return replace(state, phase="D-K", points=points, last=state.path, round_mu=state.path.mu)

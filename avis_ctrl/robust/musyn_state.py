@@ -11,7 +11,9 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, lft_lower
-from avis_ctrl.robust.dstep import PointwiseScalings
+from avis_ctrl.robust.dstep import BETWEEN, PointwiseScalings
+from avis_ctrl.robust.frequency_grid import resonances
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -28,7 +30,7 @@ class Iteration:
     """One row of the history.
 
     gamma : measured H-infinity norm of the loop scaled by D(s); an upper bound of complex mu at every frequency.
-    mu_upper : largest upper bound of complex mu over the frequency grid.
+    mu_upper : largest upper bound of complex mu over the frequency grid and the resonances of the loop.
     order : states of K; d_order : sum of the orders of the scalings used for K.
     d_fit_error : relative cost of these realised scalings compared with the best scalings at each frequency; for
         scalings of equal order in all blocks on the grid only, otherwise also between its frequencies.
@@ -134,7 +136,7 @@ class State:
             different = {json.dumps(saved[name]["K"]): saved[name] for name in ("best", "path", "last")}
             return State(), tuple(controller(item) for item in different.values())
         last = loop(saved["last"])
-        points = analysed(P, last.K, structure, np.array(saved["omega"], float))
+        points = analysed(P, last.K, structure, np.array(saved["omega"], float), last.gamma)
         return State(
             str(saved["phase"]),
             points,
@@ -154,6 +156,20 @@ def _digest(P: StateSpace, structure: BlockStructure) -> str:
     return numbers.hexdigest()
 
 
-def analysed(P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray) -> PointwiseScalings:
-    """mu and the best scalings of the loop F_l(P, K) at each frequency [rad/s]."""
-    return PointwiseScalings.of(omega, lft_lower(P, K).frequency_response(omega), structure)
+def analysed(
+    P: StateSpace, K: StateSpace, structure: BlockStructure, omega: np.ndarray, gamma: float
+) -> PointwiseScalings:
+    """mu and the best scalings of the loop F_l(P, K) at each frequency [rad/s], and at resonances where mu is higher.
+
+    gamma : norm of the scaled loop. mu exceeds it nowhere: if the peak on the grid is as high, no peak was missed.
+    Otherwise mu is computed at the resonances of this loop, too, because between them it changes little.
+    """
+    closed = lft_lower(P, K)
+    points = PointwiseScalings.of(omega, closed.frequency_response(omega), structure)
+    level, extra = BETWEEN * points.peak, np.setdiff1d(resonances(closed.poles()), omega)
+    if gamma > level and extra.size:
+        M = closed.frequency_response(extra)
+        missed = upper_bound(M[:, None], structure, goal=level).beta > level
+        if np.any(missed):
+            points = points.extended(extra[missed], M[missed])
+    return points

@@ -116,7 +116,8 @@ def robust_performance(
 ) -> Robustness:
     """Largest a for which the gain from d to e is at most 1/a with a times the declared uncertainty.
 
-    `lower` is a proved value of a: the loop is stable and its gain at most 1/a for all uncertainty of this size.
+    `lower` is the largest proved a: above 1 the gain is below 1 for more than the declared uncertainty; 0.65 means that
+    for 0.65 times the declared uncertainty the loop is stable and its gain at most 1/0.65.
     Arguments and errors as for `robust_stability`; the system needs inputs d and outputs e beyond the uncertainty.
 
     Examples

@@ -19,6 +19,7 @@ from avis_ctrl.robust.reduction import reduce_controller, replace_fast_by_lags, 
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
 @dataclass(frozen=True)
@@ -105,24 +106,21 @@ def _reduced(
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
-    def peak_on_grid(closed: StateSpace, goal: float = 0.0) -> float:
-        """Complex mu of a closed loop; only an upper bound of it if below the goal."""
-        M = closed.frequency_response(omega)[:, None]
-        return float(np.max(upper_bound(M, blocks, SETTINGS.accuracy, goal).beta))
+    def peak(K: StateSpace, goal: float = 0.0) -> float:
+        return peak_of_loop(P.closed(K), blocks, omega, goal)
 
     K = made.best.K
-    full = peak_on_grid(P.closed(K))
+    full = peak(K)
     limit = (1 + cost) * full
 
     def harmless(candidate: StateSpace) -> bool:
-        closed = P.closed(candidate)
-        return closed.is_stable() and peak_on_grid(closed, limit) <= limit
+        return P.closed(candidate).is_stable() and peak(candidate, limit) <= limit
 
     def lowest_order(start: StateSpace) -> StateSpace:
         # No weight changes below the corner up to which the offset may drift.
         lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
-        return reduce_controller(P.P, start, lambda one: peak_on_grid(P.closed(one), limit), limit=limit).K
+        return reduce_controller(P.P, start, lambda one: peak(one, limit), limit=limit).K
 
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
     # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.
@@ -135,9 +133,16 @@ def _reduced(
     candidates = chain([first], map(lowest_order, filter(harmless, lags)))
     reduced = next((one for one in candidates if np.max(np.abs(one.poles()), initial=0.0) <= nyquist), first)
     return reduced, (
-        f"reduced from {K.nstates} to {reduced.nstates} states: complex mu on a grid of {omega.size} "
-        f"frequencies changes from {full:.4f} to {peak_on_grid(P.closed(reduced)):.4f}"
+        f"reduced from {K.nstates} to {reduced.nstates} states: complex mu, at {omega.size} frequencies "
+        f"and the resonances of each loop, changes from {full:.4f} to {peak(reduced):.4f}"
     )
+
+
+def peak_of_loop(closed: StateSpace, blocks: BlockStructure, omega: np.ndarray, goal: float = 0.0) -> float:
+    """Largest upper bound of mu at given frequencies [rad/s] and at the resonances of this loop, where it may be
+    higher: a reduction can remove the damping of a mode. Only an upper bound of this if below the goal."""
+    M = closed.frequency_response(np.concatenate([omega, resonances(closed.poles())]))
+    return float(np.max(upper_bound(M[:, None], blocks, SETTINGS.accuracy, goal).beta))
 
 
 def best_of(mu: ControllerResult, others: Sequence[ControllerResult]) -> ControllerResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,13 +61,18 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
         for key in keys
         if key != "title" and asked[0].get(key) != asked[1].get(key)
     ]
-    if studies[0].get("rig") != studies[1].get("rig"):
-        requested.insert(0, ("rig file", _first_line(studies[0].get("rig")), _first_line(studies[1].get("rig"))))
+    rigs = [dict(_rig_values(study.get("rig"))) for study in studies]
+    different = [
+        (f"rig file: {key}", _as_text(rigs[0].get(key)), _as_text(rigs[1].get(key)))
+        for key in dict.fromkeys([*rigs[0], *rigs[1]])
+        if rigs[0].get(key) != rigs[1].get(key)
+    ]
+    requested = [*different, *requested]
     rows = [_figures(result, folder) for result, folder in zip(results, folders, strict=True)]
     found = [
         (name, _as_text(rows[0].get(name)), _as_text(rows[1].get(name))) for name in dict.fromkeys([*rows[0], *rows[1]])
     ]
-    other = sorted({key.partition(".")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
+    other = sorted({key.partition(".")[0].partition(":")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
     note = (
         f"mu of the two cannot be compared: it refers to different {', '.join(other)}; transmissibilities can"
         if other
@@ -96,6 +102,25 @@ def _leaves(table: Any, before: str) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
+def _rig_values(text: Any) -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of a rig file; the tables of a list by name, or by number from 1."""
+
+    def values(one: Any, name: str) -> Iterator[tuple[str, Any]]:
+        if isinstance(one, dict):
+            for key, value in one.items():
+                yield from values(value, f"{name}.{key}" if name else key)
+        elif isinstance(one, list) and one and all(isinstance(item, dict) for item in one):
+            for k, item in enumerate(one, 1):
+                yield from values(item, f"{name} {item.get('name', k)}")
+        else:
+            yield name, one
+
+    try:
+        yield from values(tomllib.loads(text), "")
+    except (TypeError, tomllib.TOMLDecodeError):
+        yield "text", text
+
+
 def _figures(result: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Values by quantity: those of the delivered controller and those of the verdict table."""
     try:
@@ -123,7 +148,3 @@ def _as_text(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(str, value))
     return value if isinstance(value, str) else in_short(value)
-
-
-def _first_line(text: Any) -> str:
-    return next((line for line in str(text).splitlines() if line.startswith("name")), "another rig")

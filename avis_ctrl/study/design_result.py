@@ -217,6 +217,7 @@ class DesignResult:
 
     loop : the sampled loop of all axes: companion loops, simulation, and the cause if it is unstable.
     failed : controllers for comparison that could not be designed or analysed. by_axis : mu against skyhook.
+    limits : sentences on what limits mu, and with mu above 1 on what would help.
     """
 
     design: Design
@@ -233,6 +234,7 @@ class DesignResult:
     notes: tuple[str, ...] = field(default=())
     failed: tuple[FailedController, ...] = ()
     by_axis: tuple[AxisGain, ...] = ()
+    limits: str = ""
 
     @property
     def simulation(self) -> SimulationCheck | None:

@@ -1,83 +1,116 @@
-"""The limiting weights and uncertainties: mu at its peak with one of them removed at a time."""
+"""The bounds and uncertainties that limit mu, and what a design with mu above 1 would need.
+
+Everything is computed: mu with one bound or uncertainty left out, or one bound wider.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from avis_ctrl.errors import ComputationError
+from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.robust.hinfsyn import hinf_suboptimal, hinfsyn
+from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.robust.mu_upper import bound_for_goal, bound_of_peak
 from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
-
-WORTH_NAMING = 0.02
-# A controller whose mu is within this fraction of the passive table's mu is regarded as doing nothing.
-IDLE = 0.01
-# Uncertainty of an identified response above which a better measurement is recommended.
-LARGE_SPREAD = 0.3
+from avis_ctrl.uncertainty.weights import ControlEffort, TransmissibilityBound
 
 
-def without_each(plant: DesignPlant, K: StateSpace, omega: float) -> list[tuple[str, float]]:
-    """(what is removed, upper bound of mu without it) at one frequency, smallest mu first.
-
-    Uncertainty blocks are removed one by one, weighted outputs by kind: transmissibility, control effort, compliance.
+@dataclass(frozen=True)
+class LimitSettings:
+    """worth : fraction of mu by which it must fall without a bound or uncertainty for this to be named; less changes
+        no decision.
+    most : number of uncertainties that are named; the first few are the ones to reduce.
+    idle : a controller whose mu is within this fraction of the passive table's mu is regarded as doing nothing.
+    large_spread : uncertainty of an identified response [1] above which a better measurement is recommended.
+    accuracy : relative accuracy of mu squared, small compared with `worth`.
+    widest_dB : largest relaxation of a bound that is tried; more would be no bound.
+    halvings : of the interval 0 to widest_dB; eight give 0.2 dB.
     """
-    P = plant.synthesis
-    M = P.closed(K).frequency_response(np.array([omega]))[0]
-    everything = list(P.all_blocks.blocks)
-    found = []
-    for k, block in enumerate(P.blocks.blocks):
-        keep_w, keep_z = np.ones(M.shape[1], bool), np.ones(M.shape[0], bool)
-        place = list(P.blocks.slices())[k]
-        keep_w[place[1]], keep_z[place[2]] = False, False
-        rest = BlockStructure(tuple(everything[:k] + everything[k + 1 :]))
-        found.append((f"uncertainty of {block.name}", _mu(M[np.ix_(keep_z, keep_w)], rest)))
-    for prefix, words in (
-        ("e_", "transmissibility bound"),
-        ("effort_", "control effort bound"),
-        ("compliance_", "compliance bound"),
-    ):
-        left = [name for name in P.z if not name.startswith(prefix)]
-        if len(left) in (0, len(P.z)):
-            continue
-        rows = [*range(P.blocks.n_z), *(P.blocks.n_z + P.z.index(name) for name in left)]
-        found.append((words, _mu(M[rows], P.blocks.with_performance(len(P.w), len(left)))))
-    return sorted(found, key=lambda one: one[1])
+
+    worth: float = 0.02
+    most: int = 3
+    idle: float = 0.01
+    large_spread: float = 0.3
+    accuracy: float = 1e-3
+    widest_dB: float = 40.0
+    halvings: int = 8
 
 
-def _mu(M: np.ndarray, blocks: BlockStructure) -> float:
-    return float(mu_upper(M, blocks).upper)
+SETTINGS = LimitSettings()
+# Prefixes of the weighted outputs of each bound.
+BOUNDS = {"transmissibility bound": "e_", "control effort bound": "effort_", "compliance bound": "compliance_"}
+
+
+def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
+    """Sentences: where mu peaks, and which bounds and uncertainties limit it there."""
+    if mu.K is None or np.isnan(mu.mu.omega):
+        return ""
+    P, omega = plant.synthesis, mu.mu.omega
+    closed = P.closed(mu.K)
+    M = closed.frequency_response(np.array([omega]))
+    worth = (1 - SETTINGS.worth) * _mu(M, P.all_blocks)[0]
+    without = {name: _without_bound(plant, closed, name) for name in _bounds(plant)}
+    bounds = sorted(
+        (value, name)
+        for name, (rest, blocks) in without.items()
+        if blocks.blocks and (value := _mu(rest.frequency_response(np.array([omega])), blocks)[0]) < worth
+    )
+    shares = sorted((value, name) for name, value in _without_uncertainties(plant, M) if value < worth)
+    text = f"mu peaks at {_hertz(omega)}."
+    if bounds:
+        value, name = bounds[0]
+        peak = mu_peak(*without[name], slack=SETTINGS.worth)
+        most = min(peak.upper, mu.mu.upper)
+        text += (
+            f" There the {name}{_part(plant, name, omega)} limits it: without this bound mu would be {value:.3g} at "
+            f"this frequency, and at most {most:.3g} over all frequencies, at {_hertz(peak.omega)}."
+        )
+        others = [f"the {name} ({value:.3g} without it)" for value, name in bounds[1:]]
+        text += f" Also {listed(others)}." if others else ""
+    if shares:
+        named = [f"{name} ({value:.3g} without it)" for value, name in shares[: SETTINGS.most]]
+        text += f" Uncertainties that raise it most there: {listed(named)}."
+    if not bounds and not shares:
+        text += (
+            f" No single bound or uncertainty limits it there: without any one of them it falls by less than "
+            f"{100 * SETTINGS.worth:g} %."
+        )
+    return text
 
 
 def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult]) -> str:
-    """Sentences on a design with mu above 1: what was reached, what limits it, and what to try.
+    """Sentences on a design with mu above 1: what was reached, what limits it, and what would help.
 
-    This does not prove that nothing better exists: the synthesis may have stopped early, which the sentences then
-    state.
+    This proves that nothing better exists only if the bounds cannot be met without uncertainty. Otherwise the synthesis
+    may have stopped early, which the sentences then state.
     """
     if mu.K is None:
         return ""
     spread = _spread_there(plant, mu.mu.omega)
+    impossible = _not_even_nominal(plant)
     if no_better_than_none(mu, others):
         return (
             f"The synthesis found no controller better than none: with the best controller found mu is "
-            f"{mu.mu.upper:.3g}, at {mu.mu.omega / (2 * np.pi):.3g} Hz, which is not smaller than without control. "
+            f"{mu.mu.upper:.3g}, at {_hertz(mu.mu.omega)}, which is not smaller than without control. "
             f"No D-K iteration came closer to the bounds with this uncertainty. "
-            f"{spread or 'Specify less uncertainty or wider bounds'}."
+            f"{spread or impossible or 'Specify less uncertainty or wider bounds'}".rstrip(".")
+            + "."
         )
-    worth = (1 - WORTH_NAMING) * mu.mu.upper
-    reliefs = [(name, value) for name, value in without_each(plant, mu.K, mu.mu.omega) if value < worth]
-    relief = [f"{name} ({value:.2f} without it)" for name, value in reliefs]
+    limits = limiting(plant, mu)
     text = (
-        f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g}, at "
-        f"{mu.mu.omega / (2 * np.pi):.3g} Hz. Main contributions there: "
-        f"{', '.join(relief[:4]) or 'no single one'}. "
-        f"With uncertainties {mu.mu.upper:.3g} times smaller and bounds {mu.mu.upper:.3g} times wider it is met."
+        f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g} and "
+        f"must be below 1. {limits} {impossible or _relief(plant, mu)}"
     )
-    if spread and any(RESPONSE in name for name, _ in reliefs):
+    if spread and RESPONSE in limits:
         text += f" {spread}."
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
         best = min(better, key=lambda c: c.mu.upper)
@@ -85,10 +118,138 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
     return text
 
 
+def _not_even_nominal(plant: DesignPlant) -> str:
+    """Proof that no controller meets the bounds even without uncertainty, and how far they would have to be relaxed;
+    empty if there is no such proof."""
+    nominal = plant.synthesis.nominal()
+    try:
+        least = hinfsyn(nominal.P, nominal.nmeas, nominal.ncon).gamma_optimal_bounds[0]
+    except ComputationError:
+        return ""
+    if least < 1:
+        return ""
+
+    def met(name: str, factor: float) -> bool:
+        left = [1 / factor if one.startswith(BOUNDS[name]) else 1.0 for one in nominal.P.outputs]
+        try:
+            hinf_suboptimal(nominal.P.scaled(left=np.array(left)), nominal.nmeas, nominal.ncon, 1.0)
+        except ComputationError:
+            return False
+        return True
+
+    return (
+        f"No controller can meet these bounds, even without uncertainty: the smallest H-infinity norm that a "
+        f"controller reaches with the nominal plant is {least:.3g}, which must be below 1. "
+        + _enough("Without uncertainty they can be met", _wider(plant, met))
+    )
+
+
+def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
+    """How far a bound, or all uncertainties, must be relaxed for this controller to meet the specification."""
+    P, every = plant.synthesis, mu.mu.frequencies
+    assert mu.K is not None
+    # Where mu is below 1 with these bounds it is below 1 with wider ones.
+    M = P.closed(mu.K).frequency_response(every[~(mu.mu.upper_curve < 1)])
+
+    def below_one(rows: Sequence[int], factor: float) -> bool:
+        left = np.ones(M.shape[1])
+        left[rows] = 1 / factor
+        scaled = M * left[:, None]
+        return bool(np.all(bound_for_goal(scaled[:, None], P.all_blocks, SETTINGS.accuracy, 1.0).beta <= 1))
+
+    def met(name: str, factor: float) -> bool:
+        return below_one(_rows(plant, name), factor)
+
+    ways = _wider(plant, met) if M.size else []
+    if M.size and (smaller := _least_dB(lambda factor: below_one(range(P.blocks.n_z), factor))) is not None:
+        ways.append(f"all uncertainties are reduced to {100 * 10 ** (-smaller / 20):.0f} % of their size")
+    return (
+        _enough("At the computed frequencies this controller meets it", ways)
+        + f" It is also enough to divide every uncertainty by {mu.mu.upper:.3g} and to relax every bound by "
+        f"{20 * np.log10(mu.mu.upper):.1f} dB."
+    )
+
+
+def _wider(plant: DesignPlant, met: Callable[[str, float], bool]) -> list[str]:
+    """For each bound that is enough alone: how far it must be relaxed. met : whether a bound wider by a factor is."""
+    found = [(name, _least_dB(partial(met, name))) for name in _bounds(plant)]
+    return [f"the {name} is relaxed by {value:.1f} dB" for name, value in found if value is not None]
+
+
+def _least_dB(met: Callable[[float], bool]) -> float | None:
+    """Smallest relaxation [dB] with which the bounds are met, by bisection; None if the widest is not enough."""
+    low, high = 0.0, SETTINGS.widest_dB
+    if not met(10 ** (high / 20)):
+        return None
+    for _ in range(SETTINGS.halvings):
+        middle = (low + high) / 2
+        low, high = (low, middle) if met(10 ** (middle / 20)) else (middle, high)
+    return high
+
+
+def _enough(said: str, ways: list[str]) -> str:
+    if not ways:
+        return "Relaxing a single bound is not enough."
+    return f"{said} if {listed(ways, 'or if')}{', each alone' if len(ways) > 1 else ''}."
+
+
+def _bounds(plant: DesignPlant) -> list[str]:
+    """The bounds of this design."""
+    return [name for name, prefix in BOUNDS.items() if any(one.startswith(prefix) for one in plant.synthesis.z)]
+
+
+def _rows(plant: DesignPlant, name: str) -> list[int]:
+    """Rows of the loop that belong to a bound."""
+    P = plant.synthesis
+    return [P.blocks.n_z + k for k, one in enumerate(P.z) if one.startswith(BOUNDS[name])]
+
+
+def _without_bound(plant: DesignPlant, closed: StateSpace, name: str) -> tuple[StateSpace, BlockStructure]:
+    """The loop without the outputs of a bound, and its blocks."""
+    P, gone = plant.synthesis, _rows(plant, name)
+    left = [k for k in range(closed.noutputs) if k not in gone]
+    if len(gone) == len(P.z):
+        return closed.select(left, slice(P.blocks.n_w)), P.blocks
+    return closed.select(left, None), P.blocks.with_performance(len(P.w), len(P.z) - len(gone))
+
+
+def _without_uncertainties(plant: DesignPlant, M: np.ndarray) -> list[tuple[str, float]]:
+    """(name, upper bound of mu of M (1, n_z, n_w) without it) of each uncertainty."""
+    P = plant.synthesis
+    every = P.all_blocks.blocks
+    found = []
+    for k, (block, w, z) in enumerate(P.blocks.slices()):
+        left = np.delete(np.delete(M, z, axis=1), w, axis=2)
+        found.append((block.name, float(_mu(left, BlockStructure((*every[:k], *every[k + 1 :])))[0])))
+    return found
+
+
+def _mu(M: np.ndarray, blocks: BlockStructure) -> np.ndarray:
+    return bound_of_peak(M[:, None], blocks, SETTINGS.accuracy).beta
+
+
+def _part(plant: DesignPlant, name: str, omega: float) -> str:
+    """The key of the design file that sets a bound at this frequency, in brackets; empty if several do."""
+    for weight in plant.weights.values():
+        if name == "transmissibility bound" and isinstance(weight, TransmissibilityBound):
+            band = weight.bands[0]
+            inside = 2 * np.pi * band.low_Hz <= omega <= 2 * np.pi * band.high_Hz
+            return " (band_dB)" if inside else " (outside band_Hz)"
+        if name == "control effort bound" and isinstance(weight, ControlEffort):
+            # Below this frequency the weight is raised to bound the voltage for the offset.
+            offset = omega < 2 * np.pi * weight.offset_corner_Hz * weight.offset
+            return " (here on the voltage for the offset of the electronics, offset_percent)" if offset else ""
+    return ""
+
+
+def _hertz(omega: float) -> str:
+    return f"{omega / (2 * np.pi):.3g} Hz" if np.isfinite(omega) else "infinite frequency"
+
+
 def no_better_than_none(mu: ControllerResult, others: Sequence[ControllerResult]) -> bool:
     """Whether the mu controller misses its target and reduces mu by less than 1 % relative to the passive table."""
     at_rest = min((c.mu.upper for c in others if c.K is None), default=np.inf)
-    return bool(mu.mu.upper >= 1 and np.isfinite(at_rest) and mu.mu.upper > (1 - IDLE) * at_rest)
+    return bool(mu.mu.upper >= 1 and np.isfinite(at_rest) and mu.mu.upper > (1 - SETTINGS.idle) * at_rest)
 
 
 def _spread_there(plant: DesignPlant, omega: float) -> str:
@@ -97,7 +258,7 @@ def _spread_there(plant: DesignPlant, omega: float) -> str:
         return ""
     weight = plant.identified.weight
     size = float(weight.magnitude(np.array([omega]))[0])
-    if size < LARGE_SPREAD:
+    if size < SETTINGS.large_spread:
         return ""
     nearest = int(np.argmin(np.abs(np.log(weight.omega / omega))))
     drowned = plant.identified.spread.drowned(plant.identified.confidence)

@@ -32,7 +32,7 @@ from avis_ctrl.study.design_result import (
     FailedController,
     Simulated,
 )
-from avis_ctrl.study.limits import best_found
+from avis_ctrl.study.limits import best_found, limiting
 from avis_ctrl.study.loops import LOOPS_TITLE, tuned_loops
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
@@ -77,6 +77,12 @@ INITIAL = {
     HINF: "H-infinity, uncertainty as performance",
     NOMINAL: "H-infinity, nominal plant",
     GIVEN: "from the comparison",
+}
+# Steps other than those of D-K iteration, by their kind.
+STEPS = {
+    "start": "D-K iteration anew from constant scalings",
+    "descent": "descent on gamma over the scalings",
+    "growth": "descent on gamma, scalings of higher order",
 }
 
 
@@ -152,10 +158,10 @@ def synthesise(
                 )
                 return True
             ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
-            kind = "" if row.kind == "D-K" else f" ({row.kind})"
             progress(
-                f"step {row.iteration}, D-K iteration{kind}: gamma {row.gamma:.5g}, peak mu {row.mu_upper:.5g}, "
-                f"order {row.order}, misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
+                f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, "
+                f"peak mu {row.mu_upper:.5g}, order {row.order}, misfit of the D-scalings "
+                f"{100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
             )
             return not ends
 
@@ -181,12 +187,10 @@ def finish(
         mu = next(c for c in controllers if c.name == "mu")
         six_dof = six_dof_check(design, rig, plant, mu, compared.loop.companions)
         assumed = plant.identified.assumption if plant.identified else ""
-        verdict = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else ""
+        limits = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else limiting(plant, mu)
         unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
         passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in compared.loop.companions.passive]
-        notes = tuple(
-            text for text in (verdict, assumed, *unlike, *passive_axes, *compared.loop.companions.remarks()) if text
-        )
+        notes = tuple(text for text in (assumed, *unlike, *passive_axes, *compared.loop.companions.remarks()) if text)
     requirements = (
         *check_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
         *check_requirements(design, controllers, compared.by_axis),
@@ -206,6 +210,7 @@ def finish(
         notes,
         compared.failed,
         compared.by_axis,
+        limits,
     )
 
 

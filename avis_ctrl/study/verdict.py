@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from avis_ctrl.errors import ComputationError
@@ -83,14 +85,31 @@ def refuse_unstable(result: DesignResult) -> None:
     """Raise ComputationError (exit code 3) if the delivered loop is unstable for any plant."""
     if not (text := unstable(result)):
         return
-    kind = result.loop.culprit.kind if result.loop is not None and result.loop.culprit is not None else ""
+    culprit = result.loop.culprit if result.loop is not None else None
     steps = {
         "table": "check the rig file's stiffness, centre of mass and damping",
         "nonlinear": "check whether the drive voltages of that plant are at their limits, and its floor motion",
-        "controller": "add the axes that move to keep in the design file, or reduce the bandwidth",
     }
-    step = steps.get(kind, "use sensors with a lower corner frequency, or add these axes to keep in the design file")
+    step = steps.get(
+        culprit.kind if culprit else "",
+        "use sensors with a lower corner frequency, or add these axes to keep in the design file",
+    )
+    if culprit is not None and culprit.kind == "controller":
+        step = _relaxed(result, culprit.axes)
     raise ComputationError(text.removesuffix("."), next_step=step)
+
+
+def _relaxed(result: DesignResult, moving: Sequence[str]) -> str:
+    """What to change if the design's controller itself makes a plant unstable. moving : axes of that motion."""
+    mu = result.controller("mu")
+    if not mu.stability.upper < 1:
+        return (
+            f"the specification asks for too much: mu of the controller is {mu.mu.upper:.3g}, not below 1; relax the "
+            "bound that limits it, or reduce the uncertainty, as the last sentences of the result say"
+        )
+    if outside := [axis for axis in moving if axis not in result.design.keep]:
+        return f"add {listed(outside)} to keep in the design file, or reduce the bandwidth"
+    return "reduce the bandwidth, or use a higher sample rate"
 
 
 def _counted(result: DesignResult) -> str:

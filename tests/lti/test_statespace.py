@@ -235,3 +235,12 @@ def test_inverse_and_powers_are_those_of_the_transfer_matrix(rng):
         _ = 1 / L
     with pytest.raises(InputError, match="whole number"):
         _ = L**0.5
+
+
+@pytest.mark.parametrize(
+    ("pole", "dt", "said"),
+    [(1.0, 0.0, "1 state, 1 unstable pole, continuous"), (0.0, 0.0, "1 state, continuous"), (1.1, 0.1, "unstable")],
+)
+def test_an_unstable_system_says_so(pole, dt, said):
+    """An integrator is not called unstable: most controllers with integral action would be."""
+    assert said in repr(StateSpace([[pole]], [[1.0]], [[1.0]], [[0.0]], dt))

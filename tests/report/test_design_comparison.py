@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import replace
 
 import matplotlib
@@ -61,6 +62,19 @@ def test_the_command_prints_both(folders):
 
     done = CliRunner().invoke(app, ["compare", *map(str, folders)], env={"COLUMNS": "160"})
     assert done.exit_code == 0 and "transmissibility.peak_dB" in done.output and "0.71" in done.output
+    assert "peak transmissibility, worst case [dB]" in done.output  # no markup
+
+
+def test_rigs_of_one_name_differ_by_their_values(folders, tmp_path):
+    content = json.loads((folders[0] / "study.json").read_text())
+    rig = tomllib.loads(content["rig"])
+    assert "mass_kg" in rig["payload"] and content["rig"].count(f"mass_kg = {rig['payload']['mass_kg']}") == 1
+    heavier = content["rig"].replace(f"mass_kg = {rig['payload']['mass_kg']}", "mass_kg = 999.0  # weighed")
+    (tmp_path / "study.json").write_text(json.dumps({**content, "rig": heavier}))
+    (tmp_path / "result.json").write_text((folders[0] / "result.json").read_text())
+    found = compare_designs(folders[0], tmp_path)
+    assert found.requested == (("rig file: payload.mass_kg", f"{rig['payload']['mass_kg']:.5g}", "999"),)
+    assert "different rig file;" in found.note
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from avis_ctrl.robust.hinf_riccati import find_gamma
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.musyn import musyn
+from avis_ctrl.robust.musyn_state import analysed
 from avis_ctrl.robust.robustness import robust_performance
 from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.robust.slycot_adapter import mu_upper_slicot
@@ -224,7 +225,7 @@ def test_callback_stops_and_resuming_equals_running_on():
     P, blocks = table()
     seen = []
     stopped = musyn(P, blocks, 1, 1, callback=lambda row: seen.append(row) or (False if row.iteration == 1 else None))
-    assert stopped.status == "stopped by the caller, before the iteration had ended"
+    assert stopped.status.startswith("stopped on request")
     assert len(seen) == len(stopped.history) == 2
     resumed = musyn(P, blocks, 1, 1, state=json.loads(json.dumps(stopped.saved_state)), max_iterations=4)
     through = musyn(P, blocks, 1, 1, max_iterations=4)
@@ -386,6 +387,21 @@ def test_the_grid_of_a_loop_sees_its_resonance_and_halves_around_peaks():
     for points, room in ((MAX_POINTS - 2, True), (MAX_POINTS - 1, False)):
         many = np.geomspace(1.0, 1e4, points)
         assert refined_grid(many, np.exp(-(np.log(many / many[40]) ** 2))).size == points + 2 * room
+
+
+def test_an_analysis_sees_a_resonance_between_its_frequencies():
+    """Without control the loop is 1/(s^2 + 2 zeta s + 1). A norm no higher than mu on the grid shows that there is no
+    peak between its points; then the grid remains."""
+    zeta = 0.01
+    P = StateSpace(
+        [[0.0, 1.0], [-1.0, -2 * zeta]], [[0.0, 0.0], [1.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], np.zeros((2, 2))
+    )
+    blocks, grid = BlockStructure((ComplexFull(1, 1),)), np.array([0.5, 0.9, 1.2])
+    peak = 1 / (2 * zeta * np.sqrt(1 - zeta**2))
+    found = analysed(P, gain([[0.0]]), blocks, grid, peak)
+    assert found.peak == pytest.approx(peak, rel=5e-3) and np.all(np.diff(found.omega) > 0)
+    assert set(grid) < set(found.omega)
+    assert np.array_equal(analysed(P, gain([[0.0]]), blocks, grid, 1 / 0.19).omega, grid)
 
 
 def test_gamma_reported_is_measured(distilled):

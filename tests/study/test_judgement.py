@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import slycot
 from slycot.exceptions import SlycotArithmeticError
 
-from avis_ctrl.lti import balance, gain, hinf_norm
+from avis_ctrl.lti import StateSpace, balance, gain, hinf_norm
 from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.hinfsyn import hinfsyn
+from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_gain import perturbed
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.analysis import analyse, bound, worst_of_axis
-from avis_ctrl.study.controllers import passive, reduction_grid
+from avis_ctrl.study.controllers import passive, peak_of_loop, reduction_grid
 from avis_ctrl.study.design_file import Design, RequirementSection, design_from_table, read_study, study_of
 from avis_ctrl.study.design_result import ControllerResult
-from avis_ctrl.study.limits import best_found
+from avis_ctrl.study.limits import best_found, limiting
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.requirements import check_requirements
 from avis_ctrl.study.runner import skyhook_limit
 from avis_ctrl.study.skyhooks import classical_skyhook
+from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 
@@ -232,6 +236,42 @@ def test_a_controller_no_better_than_none_is_called_so(one_axis, measured):
     assert (line.value, line.met) == (20.0, True)
 
 
+def test_the_bound_that_limits_mu_is_named_with_mu_without_it(one_axis, measured):
+    """Both numbers are those of the loop without the rows of the bound, by `mu_upper` and `mu_peak`."""
+    _, plant = one_axis
+    skyhook = measured["skyhook_classical"]
+    text = limiting(plant, skyhook)
+    P, omega = plant.synthesis, skyhook.mu.omega
+    rest = P.closed(skyhook.K).select([name for name in P.closed(skyhook.K).outputs if not name.startswith("e_")], None)
+    blocks = P.blocks.with_performance(len(P.w), sum(not name.startswith("e_") for name in P.z))
+    without = mu_peak(rest, blocks, slack=1e-3)
+    assert f"mu peaks at {omega / (2 * np.pi):.3g} Hz. There the transmissibility bound" in text
+    there, most = (
+        float(one) for one in re.findall(r"would be (\S+) at this frequency, and at most (\S+) over", text)[0]
+    )
+    assert there == pytest.approx(mu_upper(rest.frequency_response(np.array([omega])), blocks).upper[0], rel=0.01)
+    assert 0.99 * without.lower < most < 1.03 * without.upper
+
+
+def test_bounds_that_no_controller_meets_are_said_to_be_impossible(shipped):
+    """band_dB = -40: the optimum without uncertainty is above 1; relaxed as the sentence says it is 1."""
+    design, plant = shipped
+    asked = design.transmissibility.model_copy(update={"band_dB": -40.0})
+    plant = build_plant(design.model_copy(update={"transmissibility": asked}), load_rig("avis"))
+    idle = gain(np.zeros((2, 2)), plant.synthesis.y, plant.synthesis.u)
+    none = np.zeros(0)
+    mu = SimpleNamespace(
+        K=idle, mu=SimpleNamespace(upper=9.0, omega=10.0, frequencies=np.array([10.0]), upper_curve=none)
+    )
+    text = best_found(plant, mu, [])
+    assert "mu of the mu controller is 9 and must be below 1" in text
+    assert "No controller can meet these bounds, even without uncertainty" in text
+    relaxed = 10 ** (-float(re.findall(r"the transmissibility bound is relaxed by (\S+) dB", text)[0]) / 20)
+    nominal = plant.synthesis.nominal()
+    left = [relaxed if name.startswith("e_") else 1.0 for name in nominal.P.outputs]
+    assert hinfsyn(nominal.P.scaled(left=np.array(left)), 2, 2).gamma_optimal_bounds[1] == pytest.approx(1.0, abs=0.02)
+
+
 def test_reduction_is_compared_where_the_table_at_rest_peaks(shipped):
     """The weighted norm of the table at rest on that grid is its peak, which the even grid missed by a factor 3."""
     _, plant = shipped
@@ -242,6 +282,14 @@ def test_reduction_is_compared_where_the_table_at_rest_peaks(shipped):
     seen = np.max(np.linalg.norm(nominal.frequency_response(omega), 2, axis=(1, 2)))
     assert seen > 0.99 * hinf_norm(nominal).gain
     assert 1.0 in omega
+
+
+def test_the_peak_of_a_loop_includes_resonances_between_the_frequencies():
+    """1/(s^2 + 2 zeta s + 1) peaks at 1/(2 zeta sqrt(1 - zeta^2)); a coarse grid saw a hundredth of it."""
+    zeta = 0.004
+    loop = StateSpace([[0.0, 1.0], [-1.0, -2 * zeta]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+    seen = peak_of_loop(loop, BlockStructure((ComplexFull(1, 1),)), np.array([0.5, 2.0]))
+    assert seen == pytest.approx(1 / (2 * zeta * np.sqrt(1 - zeta**2)), rel=1e-3)
 
 
 def test_no_controller_of_x_and_phi_y_meets_the_bounds_of_the_z_phix_design():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -93,3 +94,21 @@ def test_without_bounds_none_are_said_to_hold():
     mu = SimpleNamespace(worst_peak=nothing, worst_band=nothing)
     found = all_axes(SimpleNamespace(controller=lambda name: mu, six_dof=six, design=design))
     assert "bounds hold" not in found and "+6.0 dB" in found and "-8.0 dB from 1 to 10 Hz" in found
+
+
+@pytest.mark.parametrize(
+    ("stability", "moving", "advice"),
+    [
+        (1.66, ("z", "phi_x"), "asks for too much: mu of the controller is 3.59"),
+        (0.8, ("z", "x", "phi_y"), "add x and phi_y to keep"),
+        (0.8, ("z", "phi_x"), "reduce the bandwidth, or use a higher sample rate"),
+    ],
+)
+def test_the_advice_fits_the_cause(stability, moving, advice):
+    """Axes are to be added only if axes outside the design move and the design itself is stable for its set."""
+    mu = SimpleNamespace(name="mu", stability=SimpleNamespace(upper=stability), mu=SimpleNamespace(upper=3.59))
+    found = result([plant("worst case", 1.00003)], Culprit("worst case", 1.00003, 18.2, 0.03, moving, "controller"))
+    found = replace(found, controllers=(mu,), design=SimpleNamespace(keep=["z", "phi_x"]))
+    with pytest.raises(ComputationError) as refused:
+        refuse_unstable(found)
+    assert advice in refused.value.next_step

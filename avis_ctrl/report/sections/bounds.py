@@ -16,7 +16,7 @@ Pick = Callable[[ControllerResult], Bound]
 
 def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and the perturbations that attain the lower bounds."""
-    pieces: list[Piece] = [certificate(result)]
+    pieces: list[Piece] = [*certificate(result)]
     pieces += [
         _figure(
             "mu_performance",
@@ -24,7 +24,7 @@ def bounds(result: DesignResult) -> Section:
             lambda c: c.mu,
             "mu, performance",
             "mu of the weighted performance",
-            "Below 1 (dashed line) every weighted requirement holds for every plant of the uncertainty set.",
+            "Below 1 (dashed line) every plant of the uncertainty set meets every bound.",
         ),
         _figure(
             "mu_stability",
@@ -40,8 +40,8 @@ def bounds(result: DesignResult) -> Section:
     return Section("Bounds of mu", "bounds", tuple(pieces))
 
 
-def certificate(result: DesignResult) -> Paragraph:
-    """Both bounds of mu, and whether the upper bound is guaranteed between the computed frequencies."""
+def certificate(result: DesignResult) -> list[Paragraph]:
+    """Both bounds of mu, whether the upper bound is guaranteed between the computed frequencies, and what limits mu."""
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
     between = (
@@ -50,13 +50,19 @@ def certificate(result: DesignResult) -> Paragraph:
         else "The upper bound holds at the computed frequencies; between them it is not "
         "guaranteed, although the grid was refined near every local peak."
     )
-    return Paragraph(
+    reached = (
+        f" The lower bound is reached: within {words.number(1 / mu.lower)} times the declared uncertainty there is a "
+        f"plant whose weighted gain is {words.bound(mu.lower)}."
+        if np.isfinite(mu.lower) and mu.lower > 0
+        else ""
+    )
+    bounds = Paragraph(
         f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
         f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
         + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
-        + f". Below 1, every weighted requirement holds for every plant of the uncertainty set. {between} "
-        "The lower bound is reached: a perturbation of size 1/mu makes the loop singular."
+        + f". If mu is below 1, every plant of the uncertainty set meets every bound. {between}{reached}"
     )
+    return [bounds, *([Paragraph(result.limits)] if result.limits else [])]
 
 
 def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, meaning: str) -> Figure:
@@ -127,8 +133,8 @@ def _worst(result: DesignResult) -> Table:
             rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
     return table(
         "The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
-        "perturbations of mu have the size 1/mu, which makes the loop singular: if mu is below 1 they lie "
-        "outside the uncertainty set. Those of the transmissibility lie inside the set.",
+        "perturbations of mu have the size 1/mu: if mu is below 1 they are larger than the declared uncertainty. Those "
+        "of the transmissibility are within it.",
         ("worst case of", "reaches", "at", "perturbation"),
         rows,
         "lrrl",

@@ -70,10 +70,12 @@ def synthesis(result: DesignResult) -> Section:
         "synthesis",
         (
             table(
-                'The iterations. Kind: "H-infinity", "nominal" (plant without uncertainty) and "given" are initial '
-                'controllers; "D-K" alternates synthesis and scalings; the others improve the best controller. Fit: '
-                "increase of the bound caused by realising the scalings as rational functions, compared with the best "
-                "scalings at each frequency. The best controller of all iterations is used.",
+                'The iterations. Kind: "H-infinity", "nominal" (plant without uncertainty) and "given" (a controller '
+                "for comparison) are initial controllers. Each later step is an H-infinity synthesis with scalings D: "
+                '"D-K" fits them to the last loop, "start" begins anew with the best constant ones, "descent" changes '
+                'them so that gamma falls, "growth" does so with scalings of higher order. Fit: by how much '
+                "the rational scalings D(s) raise the bound, compared with the best scalings at each frequency. The "
+                "controller with the smallest mu is used.",
                 ("step", "kind", "gamma", "mu upper", "order", "order of D", "fit", "time"),
                 rows,
                 "rlrrrrrr",

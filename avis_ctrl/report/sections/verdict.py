@@ -16,6 +16,7 @@ from avis_ctrl.study.verdict import all_axes, first_sentence
 
 def verdict(result: DesignResult) -> Section:
     """Summary page: the task, the verdict on each requirement, the certificate, and one figure."""
+    low, high = result.design.transmissibility.band_Hz
     rows = [
         (
             r.name,
@@ -29,7 +30,9 @@ def verdict(result: DesignResult) -> Section:
         [
             table(
                 "Requirements of the design and the results of the mu controller. Values in dB are the largest "
-                "singular value from floor to payload, rotations as displacement of the edge.",
+                "singular value from floor to payload, rotations as displacement of the edge; the band is "
+                f"{low:g} to {high:g} Hz. The offset's row: DC voltage of a drive if every sensor channel has the "
+                "largest offset that follows from the rig file, with the worst signs.",
                 ("requirement", "verdict", "result", "limit"),
                 rows,
                 "lcrr",
@@ -41,7 +44,7 @@ def verdict(result: DesignResult) -> Section:
     return Section(
         "Summary",
         "verdict",
-        (_sentence(result), _asked(result, bool(met)), *met, certificate(result), summary_figure(result)),
+        (_sentence(result), _asked(result, bool(met)), *met, *certificate(result), summary_figure(result)),
         alone=True,
     )
 
@@ -62,16 +65,21 @@ def _asked(result: DesignResult, judged: bool) -> Paragraph:
     members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
     return Paragraph(
         f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
-        f"{result.rig.name}, stable for {members}. Its target, the weight of the synthesis, is a transmissibility of "
-        f"at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz and of at most "
-        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
-        + (" The result is judged by the requirements of the design file:" if judged else "")
+        f"{result.rig.name}. It must stabilise {members}. The transmissibility must be at most "
+        f"{design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and at most "
+        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies; the synthesis uses these bounds as weight."
+        + (" The table has the requirements of the design file:" if judged else "")
     )
 
 
 def _achieved(result: DesignResult) -> str:
     mu = result.controller("mu")
     low, high = result.design.transmissibility.band_Hz
+    if mu.stable and mu.stability.lower >= 1:
+        return (
+            f"A plant of the uncertainty set makes the loop unstable: mu of the uncertainty alone is at least "
+            f"{words.bound(mu.stability.lower)} with the mu controller, so there is no worst-case transmissibility."
+        )
     if not np.isfinite(mu.worst_peak.upper):
         return (
             "The mu controller is not proved to be stable for every plant of the uncertainty set, so no worst-case "
