@@ -112,6 +112,8 @@ def test_truncated_files_are_one_line(campaign, tmp_path, keep):
         (("simulate-campaign", "--rig", "avis", "--out", "no/where/c.h5", "--duration", "20"), "no/where"),
         (("simulate-campaign", "--rig", "avis", "--out", "c.h5", "--plan", "none.toml"), "none.toml"),
         (("convert", "C", "no/where/c.h5"), "no/where"),
+        (("convert", "C"), "--out: missing"),
+        (("convert", "C", "a.h5", "--out", "b.h5"), "a.h5 is named, too"),
         (("single-axis", "pendulum", "C", "--columns", "u=u"), "pendulum"),
         (("single-axis", "drive", "C", "--columns", "force"), "force"),
     ],
@@ -211,7 +213,7 @@ def test_files_that_say_little_are_refused_in_one_line(campaign, flat, tmp_path,
 
 def test_what_the_file_does_not_say_may_be_said(flat, tmp_path):
     out = tmp_path / "c.h5"
-    done = avis("convert", str(flat[0]), str(out), "--period", "5", "--unit-y", "mV", "--rig", "avis")
+    done = avis("convert", str(flat[0]), "--out", str(out), "--period", "5", "--unit-y", "mV", "--rig", "avis")
     assert done.returncode == 0, done.stderr
     with h5py.File(out) as file:
         record = file["records/00"]

@@ -95,9 +95,10 @@ def test_a_design_for_this_rig(tmp_path):
     ("arguments", "said"),
     [
         (("rig", "OUT", "--mounts", "5"), "mounts = 5: expected 3 or 4"),
-        (("rig", "OUT", "--mass", "-3"), "mass_kg = -3.0: expected a finite number, greater than zero"),
+        (("rig", "OUT", "--mass", "-3"), "--mass = -3.0: expected a finite number, greater than zero"),
         (("rig", "OUT", "--size", "1, 2"), "--size = '1, 2': expected 3 numbers"),
-        (("rig", "OUT", "--size", "1500, 1000, 500"), "expected three positive lengths in metres"),
+        (("rig", "OUT", "--size", "1500, 1000, 500"), "did you mean [1.5, 1, 0.5] (given in mm)?"),
+        (("rig", "OUT", "--mass", "500000"), "avis: --mass = 500000.0: "),
         (("rig", "OUT", "--name", 'a"b'), "expected a name without quotes"),
         (("rig", "OUT", "--geophone", "RESP.absent"), "RESP.absent"),
         (("rig", "OLD"), "this file exists"),

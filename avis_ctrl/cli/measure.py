@@ -191,7 +191,8 @@ def simulate_campaign(
 
 def convert(
     source: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5, .mat, UFF 58, CSV or a folder of CSV")],
-    out: Annotated[Path, typer.Argument(metavar="CAMPAIGN.h5")],
+    file: Annotated[Path | None, typer.Argument(metavar="CAMPAIGN.h5", help="file to write; the same as --out")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")] = None,
     columns: Annotated[
         str | None,
         typer.Option(
@@ -214,7 +215,12 @@ def convert(
     from avis_ctrl.measurement.formats.hdf5 import write_campaign, write_frequency_response
     from avis_ctrl.study.files import require_other
 
-    require_other(out, source)
+    target = out or file
+    if target is None:
+        raise InputError("missing; expected the file to write", field="--out")
+    if file is not None and out is not None:
+        raise InputError(f"expected one file to write; {file} is named, too", field="--out", value=str(out))
+    require_other(target, source)
     console = Console(highlight=False)
     measured = read_measurements(
         source,
@@ -223,16 +229,16 @@ def convert(
         **known_hints(period_s, excitation, sample_rate_Hz, unit_y),
     )
     if isinstance(measured, Campaign):
-        write_campaign(out, measured)
+        write_campaign(target, measured)
         for note in in_short(measured.notes):
             console.print(note)
         console.print(
-            f"{out}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
+            f"{target}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
             f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz"
         )
     else:
-        write_frequency_response(out, measured)
+        write_frequency_response(target, measured)
         console.print(
-            f"{out}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
+            f"{target}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
             f"inputs, {len(measured.outputs)} outputs"
         )

@@ -32,19 +32,46 @@ def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], 
         try:
             check(ctx, str(param.name), value)
         except InputError as error:
+            error = _with_options(ctx, error)
             if ctx.get_parameter_source(str(param.name)) is None:  # typed at the prompt: its source is set later
                 raise typer.BadParameter(str(error)) from None
-            raise
+            raise error from None
         return value
 
     # [kg] in a help text would be markup.
     return typer.Option(flag, prompt=question, help=question.replace("[", r"\["), callback=checked)
 
 
-def _check_rig(ctx: typer.Context, name: str, value: Any) -> None:
-    from avis_ctrl.study.new_files import NewRig, rig_text
+def _with_options(ctx: typer.Context, error: InputError) -> InputError:
+    """The error with the option instead of the field, which the user does not know."""
+    option = next((one.opts[0] for one in ctx.command.params if one.name == error.field), error.field)
+    return InputError(error.expected, file=error.file, field=option, value=error.value)
 
-    rig_text(replace(NewRig(), **_rig_fields({name: value})))
+
+RIG = (
+    "name",
+    "mass_kg",
+    "size_m",
+    "mounts",
+    "vertical_Hz",
+    "horizontal_Hz",
+    "damping",
+    "constant_N_per_V",
+    "limit_V",
+    "geophone",
+    "sample_rate_Hz",
+)
+
+
+def _check_rig(ctx: typer.Context, name: str, value: Any) -> None:
+    from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
+
+    new = replace(NewRig(), **_rig_fields({name: value}))
+    try:
+        rig_text(new)
+    except InputError:
+        rig_of(new)  # the same error, with the likely unit error
+        raise
 
 
 def _rig_fields(given: dict[str, Any]) -> dict[str, Any]:
@@ -59,6 +86,7 @@ def _rig_fields(given: dict[str, Any]) -> dict[str, Any]:
 
 @app.command()
 def rig(
+    ctx: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="RIG.toml", help="file to write", callback=_absent)],
     name: Annotated[str, _asked("--name", "Name of the table", _check_rig)] = "my_table",
     mass_kg: Annotated[float, _asked("--mass", "Mass of the payload [kg]", _check_rig)] = 500.0,
@@ -80,27 +108,12 @@ def rig(
     from avis_ctrl.files import write_whole
     from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
-    text = rig_text(
-        NewRig(
-            **_rig_fields(
-                {
-                    "name": name,
-                    "mass_kg": mass_kg,
-                    "size_m": size_m,
-                    "mounts": mounts,
-                    "vertical_Hz": vertical_Hz,
-                    "horizontal_Hz": horizontal_Hz,
-                    "damping": damping,
-                    "constant_N_per_V": constant_N_per_V,
-                    "limit_V": limit_V,
-                    "geophone": geophone,
-                    "sample_rate_Hz": sample_rate_Hz,
-                }
-            )
-        )
-    )
-    modes = rig_of(text).equations_of_motion().natural_frequencies().frequencies_Hz
-    write_whole(out, text.encode())
+    new = NewRig(**_rig_fields({field: ctx.params[field] for field in RIG}))
+    try:
+        modes = rig_of(new).equations_of_motion().natural_frequencies().frequencies_Hz
+    except InputError as error:
+        raise _with_options(ctx, error) from None
+    write_whole(out, rig_text(new).encode())
     print(
         f"{out}: natural frequencies {', '.join(f'{f:.3g}' for f in sorted(modes))} Hz. The mounts stand below the "
         "centre of mass, so horizontal motion is coupled with rocking.\n"

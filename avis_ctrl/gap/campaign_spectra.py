@@ -17,6 +17,7 @@ from avis_ctrl.identification.campaign_fit import (
     measured_noise,
     of_one_level,
 )
+from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
@@ -76,7 +77,8 @@ def divide(campaign: Campaign) -> Halves:
         return Halves(
             campaign.only(rest),
             campaign.only(tuple(sorted(chosen))),
-            f"records {', '.join(sorted(chosen))}; another record of the same level is fitted",
+            f"record{'s' * (len(chosen) > 1)} {listed(sorted(chosen))} (for each, another record of the same level is "
+            "fitted)",
         )
     parts = [_parted(record) for record in driven]
     quiet = tuple(record for record in campaign.records if record not in driven)

@@ -13,6 +13,7 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.priors import Tolerance
 
 Verdict = Literal["none", "explained", "partly explained", "unexplained"]
+AXES = ("x", "y", "z")
 VERDICTS: tuple[str, ...] = get_args(Verdict)
 
 
@@ -58,17 +59,38 @@ class NamedEffect:
         }
 
     def in_words(self) -> str:
-        """Title with place, probability, and the first parameters that differ from zero by two standard deviations;
-        differences between single mounts appear only in the table."""
-        own = [(name, p) for name, p in self.parameters.items() if not name.startswith("uneven_")]
-        certain = [(name, p) for name, p in own if not (p.std or 0.0) > abs(p.value) / 2]
-        sizes = ", ".join(f"{spoken(name, p.unit)} {p}" for name, p in (certain or own)[:3])
+        """Title with place, probability, and the first three quantities that differ from zero by two standard
+        deviations, then direction and position; differences between single mounts appear only in the table. The
+        components of a vector are one quantity.
+        """
+        groups: dict[str, list[tuple[str, Reported]]] = {}
+        for name, p in self.parameters.items():
+            if not name.startswith("uneven_"):
+                words = spoken(name, p.unit)
+                stem, _, axis = words.rpartition(" ") if words[-2:].strip() in AXES else (words, "", "")
+                groups.setdefault(stem, []).append((axis, p))
+        # A component of these may well be zero.
+        direction, position = groups.pop("direction", []), groups.pop("", [])
+        certain = {
+            stem: kept
+            for stem, group in groups.items()
+            if (kept := [(axis, p) for axis, p in group if not (p.std or 0.0) > abs(p.value) / 2])
+        }
+        told = dict(list((certain or groups).items())[:3])
+        if direction:
+            told["direction"] = direction
+        if known := [(axis, p) for axis, p in position if p.std and np.isfinite(p.std)]:
+            told["line of action through" if direction else "position"] = known
+        sizes = ", ".join(
+            f"{stem} {', '.join(f'{axis} {p}'.lstrip() for axis, p in group)}" for stem, group in told.items()
+        )
         ties = (
             f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"
             if self.indistinguishable_from
             else ""
         )
-        return f"{self.title} ({self.name}, {self.location}: {sizes}; probability {self.probability:.2f}{ties})"
+        where = f"{self.name}, {self.location}{': ' * bool(sizes)}{sizes}"
+        return f"{self.title} ({where}; probability {self.probability:.2f}{ties})"
 
 
 def missed(reported: Sequence[NamedEffect]) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -83,7 +83,14 @@ class RecordHeader:
         if not (np.isfinite(period_s) and period_s > 0):
             raise InputError("expected a positive period in s", field=field, value=period_s)
         count = period_s * self.sample_rate_Hz
-        if abs(count - round(count)) > 1e-6 * count or round(count) < 2:
+        if round(count) < 2:
+            raise InputError(
+                f"expected at least two samples in a period; at {self.sample_rate_Hz:g} Hz it is {count:.6g}; is the "
+                "sample rate, or the unit of the time stamps, right?",
+                field=field,
+                value=period_s,
+            )
+        if abs(count - round(count)) > 1e-6 * count:
             raise InputError(
                 f"expected a whole number of samples; at {self.sample_rate_Hz:g} Hz it is {count:.6g}",
                 field=field,
@@ -123,14 +130,16 @@ def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
         yield start, samples if left <= longest + 1 else start + longest
 
 
-def require_finite(array: np.ndarray, names: Sequence[str], field: str, start: int = 0) -> None:
-    """Raise InputError for NaN or Inf in (samples, channels), with the sample number from the start of the record."""
+def require_finite(
+    array: np.ndarray, names: Sequence[str], field: str | None, place: Callable[[int], str] = "sample {}".format
+) -> None:
+    """Raise InputError for NaN or Inf in (samples, channels). place : of a row (from 0) in words, for the message."""
     good = np.isfinite(array)
     if not good.all():
         row, column = np.argwhere(~good)[0]
         raise InputError(
-            f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at sample "
-            f"{start + row} of channel {names[column]}",
+            f"expected finite numbers; NaN or infinite: {np.count_nonzero(~good)}, the first at {place(int(row))} "
+            f"of channel {names[column]}",
             field=field,
             value=float(array[row, column]),
         )

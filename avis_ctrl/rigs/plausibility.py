@@ -21,7 +21,8 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, Modes
 from avis_ctrl.rigs.unit_slips import Entry, G, Place, UnitError, apart, entries, unit_errors
 
-Build = Callable[[dict[str, Any]], Rig]
+Content = dict[str, Any]
+Build = Callable[[Content], Rig]
 Judge = Callable[..., None]
 ALIKE = ("constant_N_per_V", "sensitivity_Vs_per_m", "sensitivity_Vs2_per_m", "sensitivity_V_per_m")
 
@@ -32,8 +33,10 @@ class SlipCost:
 
     scope : times the squared scope (`UnitError.scope`). rank : per position in the list of likely wrong units.
     off_centre : if all properties of the table are at the ends of their usual ranges. apart : if the corrected numbers
-    are a decade from the others of the same unit and section. near : a second field is named if its cost is within this
-    of the best. better : an unusual rig is taken for a slip if the correction reduces the cost below this fraction.
+    are a decade from the others of their kind (`unit_slips.apart`). near : a second field is named if its cost is
+    within this of the best. near_unit : the same for another unit of the same numbers; less than `rank`, so that the
+    usual wrong unit is named alone where nothing else decides. better : an unusual rig is taken for a slip if the
+    correction reduces the cost below this fraction.
     """
 
     scope: float = 0.02
@@ -41,6 +44,7 @@ class SlipCost:
     off_centre: float = 1.0
     apart: float = 0.1
     near: float = 0.05
+    near_unit: float = 0.03
     better: float = 0.3
 
 
@@ -68,35 +72,48 @@ class Property:
     value: Any = None
 
 
-def plausible(content: dict[str, Any], build: Build, ranges: PlausibleRanges = RANGES) -> str:
+Properties = Callable[[Content], list[Property]]
+
+
+def plausible(
+    content: Content,
+    build: Build,
+    ranges: PlausibleRanges = RANGES,
+    written: Callable[[Content], Content] | None = None,
+) -> str:
     """Compare a file's content with the ranges of real tables; return one line on unusual values, empty if none.
 
     Parameters
     ----------
-    content : of the TOML file. build : makes the rig from it, or raises InputError.
+    content : of the TOML file. build : makes the rig from it, or raises InputError. written : if `content` is answers
+        from which a file is written, the content of this file; messages then name the answers.
 
     Raises
     ------
     InputError : the error of `build`, with the likely unit error if there is one; values that no real table has.
     """
+
+    def properties(content: Content) -> list[Property]:
+        of_file = written(content) if written else content
+        return judged(of_file, build(of_file), ranges)
+
     try:
-        rig = build(content)
+        found = properties(content)
     except InputError as error:
-        likely = _likely(content, build, ranges) if _of_numbers(error.value) else []
+        likely = _likely(content, properties) if _of_numbers(error.value) else []
         if not likely:
             raise
         first, words = likely[0], error.expected
         if error.field and not error.field.startswith(first.field):
             words = f"it makes {error.field} invalid ({words})"
         raise InputError(f"{words}; {_asked(likely)}", field=first.field, value=first.value) from None
-    found = judged(content, rig, ranges)
     odd = sorted((one for one in found if one.unusual > 1e-9), key=lambda one: (-one.refused, -one.unusual))
     if not odd:
         return ""
     refused = odd[0].refused > 0
     worst = {one.kind: one for one in reversed(odd) if one.refused > 0 or not refused}
     words = ", ".join([one.words for one in odd if worst.get(one.kind) is one][:2])
-    likely = _likely(content, build, ranges, np.inf if refused else _cost(found))
+    likely = _likely(content, properties, np.inf if refused else _cost(found))
     if not refused:
         hint = f"; {likely[0].field}: {_asked(likely)}" if likely else ""
         return f"unusual for a table: {words}{hint}"
@@ -118,7 +135,10 @@ def _of_numbers(value: Any) -> bool:
 
 def _asked(likely: Sequence[UnitError]) -> str:
     first, *others = likely
-    also = "".join(f", or {one.field} = {_shown(one.meant)} ({one.words})" for one in others[:1])
+    also = "".join(
+        f", or {'' if one.field == first.field else f'{one.field} = '}{_shown(one.meant)} ({one.words})"
+        for one in others[:1]
+    )
     return f"did you mean {_shown(first.meant)} ({first.words}){also}?"
 
 
@@ -128,13 +148,13 @@ def _shown(value: Any) -> str:
     return f"{value:g}"
 
 
-def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now: float = np.inf) -> list[UnitError]:
+def _likely(content: Content, properties: Properties, now: float = np.inf) -> list[UnitError]:
     """Slips whose correction leaves nothing impossible and a cost well below `now`: the best, and one nearly as good.
 
     Single numbers of lists are tried only if something is impossible and no wider slip explains it.
     """
     found: list[tuple[float, UnitError]] = []
-    before, _, _ = _outcome(content, build, ranges)
+    before, _, _ = _outcome(content, properties)
     idle: set[Place] = set()
     for slip in unit_errors(content):
         if slip.one_of_list and (found or np.isfinite(now)):
@@ -142,7 +162,7 @@ def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now:
         if idle.issuperset(entry.place for entry in slip.entries):
             continue
         mended = slip.mended(content)
-        odd, refused, cost = _outcome(mended, build, ranges)
+        odd, refused, cost = _outcome(mended, properties)
         if odd == before:
             # The problem does not depend on these numbers.
             idle.update(entry.place for entry in slip.entries)
@@ -154,23 +174,25 @@ def _likely(content: dict[str, Any], build: Build, ranges: PlausibleRanges, now:
     found.sort(key=lambda one: one[0])
     least, best = found[0]
     places = {entry.place for entry in best.entries}
+    # Another unit of the same numbers, or other numbers.
     others = [
         slip
-        for cost, slip in found
-        if cost <= least + COST.near and not places & {entry.place for entry in slip.entries}
+        for cost, slip in found[1:]
+        if (cost <= least + COST.near and not places & {entry.place for entry in slip.entries})
+        or (cost <= least + COST.near_unit and slip.entries == best.entries)
     ]
     return [best, *others[:1]]
 
 
-def _outcome(content: dict[str, Any], build: Build, ranges: PlausibleRanges) -> tuple[tuple[str, ...], bool, float]:
+def _outcome(content: Content, properties: Properties) -> tuple[tuple[str, ...], bool, float]:
     """Unusual or impossible properties of a content in words; whether it is rejected; its cost."""
     try:
-        properties = judged(content, build(content), ranges)
+        found = properties(content)
     except (InputError, ArithmeticError, np.linalg.LinAlgError) as error:
         return (str(error),), True, np.inf
-    refused = tuple(one.words for one in properties if one.refused)
-    unusual = tuple(one.words for one in properties if one.unusual > 1e-9)
-    return refused or unusual, bool(refused), _cost(properties)
+    refused = tuple(one.words for one in found if one.refused)
+    unusual = tuple(one.words for one in found if one.unusual > 1e-9)
+    return refused or unusual, bool(refused), _cost(found)
 
 
 def _cost(properties: Sequence[Property]) -> float:

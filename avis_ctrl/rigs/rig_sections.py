@@ -30,8 +30,16 @@ class RigLimits:
 
 
 LIMITS = RigLimits()
-Length = Annotated[float, Field(ge=-LIMITS.farthest_m, le=LIMITS.farthest_m)]
-PositiveLength = Annotated[float, Field(gt=0, le=LIMITS.farthest_m)]
+
+
+def _not_far(length: float) -> float:
+    if abs(length) > LIMITS.farthest_m:
+        raise ValueError(f"expected metres, at most {LIMITS.farthest_m:g}")
+    return length
+
+
+Length = Annotated[float, AfterValidator(_not_far)]
+PositiveLength = Annotated[float, Field(gt=0), AfterValidator(_not_far)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
 PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]

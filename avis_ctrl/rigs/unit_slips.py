@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -34,17 +34,18 @@ UNITS: dict[str, tuple[tuple[float, str], ...]] = {
     "_N_per_m": ((KILO, "N/mm"), (1e-3, "mN/m"), (1e6, "N/um"), (175.127, "lbf/in")),
     "_N_per_V": ((KILO, "kN/V"), (1e-3, "mN/V"), (1e-6, "uN/V")),
     "_rms_m_per_s": ((1e-3, "mm/s"), (1e-6, "um/s"), (1e-9, "nm/s"), (INCH, "in/s")),
-    "_m_per_s2_rtHz": ((1e-6, "um/s^2"), (1e-6 * G, "ug"), (1e-3, "mm/s^2"), (1e-9 * G, "ng"), (1e-9, "nm/s^2")),
+    "_m_per_s2_rtHz": ((1e-6 * G, "ug"), (1e-6, "um/s^2"), (1e-3, "mm/s^2"), (1e-9 * G, "ng"), (1e-9, "nm/s^2")),
     "_m_rtHz": ((1e-9, "nm"), (1e-12, "pm"), (1e-6, "um"), (1e-3, "mm")),
-    "_Vs2_per_m": ((1e-3, "mV s^2/m"), (1e-3 / G, "mV/g"), (KILO, "V per mm/s^2"), (1 / G, "V/g")),
+    "_Vs2_per_m": ((1e-3 / G, "mV/g"), (1e-3, "mV s^2/m"), (KILO, "V per mm/s^2"), (1 / G, "V/g")),
     "_Vs_per_m": ((KILO, "V per mm/s"), (1e-3, "mV s/m"), (1 / INCH, "V per in/s")),
     "_V_per_m": ((KILO, "V/mm"), (1e-3, "mV/m"), (1e6, "V/um")),
     "_V": ((1e-3, "mV"), (1e-6, "uV"), (KILO, "kV")),
     "_Hz": ((KILO, "kHz"), (1 / (2 * np.pi), "rad/s"), (1e-3, "mHz"), (1e6, "MHz")),
     "_s": ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns")),
-    "_m": ((1e-3, "mm"), (1e-2, "cm"), (INCH, "in"), (1e-6, "um")),
+    "_m": ((1e-3, "mm"), (1e-2, "cm"), (INCH, "inches"), (1e-6, "um")),
 }
 RATIOS = {
+    "damping": ((1e-2, "per cent"),),
     "suspension_damping": ((1e-2, "per cent"),),
     "compensated_damping": ((1e-2, "per cent"),),
     "preamplifier_gain": ((1e-3, "a thousand times too large"), (KILO, "a thousand times too small")),
@@ -69,8 +70,8 @@ class UnitError:
     """Numbers that were all given in a unit other than that of their key.
 
     field, value : as in messages. factor : to the key's unit. unit : in which they were probably given. rank : position
-    among the slips of the key, the likeliest first. scope : 0 one number, 1 a list, 2 a key, 3 a unit in a section,
-    4 a unit in the whole file.
+    among the slips of the key, the likeliest first. scope : 0 one number, 1 a list, 2 a key or copies of a list,
+    3 a unit in a section or a key in all sections, 4 a unit in the whole file.
     """
 
     field: str
@@ -132,18 +133,23 @@ def unit_of(key: str) -> str:
 
 
 def unit_errors(content: dict[str, Any]) -> Iterator[UnitError]:
-    """All possible single unit errors: in one number, a list, a key, or a unit in a section or in the whole file.
+    """All possible single unit errors: in one number, a list, copies of a list, a key, or a unit in a section or in the
+    whole file.
 
     Single numbers of lists come last.
     """
     found = [entry for entry in entries(content) if entry.value]
-    groups: dict[tuple[Any, ...], list[Entry]] = {}
+    groups: dict[tuple[int, tuple[Any, ...]], list[Entry]] = {}
     for entry in found:
-        numbered = [k for k, part in enumerate(entry.place) if isinstance(part, int)]
-        plain = tuple(part for part in entry.place if not isinstance(part, int))
-        of_list = entry.place[:-1] if numbered and numbered[-1] == len(entry.place) - 1 else entry.place
-        for scope, name in enumerate(
-            (entry.place, of_list, plain, (plain[0], unit_of(entry.key)), (unit_of(entry.key),))
+        plain, unit, together = _plain(entry.place), unit_of(entry.key), _list_place(entry.place)
+        for scope, name in (
+            (0, entry.place),
+            (1, together),
+            (2, plain),
+            (2, (entry.key, str(_at(content, together)))),
+            (3, (plain[0], unit)),
+            (3, (entry.key,)),
+            (4, (unit,)),
         ):
             groups.setdefault((scope, name), []).append(entry)
     seen: set[tuple[Place, ...]] = set()
@@ -154,29 +160,49 @@ def unit_errors(content: dict[str, Any]) -> Iterator[UnitError]:
             continue
         seen.add(places)
         ending = unit_of(members[0].key)
+        # Copies of a list are named one by one, a key of all sections once.
+        fields = [_list_place(place) if scope < 3 and name != _plain(place) else _plain(place) for place in places]
+        field = _row(name if scope == 0 else place for place in fields)
+        value = float(f"{members[0].value:.6g}") if scope == 0 else _first_value(content, members)
         for rank, (factor, unit) in enumerate(RATIOS.get(ending) or UNITS[ending]):
-            field, value = _named(scope, name, members)
             yield UnitError(field, value, tuple(members), factor, unit, rank, scope)
 
 
-def _named(scope: int, name: tuple[Any, ...], members: list[Entry]) -> tuple[str, Any]:
-    values = [float(f"{entry.value:.6g}") for entry in members]
-    if len(set(values)) == 1:
-        values = values[:1]
-    if scope == 0:
-        return dotted(members[0].place), values[0]
-    if scope in (1, 2):
-        shown = values if scope == 1 or len(values) <= 6 else values[:3]
-        return dotted(name), shown if len(shown) > 1 else shown[0]
-    keys = list(
-        dict.fromkeys(dotted(tuple(part for part in entry.place if not isinstance(part, int))) for entry in members)
-    )
-    shown_keys = ", ".join(keys[:3]) + (", ..." if len(keys) > 3 else "")
-    return shown_keys, values[:3] if len(values) > 1 else values[0]
+def _plain(place: Place) -> Place:
+    """The place without numbers of sections and of entries of lists."""
+    return tuple(part for part in place if not isinstance(part, int))
+
+
+def _list_place(place: Place) -> Place:
+    """Place of the list to which a number belongs; of the number itself if it is not in a list."""
+    return place[:-1] if isinstance(place[-1], int) else place
+
+
+def _at(content: Any, place: Place) -> Any:
+    for part in place:
+        content = content[part]
+    return content
+
+
+def _row(places: Iterable[Place]) -> str:
+    names = list(dict.fromkeys(dotted(place) for place in places))
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def _first_value(content: dict[str, Any], members: list[Entry]) -> Any:
+    """The first list of a group, or its numbers if there is none; a single number if they are all equal."""
+    first = _at(content, _list_place(members[0].place))
+    if isinstance(first, list) and len({*first, *(entry.value for entry in members)}) > 1:
+        return [float(f"{value:.6g}") for value in first]
+    of_key = [entry.value for entry in members if _plain(entry.place) == _plain(members[0].place)]
+    shown = [float(f"{value:.6g}") for value in of_key[:3]]
+    return shown if len(set(of_key)) > 1 else shown[0]
 
 
 def apart(slip: UnitError, mended: dict[str, Any]) -> float:
-    """Mean squared distance, in decades, of the corrected numbers from the median of the others of their unit."""
+    """Mean squared distance, in decades, of the corrected numbers from the median of the others of their kind: of the
+    same key anywhere, or of the same unit in the same section.
+    """
     there = {entry.place for entry in slip.entries}
     first = slip.entries[0]
     others = [
@@ -184,8 +210,7 @@ def apart(slip: UnitError, mended: dict[str, Any]) -> float:
         for entry in entries(mended)
         if entry.place not in there
         and entry.value
-        and entry.place[0] == first.place[0]
-        and unit_of(entry.key) == unit_of(first.key)
+        and (entry.key == first.key or (entry.place[0], unit_of(entry.key)) == (first.place[0], unit_of(first.key)))
     ]
     if not others:
         return 0.0

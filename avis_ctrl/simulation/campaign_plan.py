@@ -18,7 +18,8 @@ class RecordPlan(Section):
     """One record, or a set of records at one level.
 
     level_V : r.m.s. of every drive. level_percent : instead, percentage of the largest level at which neither drives
-        nor converter clip on the rig as specified in its file; 50 if neither is given.
+        nor converter clip on the rig as specified in its file; 50 if neither is given. The level depends on the peak of
+        each random signal, so levels of several records are not exactly in the ratio of their percentages.
     records : number of records with different random draws; for an orthogonal multisine, multiplied by the number of
         drives.
     floor_rms_m_per_s : r.m.s. velocity of the shaken floor along each of x, y, z, added to the ambient motion.

@@ -6,6 +6,7 @@ import tomllib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,7 @@ def rig_text(new: NewRig) -> str:
         raise InputError(
             f"expected three positive lengths in metres, at most {LIMITS.farthest_m:g}",
             field="size_m",
-            value=new.size_m,
+            value=list(new.size_m),
         )
     if not new.name.strip() or not new.name.isprintable() or set(new.name) & set('"\\'):
         raise InputError("expected a name without quotes", field="name", value=new.name)
@@ -119,12 +120,21 @@ def rig_text(new: NewRig) -> str:
     )
 
 
-def rig_of(text: str) -> Rig:
-    """The table of a rig file's text. Warns of unusual values; raises InputError for impossible values."""
-    content = tomllib.loads(text)
-    if unusual := plausible(content, rig_from):
+def rig_of(new: NewRig) -> Rig:
+    """The table of a new rig file. Warns of unusual answers.
+
+    Raises
+    ------
+    InputError : answers that no real table has, with the likely unit error; see also `rig_text`.
+    """
+    answers = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(new).items()}
+    if unusual := plausible(answers, rig_from, written=_content):
         warnings.warn(UnusualRig(unusual), stacklevel=2)
-    return rig_from(content)
+    return rig_from(_content(answers))
+
+
+def _content(answers: dict[str, Any]) -> dict[str, Any]:
+    return tomllib.loads(rig_text(NewRig(**answers)))
 
 
 def _row(values: object) -> str:

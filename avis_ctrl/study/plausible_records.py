@@ -40,7 +40,6 @@ class RecordPlausibility:
     rare : penalty added to the distance for an error other than three decades. scope : penalty for an error other than
         a common gain; half of it for a single channel, so that the simplest of similar errors is named.
     like_g : a factor within this many decades of 9.81 is taken for the acceleration of gravity.
-    rate : ratio of the sample rates of records and rig above which one of them is considered wrong.
     """
 
     far: float = 0.30
@@ -58,7 +57,6 @@ class RecordPlausibility:
     rare: float = 0.02
     scope: float = 0.02
     like_g: float = 0.06
-    rate: float = 20.0
 
 
 SETTINGS = RecordPlausibility()
@@ -156,17 +154,6 @@ def check_records(
     ------
     InputError : one line that names the field and the likely error.
     """
-    ratio = measured.sample_rate_Hz / model.rig.sample_rate_Hz
-    if not 1 / settings.rate < ratio < settings.rate:
-        raise InputError(
-            f"the rig file has {model.rig.sample_rate_Hz:g} Hz, {1 / ratio:g} times as much; did you mean "
-            f"{measured.sample_rate_Hz * 1e3:g} (given in kHz)?"
-            if ratio < 1
-            else f"the rig file has {model.rig.sample_rate_Hz:g} Hz; is the rig file's value in kHz, or that "
-            "of the records in mHz?",
-            field="sample_rate_Hz of the records",
-            value=measured.sample_rate_Hz,
-        )
     seen = record_spectra(measured, settings)
     if seen is None:
         return ()

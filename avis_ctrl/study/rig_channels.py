@@ -1,4 +1,4 @@
-"""Match the names of a measurement to those of a rig; errors come with instructions."""
+"""Match the channels and the sample rate of a measurement to those of a rig; errors come with instructions."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from avis_ctrl.rigs.rig import Rig
 
 # Variables whose columns the readers number if they have no names: "y1", "y2", ...
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output")}
+# Relative difference of two sample rates below which they are the same: models of the two agree to this order.
+SAME_RATE = 1e-6
 WHAT = {"u": "actuators", "y": "sensors"}
 
 
@@ -30,8 +32,8 @@ def with_rig_names(
 
     Raises
     ------
-    InputError : channels that the rig does not have. The message explains how to name them and which rig the file
-        names.
+    InputError : channels that the rig does not have; the message explains how to name them and which rig the file
+        names. Records of another sample rate than the rig's.
     """
     of_rig = {"u": tuple(rig.equations_of_motion().actuators), "y": tuple(rig.sensor_rows()[0])}
     if isinstance(measured, FrequencyResponse):
@@ -58,6 +60,7 @@ def with_rig_names(
         raise _refusal(rig, {role: had[role] for role in unknown}, known, of_rig, getattr(measured, "rig", UNNAMED))
     if isinstance(measured, FrequencyResponse):
         return replace(measured, inputs=changes.get("u", measured.inputs), outputs=changes.get("y", measured.outputs))
+    _require_rate(rig, measured)
     if measured.rig == UNNAMED:
         measured = replace(measured, rig=rig.name)
         notes.append(f"the file does not name its rig; assumed to be {rig.name}")
@@ -65,6 +68,23 @@ def with_rig_names(
     records = tuple(with_header(record, **renamed) for record in measured.records) if renamed else measured.records
     new = tuple(note for note in notes if note not in measured.notes)
     return replace(measured, records=records, notes=(*measured.notes, *new))
+
+
+def _require_rate(rig: Rig, measured: Campaign) -> None:
+    """Raise InputError for records that the rig's controller has not sampled: the models hold the drive voltage for a
+    sample of the rig.
+    """
+    found, expected = measured.sample_rate_Hz, rig.sample_rate_Hz
+    ratio = found / expected
+    if abs(ratio - 1) <= SAME_RATE:
+        return
+    if abs(1e3 * ratio - 1) <= SAME_RATE:
+        likely = "are the time stamps in ms (column t [ms]), or is the sample rate in kHz?"
+    elif abs(1e-3 * ratio - 1) <= SAME_RATE:
+        likely = "is the sample rate in mHz, or the rig file's sample_rate_Hz in kHz?"
+    else:
+        likely = "check the time stamps; if the rate is right, change sample_rate_Hz and loop_delay_s of the rig file"
+    raise InputError(f"expected {expected:g} Hz, as in the rig file; {likely}", field="sample_rate_Hz", value=found)
 
 
 def numbered(stem: str, count: int) -> tuple[str, ...]:

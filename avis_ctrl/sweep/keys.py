@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, get_args, get_origin
 
@@ -12,6 +14,17 @@ from pydantic import BaseModel
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.rig import Rig
 
+
+@dataclass(frozen=True)
+class KeySettings:
+    """similar : ratio of matching characters from which a known key is suggested for an unknown one [1]: a typing error
+    leaves more than 0.8, and unrelated keys of the same length share less than half.
+    """
+
+    similar: float = 0.7
+
+
+SETTINGS = KeySettings()
 # Prefixes of a parameter's name: its value, or a factor on the value in the rig file.
 VALUE, FACTOR = "rig.", "rig_factor."
 
@@ -53,14 +66,24 @@ def expanded(key: str, known: Mapping[str, bool], rig: Rig) -> list[str]:
     names = [f"{before}{name}" for before in (VALUE, FACTOR) for name in rig.parameters()]
     if found := [name for name in names if fnmatchcase(name, key)]:
         return found
-    every = [*known, *names]
-    last = {name.rpartition(".")[2]: name for name in reversed(every)}
-    near = [
-        *difflib.get_close_matches(key, every, n=3),
-        *(last[one] for one in difflib.get_close_matches(key.rpartition(".")[2], last, n=2)),
-    ]
-    hint = f"did you mean {' or '.join(dict.fromkeys(near))}?" if near else f"expected one of {', '.join(known)}"
+    if "*" in key:
+        names = [re.sub(r"\d+", "*", name) for name in names]
+    near = _nearest(key, [*known, *names])
+    hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
     raise InputError(f"unknown key; {hint}", field="key", value=key)
+
+
+def _nearest(key: str, every: Sequence[str]) -> list[str]:
+    """At most three names that resemble a key, as a whole or in their last part, the nearest first."""
+
+    def alike(one: str, other: str) -> float:
+        return difflib.SequenceMatcher(None, one, other).ratio()
+
+    last = key.rpartition(".")[2]
+    alikeness = {name: max(alike(key, name), alike(last, name.rpartition(".")[2])) for name in every}
+    # Of names with the same last part, those that resemble the whole key come first.
+    order = sorted(alikeness, key=lambda name: (-alikeness[name] - alike(key, name), name))
+    return [name for name in order if alikeness[name] >= SETTINGS.similar][:3]
 
 
 def with_rig_keys(rig: Rig, point: Mapping[str, Any]) -> Rig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +17,10 @@ from avis_ctrl.gap.result import VERDICTS
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.study import gap as gap_study
 from avis_ctrl.study.gap import GapOptions, find_gap
-from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
+from avis_ctrl.study.new_files import NewRig, rig_text
 
 SIGNALS = {"mains_hum", "sensor_quantisation", "ground_motion"}
 
@@ -94,7 +96,9 @@ def test_a_cable_that_tolerances_imitate_is_named():
     """Values of the rig file up to ten tolerances away leave 0.3 % of the response; starting values found there lead to
     a cable of a few newtons per metre at the wrong place, and to the verdict that nothing is missing."""
     text = rig_text(NewRig("granite", 420.0, (1.2, 0.9, 0.25), 4, 3.0, 2.5))
-    table = rig_of(text.replace("centre_of_mass_m = [0.0, 0.0, 0.0]", "centre_of_mass_m = [0.01, 0.0, 0.03]"))
+    table = rig_from(
+        tomllib.loads(text.replace("centre_of_mass_m = [0.0, 0.0, 0.0]", "centre_of_mass_m = [0.01, 0.0, 0.03]"))
+    )
     records = [{"excitation": "noise", "level_percent": level, "records": 2} for level in (50.0, 25.0, 10.0)]
     cable = {"k_x_N_per_m": 2000.0, "k_z_N_per_m": 4000.0, "damping_s": 0.01, "x_m": 0.5, "y_m": 0.2, "z_m": 0.1}
     plan = {

@@ -10,10 +10,12 @@ from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
 from scipy.linalg import expm
 
+from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.effects.impedance import peaks
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.realisation import realise
+from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import at_the_edge
 from avis_ctrl.gap.starting_values import seeds
@@ -31,6 +33,26 @@ F = np.geomspace(0.3, 90.0, 60)
 PLACE = np.array([0.35, -0.2, 0.3])
 MASS, ZETA = 12.0, 0.04
 ALONG = np.array([2.0, -1.0, 2.0]) / 3
+
+
+def test_the_sentence_gives_place_and_direction_also_where_they_are_zero():
+    """Two certain sizes beside them; a frequency in three axes is one quantity."""
+
+    def said(**parameters):
+        own = {name: Reported(value, std, unit) for name, (value, std, unit) in parameters.items()}
+        return NamedEffect("attached_oscillator", "payload", "a sprung mass", own, 0.99).in_words()
+
+    at = {"x_m": (0.3, 0.002, "m"), "y_m": (0.0, 0.002, "m"), "z_m": (0.2, 0.002, "m")}
+    each = {f"frequency_{axis}_Hz": (f, 0.01, "Hz") for axis, f in zip("xyz", (14.0, 15.0, 22.0), strict=True)}
+    assert said(mass_kg=(8.0, 0.1, "kg"), **each, damping=(0.01, 0.02, "1"), **at) == (
+        "a sprung mass (attached_oscillator, payload: mass 8.00 +- 0.10 kg, frequency x 14.000 +- 0.010 Hz, "
+        "y 15.000 +- 0.010 Hz, z 22.000 +- 0.010 Hz, position x 0.3000 +- 0.0020 m, y 0.0000 +- 0.0020 m, "
+        "z 0.2000 +- 0.0020 m; probability 0.99)"
+    )
+    along = {f"direction_{axis}": (value, 0.01, "1") for axis, value in zip("xyz", (0.0, 0.0, 1.0), strict=True)}
+    assert "direction x 0.000 +- 0.010, y 0.000 +- 0.010, z 1.000 +- 0.010, line of action through x 0.3" in said(
+        mass_kg=(8.0, 0.1, "kg"), **along, **at
+    )
 
 
 def with_effect(name, place, values, model=BARE):

@@ -80,11 +80,20 @@ def shifted(at, by):
 STAMPS = {
     "backwards": (
         np.concatenate([np.arange(100), np.arange(90, 190)]) / 100,
-        r"not later than the one before: 1, the first at data row 101: 0.9 s after 0.99 s",
+        r"not later than the one before: 1, the first at line 102 \(sample 100\): 0.9 s after 0.99 s",
     ),
-    "still": (np.repeat(np.arange(100), 2) / 100, r"not later than the one before: 100, the first at data row 2: "),
-    "gap": (np.delete(np.arange(200), [50, 51, 120]) / 100, r"gaps: 2, the first before data row 51: 0.03 s instead"),
-    "uneven": (shifted(30, 0.003), r"1 are more than 0.1 of a sample off, the worst at data row 31 by 0.3 samples"),
+    "still": (
+        np.repeat(np.arange(100), 2) / 100,
+        r"not later than the one before: 100, the first at line 3 \(sample 1\): ",
+    ),
+    "gap": (
+        np.delete(np.arange(200), [50, 51, 120]) / 100,
+        r"gaps: 2, the first before line 52 \(sample 50\): 0.03 s instead",
+    ),
+    "uneven": (
+        shifted(30, 0.003),
+        r"1 are more than 0.1 of a sample off, the worst at line 32 \(sample 30\) by 0.3 samples",
+    ),
 }
 
 
@@ -157,12 +166,13 @@ def edited(line, text):
 
 
 WRONG = {
-    "text in the middle": (edited(4, "0.75,abc,3"), r"line 5, column A1 = 'abc': expected a number"),
-    "nothing": (edited(4, "0.75,,3"), r"line 5, column A1 = '': expected a number, found nothing"),
+    "text in the middle": (edited(4, "0.75,abc,3"), r"line 5 \(sample 3\), column A1 = 'abc': expected a number"),
+    "nothing": (edited(4, "0.75,,3"), r"line 5 \(sample 3\), column A1 = '': expected a number, found nothing"),
+    "below an empty line": (edited(4, "\n0.75,abc,3"), r"line 6 \(sample 3\), column A1 = 'abc': expected a number"),
     "short line": (edited(3, "0.5,1"), r"line 4 = '0.5,1': expected 3 columns, as in the header; there are 2"),
     "long line": (edited(3, "0,5,1,3"), r"expected 3 columns, as in the header; there are 4"),
-    "second header": (edited(5, GOOD[0]), r"line 6, column t = 't': expected a number"),
-    "nan": (edited(4, "0.75,1,nan"), r"record a: y = nan: .* infinite: 1, the first at sample 3 of channel S1"),
+    "second header": (edited(5, GOOD[0]), r"line 6 \(sample 4\), column t = 't': expected a number"),
+    "nan": (edited(4, "\n0.75,1,nan"), r"NaN or infinite: 1, the first at line 6 \(sample 3\) of channel S1"),
     "no header": ("\n".join(GOOD[1:]), r"line 1 = '0.0,0,0': expected a header line .* found numbers"),
     "only a header": (GOOD[0], r"expected at least two lines of numbers; there are 0"),
     "only comments": ("# a = 1\n# b = 2", r"expected a header line"),
@@ -172,7 +182,7 @@ WRONG = {
     "unit of time": (edited(0, "t [h],A1,S1"), r"unit of t = 'h': expected one of s, sec, ms"),
     "no input": (edited(0, "t,S2,S1"), r"record a: u: expected at least one input"),
     "comment": ("# period_s = long\n" + "\n".join(GOOD), r"comment: period_s = 'long': expected one number"),
-    "period": ("# period_s = 0.3\n" + "\n".join(GOOD), r"expected a whole number of samples; at 4 Hz it is 1.2"),
+    "period": ("# period_s = 0.3\n" + "\n".join(GOOD), r"expected at least two samples in a period; at 4 Hz it is 1.2"),
     "binary": ("\n".join(GOOD) + "\n\0\1\2", r"expected (3 columns|text|HDF5)"),
 }
 

@@ -21,6 +21,7 @@ from avis_ctrl.rigs import rig_file
 from avis_ctrl.rigs.plausibility import UnusualRig, judge_modes, judged, plausible
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion
+from avis_ctrl.study.new_files import NewRig, rig_text
 
 DATA = Path(rig_file.__file__).parent / "data"
 CONTENT = {name: tomllib.loads((DATA / f"{name}.toml").read_text(encoding="utf-8")) for name in ("avis", "halcyonics")}
@@ -110,6 +111,43 @@ def test_a_slip_is_named_in_one_line(rig, place, factor, field, meant):
     said = str(refused.value)
     assert said.startswith(f"{field} = ") and f"did you mean {meant}" in said and "\n" not in said
     assert refused.value.exit_code == 2
+
+
+def own_table() -> dict:
+    """Three mounts, drives and geophones each at its place; the third geophone elsewhere."""
+    content = tomllib.loads(rig_text(NewRig(mounts=3)))
+    content["payload"]["centre_of_mass_m"] = [0.01, 0.0, 0.03]
+    content["geophone"][2]["position_m"] = [0.40, -0.11, -0.05]
+    return content
+
+
+@pytest.mark.parametrize(
+    "places, factor, field, meant",
+    [
+        (["geophone.2.position_m"], 1e2, "geophone[3].position_m = [40.0, ", "[0.4, -0.11, -0.05] (given in cm)"),
+        (
+            ["isolator.*.position_m", "drive.*.position_m", "geophone.*.position_m"],
+            1e2,
+            "isolator.position_m, drive.position_m, geophone.position_m = [-48.0, ",
+            "[-0.48, -0.18, -0.2] (given in cm)",
+        ),
+        slow_case(["drive.*.position_m"], 1e2, "drive.position_m = [-48.0, ", "[-0.48, -0.18, -0.2] (given in cm)"),
+        slow_case(
+            ["isolator.0.position_m", *(f"{kind}.{k}.position_m" for kind in ("drive", "geophone") for k in (0, 1))],
+            1e3,
+            "isolator[1].position_m, drive[1].position_m, drive[2].position_m, ... = [-480.0, ",
+            "[-0.48, -0.18, -0.2] (given in mm)",
+        ),
+    ],
+)
+def test_wrong_positions_are_named(places, factor, field, meant):
+    """One, all in the file (not the centre of mass), all of a kind, copies of one."""
+    content = own_table()
+    for place in places:
+        content = slipped(content, place, factor)
+    with pytest.raises(InputError) as refused:
+        plausible(content, rig_from)
+    assert str(refused.value).startswith(field) and f"did you mean {meant}" in str(refused.value)
 
 
 def isolators(places, stiffness, damping) -> list[dict]:
@@ -238,7 +276,7 @@ def test_what_is_unusual_is_told_and_goes_on(tmp_path):
     with pytest.warns(UnusualRig, match=r"284 Hz.*k_r_Nm_per_rad: did you mean 1590 \(given in N mm/rad\)"):
         assert load_rig(path).k_r == 1.59e6
     path.write_text(text.replace("sensitivity_Vs2_per_m = 1.0", "sensitivity_Vs2_per_m = 1000.0"), encoding="utf-8")
-    with pytest.warns(UnusualRig, match=r"1000 V s\^2/m.*sensitivity_Vs2_per_m: did you mean 1 \(given in mV s"):
+    with pytest.warns(UnusualRig, match=r"1000 V s\^2/m.*sensitivity_Vs2_per_m: did you mean 0.10197 \(given in mV/g"):
         load_rig(path)
 
 

@@ -139,10 +139,6 @@ def test_sensors_that_are_off_by_different_factors_are_told_apart(sound):
             "force constant of A(z2|4): .* did you mean 0.001 times",
         ),
         (lambda m: changed(m, y_unit="m/s"), r"^unit of y = 'm/s': .*did you mean V\?"),
-        (
-            lambda m: changed(m, sample_rate_Hz=1.0),
-            r"sample_rate_Hz of the records = 1\.0: .*did you mean 1000 \(given in kHz\)",
-        ),
     ],
 )
 def test_a_slip_of_the_records_is_named(sound, change, said):

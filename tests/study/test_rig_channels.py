@@ -14,9 +14,9 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.study.rig_channels import numbered, with_rig_names
 
 
-def campaign(u_names, y_names, rig="unnamed"):
+def campaign(u_names, y_names, rig="unnamed", rate_Hz=1000.0):
     rng = np.random.default_rng(3)
-    header = RecordHeader("00", 1000.0, 50, tuple(u_names), tuple(y_names), "noise")
+    header = RecordHeader("00", rate_Hz, 50, tuple(u_names), tuple(y_names), "noise")
     return Campaign(rig, (Record(header, rng.normal(size=(50, len(u_names))), rng.normal(size=(50, len(y_names)))),))
 
 
@@ -66,6 +66,15 @@ def test_a_campaign_of_another_rig_says_so_and_both_roles_at_once(rig):
         "not of halcyonics",
     ):
         assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "rate_Hz, said", [(1.0, "time stamps in ms"), (1e6, "sample_rate_Hz in kHz"), (500.0, "change sample_rate_Hz")]
+)
+def test_another_sample_rate_is_refused_before_any_computation(rig, rate_Hz, said):
+    own = campaign(rig.equations_of_motion().actuators, rig.sensor_rows()[0], rate_Hz=rate_Hz)
+    with pytest.raises(InputError, match=f"sample_rate_Hz = {rate_Hz}: expected 1000 Hz, as in the rig file; .*{said}"):
+        with_rig_names(rig, own)
 
 
 def test_frequency_responses_too(rig):

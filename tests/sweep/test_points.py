@@ -141,6 +141,10 @@ def test_the_identity_is_that_of_the_resolved_input(tmp_path):
             "uncertainty.actuator_chains.crossover_Hz",
         ),
         ('base = "small.toml"\n[[vary]]\nkey = "rig.masss"\nvalues = [1]', "did you mean rig.mass"),
+        (
+            'base = "small.toml"\n[[vary]]\nkey = "rig_factr.isolator*.k_z"\nvalues = [1]',
+            "did you mean rig_factor.isolator*.k_z or ",
+        ),
         ('base = "small.toml"\n[[point]]\n"rig.masss" = 1', "did you mean rig.mass"),
         (
             'base = "small.toml"\n[[vary]]\nkey = "rig.mass"\nvalues = [1]\n[[vary]]\nkey = "rig.mass"\nvalues = [2]',

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,7 +22,7 @@ from typing import TextIO
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
+from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource, require_finite
 from avis_ctrl.measurement.formats.common import INPUT_NAME, existing_file, is_number, reading, require_small, within
 from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
@@ -104,7 +104,7 @@ def _lines(stream: TextIO) -> Iterator[str]:
         if len(line) == LONGEST_LINE:
             raise InputError(f"expected lines shorter than {LONGEST_LINE} characters")
         line = line.rstrip("\r\n\x1a").replace('"', "")
-        if any("\udc80" <= letter <= "\udcff" for letter in line):
+        if not line.isascii() and any("\udc80" <= letter <= "\udcff" for letter in line):
             line = line.encode("utf-8", "surrogateescape").decode("latin-1")
         yield line
 
@@ -202,9 +202,12 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
             lines = islice(_lines(stream), layout.lines, None)
         roles = _roles(layout, columns, path)
         use = [k for k, name in enumerate(layout.names) if any(name in names for names in roles.values())]
-        table = _table(lines, layout, use)
+        table, place = _table(lines, layout, use)
     at = {layout.names[k]: i for i, k in enumerate(use)}
     unit = dict(zip(layout.names, layout.units, strict=True))
+    for role, names in roles.items():
+        if role != "t":
+            require_finite(table[:, [at[name] for name in names]], names, None, place)
     parts = {
         role: Part(names, [unit[name] for name in names], table[:, [at[name] for name in names]])
         for role, names in roles.items()
@@ -212,7 +215,7 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
     }
     hints = _with_stated(hints, layout.stated)
     time = roles["t"][0] if roles["t"] else ""
-    rate, start, note = _clock(table[:, at[time]] if time else None, unit.get(time), hints)
+    rate, start, note = _clock(table[:, at[time]] if time else None, unit.get(time), place, hints)
     record, notes = record_from(path.stem, parts, rate, start, hints)
     notes += [f"record {path.stem}: {note}"] if note else []
     unused = [name for k, name in enumerate(layout.names) if k not in use]
@@ -228,12 +231,14 @@ def _with_stated(hints: Hints, stated: dict[str, str]) -> Hints:
         return hints.completed({field: float(text) if is_number(text) else text for field, text in texts.items()})
 
 
-def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[float, float, str]:
+def _clock(
+    time: np.ndarray | None, unit: str | None, place: Callable[[int], str], hints: Hints
+) -> tuple[float, float, str]:
     if time is not None:
         if unit is not None and unit not in TIME_UNITS:
             raise InputError(f"expected one of {', '.join(TIME_UNITS)}", field="unit of t", value=unit)
         factor = TIME_UNITS[unit or "s"]
-        rate, start, note = sample_rate_from(time * factor, lambda sample: f"data row {sample + 1}")
+        rate, start, note = sample_rate_from(time * factor, place)
         return rate if hints.sample_rate_Hz is None else agreed_rate(hints.sample_rate_Hz, rate), start, note
     if hints.sample_rate_Hz is None:
         raise InputError(
@@ -242,9 +247,9 @@ def _clock(time: np.ndarray | None, unit: str | None, hints: Hints) -> tuple[flo
     return hints.sample_rate_Hz, 0.0, ""
 
 
-def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> np.ndarray:
-    """(rows, columns used) numbers, read chunk by chunk."""
-    blocks, row, decimal_comma = [], layout.lines, None
+def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> tuple[np.ndarray, Callable[[int], str]]:
+    """(rows, columns used) numbers, read chunk by chunk; and the place of a row in the file, for messages."""
+    blocks, numbers, row, decimal_comma = [], [], layout.lines, None
     separators = len(layout.names) - 1
     while chunk := list(islice(lines, CHUNK)):
         if decimal_comma is None:
@@ -265,20 +270,22 @@ def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> np.ndarray:
                     value=line[:60],
                 )
         filled = [line for line in chunk if line.strip()]
+        numbers.append(np.array([number for number, line in enumerate(chunk, row + 1) if line.strip()], dtype=int))
         try:
             if filled:
                 blocks.append(np.loadtxt(filled, delimiter=layout.separator, usecols=use, ndmin=2, comments=None))
         except ValueError:
-            raise _misfit(chunk, row, layout, use) from None
+            raise _misfit(chunk, row, sum(map(len, numbers[:-1])), layout, use) from None
         row += len(chunk)
     table = np.concatenate(blocks) if blocks else np.zeros((0, len(use)))
     if len(table) < 2:
         raise InputError(f"expected at least two lines of numbers; there are {len(table)}")
-    return table
+    at = np.concatenate(numbers)
+    return table, lambda sample: f"line {at[sample]} (sample {sample})"
 
 
-def _misfit(chunk: list[str], row: int, layout: Layout, use: list[int]) -> InputError:
-    """Error with the place of the first entry that is not a number."""
+def _misfit(chunk: list[str], row: int, sample: int, layout: Layout, use: list[int]) -> InputError:
+    """Error with the place of the first entry that is not a number. sample : of the first line with numbers."""
     for number, line in enumerate(chunk, row + 1):
         entries = line.split(layout.separator)
         for column in use if line.strip() else ():
@@ -286,7 +293,8 @@ def _misfit(chunk: list[str], row: int, layout: Layout, use: list[int]) -> Input
                 found = entries[column].strip()
                 return InputError(
                     "expected a number" if found else "expected a number, found nothing",
-                    field=f"line {number}, column {layout.names[column]}",
+                    field=f"line {number} (sample {sample}), column {layout.names[column]}",
                     value=found[:40],
                 )
+        sample += bool(line.strip())
     return InputError("expected numbers", field=f"lines {row + 1} to {row + len(chunk)}")

@@ -132,7 +132,7 @@ class Columns:
             )
         if set(self.factors) != {1.0}:
             array *= self.factors
-        require_finite(array, names, field, start)
+        require_finite(array, names, field, lambda row: f"sample {start + row}")
         return array
 
 
