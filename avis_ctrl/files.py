@@ -29,12 +29,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     InputError : a path that cannot be written, or that exists and is not a regular file (a folder, a device).
     ComputationError : the disk is full.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError("cannot be written (it exists and is not a regular file)", file=path)
-        file, name = _opened(path)
-    except OSError as error:
-        raise _refused(path, error) from None
+    file, name = _opened(path)
     try:
         with file:
             yield file
@@ -49,6 +44,14 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         if name is not None:
             with contextlib.suppress(OSError):
                 os.unlink(name)
+
+
+def require_writable(path: Path) -> None:
+    """Raise the errors of `whole_file` before a long computation."""
+    file, name = _opened(path)
+    file.close()
+    if name is not None:
+        os.unlink(name)
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -140,10 +143,15 @@ def _refused(path: Path, error: OSError) -> AvisError:
 
 def _opened(path: Path) -> tuple[BinaryIO, str | None]:
     """A temporary file in the folder of `path`, and its name if it has one."""
-    if hasattr(os, "O_TMPFILE"):
-        with contextlib.suppress(OSError):  # some file systems (NFS, old overlays) do not support files without a name
-            return open(os.open(path.parent, os.O_TMPFILE | os.O_RDWR, 0o600), "w+b"), None
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError("cannot be written (it exists and is not a regular file)", file=path)
+        if hasattr(os, "O_TMPFILE"):
+            with contextlib.suppress(OSError):  # some file systems (NFS, old overlays) do not support nameless files
+                return open(os.open(path.parent, os.O_TMPFILE | os.O_RDWR, 0o600), "w+b"), None
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise _refused(path, error) from None
     return open(descriptor, "w+b"), name
 
 

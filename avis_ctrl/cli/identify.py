@@ -178,12 +178,12 @@ def predict(
     from rich.console import Console
     from rich.table import Table
 
-    from avis_ctrl.study.files import require_other
+    from avis_ctrl.study.files import require_output
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.prediction_file import compared, prediction_errors
 
-    require_other(out, campaign)
+    require_output(out, campaign)
     console = Console(highlight=False)
     if is_axis_gap(folder):
         several = write_axis_predictions(folder, [campaign], out)

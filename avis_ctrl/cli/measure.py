@@ -54,11 +54,14 @@ def excite(
     from rich.table import Table
 
     from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
-    from avis_ctrl.measurement.excitation.files import write_signals
+    from avis_ctrl.measurement.excitation.files import require_suffix, write_signals
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation.campaign_data import largest_level, open_loop
+    from avis_ctrl.study.files import require_output
     from avis_ctrl.study.plan_file import plan_from_table
 
+    require_suffix(out)
+    require_output(out)
     console = Console(highlight=False)
     table = load_rig(rig)
     names, limit_V = table.equations_of_motion().actuators, float(table.drive_limits_V().min())
@@ -147,13 +150,13 @@ def simulate_campaign(
     from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import require_other
+    from avis_ctrl.study.files import require_output
     from avis_ctrl.study.hidden_effects import rehearse_with_effects
     from avis_ctrl.study.plan_file import default_plan, plan_toml, read_plan
 
     for written in (out, write_plan, truth):
         if written is not None:
-            require_other(written, plan, rig, effects)
+            require_output(written, plan, rig, effects)
     if plan and (perturbed or orthogonal):
         raise InputError(
             "these belong to the default plan; in a plan, write perturb_percent under [truth] and scheme "
@@ -213,14 +216,14 @@ def convert(
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.measurement.formats.hdf5 import write_campaign, write_frequency_response
-    from avis_ctrl.study.files import require_other
+    from avis_ctrl.study.files import require_output
 
     target = out or file
     if target is None:
         raise InputError("missing; expected the file to write", field="--out")
     if file is not None and out is not None:
         raise InputError(f"expected one file to write; {file} is named, too", field="--out", value=str(out))
-    require_other(target, source)
+    require_output(target, source)
     console = Console(highlight=False)
     measured = read_measurements(
         source,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.files import FULL, not_written
+from avis_ctrl.files import FULL, not_written, require_writable
 
 
 def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
@@ -56,12 +56,14 @@ def output_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequen
         raise
 
 
-def require_other(out: Path, *inputs: Path | str | None) -> None:
-    """Raise InputError if the output file is one of the input files: a measurement is never overwritten."""
+def require_output(out: Path, *inputs: Path | str | None) -> None:
+    """Raise InputError if the file cannot be written, or is one of the input files: a measurement is never
+    overwritten."""
     for one in inputs:
         with contextlib.suppress(OSError):
             if one is not None and out.samefile(one):
                 raise InputError("expected a file other than the input file", field="--out", value=str(out))
+    require_writable(out)
 
 
 def as_json(value: dict[str, Any]) -> bytes:

@@ -250,8 +250,8 @@ def test_what_is_read_is_never_written(tmp_path):
     (tmp_path / "link.h5").symlink_to(campaign)
     for out in (campaign, tmp_path / "link.h5", tmp_path / "." / "campaign.h5"):
         with pytest.raises(InputError, match="other than the input file"):
-            folders.require_other(out, "avis", None, campaign)
-    folders.require_other(tmp_path / "new.h5", campaign, None, "avis")
+            folders.require_output(out, "avis", None, campaign)
+    folders.require_output(tmp_path / "new.h5", campaign, None, "avis")
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):

@@ -18,6 +18,12 @@ SUFFIXES = (".h5", ".hdf5", ".csv", ".mat")
 MAT5_BYTES = 2**31
 
 
+def require_suffix(path: Path) -> None:
+    """Raise InputError if the name of the file does not end in one of the formats."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"expected a file name that ends in {', '.join(SUFFIXES)}", file=path)
+
+
 def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1, rig: str = "") -> None:
     """Write all records; a multisine is repeated `periods` times.
 
@@ -33,8 +39,7 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
     ComputationError : the disk is full; an existing file is then unchanged.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"expected a file name that ends in {', '.join(SUFFIXES)}", file=path)
+    require_suffix(path)
     if not isinstance(periods, (int, np.integer)) or periods < 1 or (periods > 1 and signals.period_s is None):
         raise InputError(
             "expected a whole number, 1 or more (noise is not periodic: 1)", field="periods", value=periods
