@@ -7,6 +7,7 @@ campaign is stored, for effects that depend on time.
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -212,11 +213,9 @@ def effect_at(model: TableModel, name: str, place: str | None, field: str) -> tu
     """
     known: dict[str, Effect] = {**library(), LargeMotion.name: LargeMotion()}
     if name not in known:
-        raise InputError(
-            f"expected one of {', '.join(library())}; load an effect of your own with --effects FILE.py",
-            field=f"{field}.name",
-            value=name,
-        )
+        near = [f"did you mean {one}?" for one in difflib.get_close_matches(name, known, n=1)]
+        every = f"expected one of {', '.join(library())}; load an effect of your own with --effects FILE.py"
+        raise InputError(" ".join([*near, every]), field=f"{field}.name", value=name)
     places = known[name].places(model)
     if place is None and len(places) == 1:
         place = places[0]

@@ -184,12 +184,28 @@ def read_json(path: Path, form: str, expected: str = "a file of avis design") ->
 
 
 def _read(path: Path, parse: Callable[[str], Any], language: str, expected: str) -> Any:
+    text = ""
     try:
         # Editors on Windows may start a file with a byte-order mark.
-        return parse(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        return parse(text)
     except FileNotFoundError:
         raise InputError(f"no such file; expected {expected}", file=path) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}; expected {expected}", file=path) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"expected a {language} file in UTF-8; {' '.join(str(error).split())}", file=path) from None
+        said = " ".join(str(error).split())
+        raise InputError(f"expected a {language} file in UTF-8; {said}{_cause(said, text)}", file=path) from None
+
+
+def _cause(said: str, text: str) -> str:
+    """The line that a parser of TOML complains of, and the usual cause."""
+    at = re.search(r"\(at line (\d+), column (\d+)\)$", said)
+    if at is None:
+        return ""
+    line = text.splitlines()[int(at[1]) - 1].strip()[:60]
+    if re.match(r",\d", text.splitlines()[int(at[1]) - 1][int(at[2]) - 1 :]):
+        return f": {line!r}; write a decimal point, not a comma"
+    if said.startswith("Cannot overwrite a value"):
+        return f": {line!r}; a section that occurs several times is written in double brackets, such as [[record]]"
+    return f": {line!r}"

@@ -80,7 +80,7 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
     rig: AvisTable | Halcyonics
     if "isolator" in content:
         if loaded:
-            raise InputError("a table on isolators has no [load] section", field="load")
+            raise InputError("a table on isolators has no [load] section; use loaded = false", field="load")
         rig = _avis(validated(AvisFile, content))
     elif "suspension" in content:
         rig = _halcyonics(validated(HalcyonicsFile, content), loaded)

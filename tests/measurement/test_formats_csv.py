@@ -173,6 +173,8 @@ WRONG = {
     "long line": (edited(3, "0,5,1,3"), r"expected 3 columns, as in the header; there are 4"),
     "second header": (edited(5, GOOD[0]), r"line 6 \(sample 4\), column t = 't': expected a number"),
     "nan": (edited(4, "\n0.75,1,nan"), r"NaN or infinite: 1, the first at line 6 \(sample 3\) of channel S1"),
+    "spaces": ("t A1 S1\n0 1 2\n1 1 2\n", r"line 1 = .*these are separated by spaces"),
+    "units below": (edited(1, "s,V,V"), r"line 2 \(sample 0\), column t = 's': .* header, such as t \[s\]"),
     "no header": ("\n".join(GOOD[1:]), r"line 1 = '0.0,0,0': expected a header line .* found numbers"),
     "only a header": (GOOD[0], r"expected at least two lines of numbers; there are 0"),
     "only comments": ("# a = 1\n# b = 2", r"expected a header line"),

@@ -158,6 +158,8 @@ def test_files_that_are_no_rigs(tmp_path):
     cases = {
         "absent.toml": (None, "one of"),
         "broken.toml": ("mass = = 3", "TOML"),
+        "comma.toml": ("a = 1\nmass = 3,5", "'mass = 3,5'; write a decimal point"),
+        "single.toml": ("[isolator]\n[[isolator]]", "is written in double brackets"),
         "empty.toml": ("", "sections"),
         "other.toml": ("[motor]\nx = 1", "sections"),
         "deep.toml": ("x = " + "[" * 5000, "TOML"),

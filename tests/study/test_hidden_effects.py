@@ -88,6 +88,7 @@ def test_a_plan_with_effects_is_written_as_it_is_read(tmp_path):
     ("effect", "said"),
     [
         ({"name": "gremlins"}, r"effect\[1\].name.*gremlins.*cubic_stiffness"),
+        ({"name": "cable_stifness"}, r"effect\[1\].name.*: did you mean cable_stiffness\? expected one of"),
         ({"name": "sensor_gain", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz2"),
         ({"name": "sensor_gain", "place": "Sz9", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz9"),
         ({"name": "loop_delay", "values": {"delay": 1.0}}, r"effect\[1\].values.*extra_delay_s.*0 to 0.2 s"),

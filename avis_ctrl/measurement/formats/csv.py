@@ -118,7 +118,7 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
             key, equals, value = line.strip().lstrip("#").partition("=")
             if equals:
                 stated[key.strip()] = value.strip()
-        elif line.strip():
+        elif line.strip() and not re.fullmatch(r"sep=.", line.strip()):  # Excel's line with the separator
             break
     else:
         raise InputError(f"expected a header line with the names of the columns; there are {count} lines without one")
@@ -170,9 +170,11 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(layout.names) else []
     for role, wanted in (("t", "at most one column"), ("y", "at least one column")):
         if len(roles[role]) > 1 if role == "t" else not roles[role]:
-            if not roles["t"] and not _followed_by_numbers(path, layout):
+            if not roles["t"] and not _followed_by_numbers(path, layout, layout.separator):
                 raise InputError(
-                    "not a measurement file: a text without a header line followed by lines of numbers",
+                    "expected columns separated by commas, semicolons or tabs; these are separated by spaces"
+                    if _followed_by_numbers(path, layout, None)
+                    else "not a measurement file: a text without a header line followed by lines of numbers",
                     field=f"line {layout.lines}",
                     value=", ".join(layout.names)[:60],
                 )
@@ -185,11 +187,11 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
     return roles
 
 
-def _followed_by_numbers(path: Path, layout: Layout) -> bool:
-    """Whether the first non-empty line below the header contains numbers."""
+def _followed_by_numbers(path: Path, layout: Layout, separator: str | None) -> bool:
+    """Whether the first non-empty line below the header contains numbers. separator : None for spaces."""
     with _open(path) as stream:
         below = (line for line in islice(_lines(stream), layout.lines, None) if line.strip())
-        entries = [entry.strip().replace(",", ".") for entry in next(below, "").split(layout.separator)]
+        entries = [entry.strip().replace(",", ".") for entry in next(below, "").split(separator)]
     return any(entries) and all(is_number(entry) for entry in entries if entry)
 
 
@@ -291,8 +293,9 @@ def _misfit(chunk: list[str], row: int, sample: int, layout: Layout, use: list[i
         for column in use if line.strip() else ():
             if not is_number(entries[column]) or "_" in entries[column]:
                 found = entries[column].strip()
+                units = "; units belong into the header, such as t [s]" if sample == 0 and found.isalpha() else ""
                 return InputError(
-                    "expected a number" if found else "expected a number, found nothing",
+                    f"expected a number{units}" if found else "expected a number, found nothing",
                     field=f"line {number} (sample {sample}), column {layout.names[column]}",
                     value=found[:40],
                 )
