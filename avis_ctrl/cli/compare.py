@@ -24,7 +24,7 @@ def compare(
     for title, rows in (("requested differently", found.requested), ("result", found.found)):
         table = Table("", *map(escape, found.titles), title=title)
         for row in rows:
-            table.add_row(*map(escape, row))  # a unit in brackets is no markup
+            table.add_row(*map(escape, row))  # a unit in brackets is not markup
         if rows:
             console.print(table)
     if not found.requested:

@@ -43,7 +43,7 @@ def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], 
 
 
 def _with_options(ctx: typer.Context, error: InputError) -> InputError:
-    """The error with the option instead of the field, which the user does not know."""
+    """The error with the name of the option instead of that of the field."""
     option = next((one.opts[0] for one in ctx.command.params if one.name == error.field), error.field)
     return InputError(error.expected, file=error.file, field=option, value=error.value)
 
@@ -70,7 +70,7 @@ def _check_rig(ctx: typer.Context, name: str, value: Any) -> None:
     try:
         rig_text(new)
     except InputError:
-        rig_of(new)  # the same error, with the likely unit error
+        rig_of(new)  # raises the same error with the likely wrong unit
         raise
 
 

@@ -77,8 +77,8 @@ def divide(campaign: Campaign) -> Halves:
         return Halves(
             campaign.only(rest),
             campaign.only(tuple(sorted(chosen))),
-            f"record{'s' * (len(chosen) > 1)} {listed(sorted(chosen))} (for each, another record of the same level is "
-            "fitted)",
+            f"record{'s' * (len(chosen) > 1)} {listed(sorted(chosen))} (for each of them, another record of the same "
+            "level is fitted)",
         )
     parts = [_parted(record) for record in driven]
     quiet = tuple(record for record in campaign.records if record not in driven)

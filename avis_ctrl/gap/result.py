@@ -69,7 +69,7 @@ class NamedEffect:
                 words = spoken(name, p.unit)
                 stem, _, axis = words.rpartition(" ") if words[-2:].strip() in AXES else (words, "", "")
                 groups.setdefault(stem, []).append((axis, p))
-        # A component of these may well be zero.
+        # Of these all components are given, also those that are zero.
         direction, position = groups.pop("direction", []), groups.pop("", [])
         certain = {
             stem: kept

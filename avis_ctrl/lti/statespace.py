@@ -333,7 +333,7 @@ class StateSpace:
     def from_control(system: Any) -> StateSpace:
         """Convert a python-control StateSpace or TransferFunction."""
         if system.dt is True:
-            raise InputError("expected a sample time in seconds; True leaves it open", field="dt", value=True)
+            raise InputError("expected a sample time in seconds; True leaves it unspecified", field="dt", value=True)
         if not hasattr(system, "A"):
             import control
 
@@ -353,7 +353,7 @@ class StateSpace:
         clock = f"dt = {self.dt:g} s" if self.dt else "continuous"
         poles = self.poles()
         growth = np.abs(poles) - 1 if self.dt else poles.real / np.max(np.abs(poles), initial=1e-300)
-        # Not an integrator, whose pole is known only to round-off.
+        # An integrator does not count as unstable; its pole is known only to round-off.
         unstable = int(np.count_nonzero(growth > 1e-9))
         size = count_of(self.nstates, "state") + (f", {count_of(unstable, 'unstable pole')}" if unstable else "")
         return f"StateSpace({size}, {clock}, {list(self.inputs)} -> {list(self.outputs)})"
@@ -479,8 +479,9 @@ def append(*systems: StateSpace) -> StateSpace:
 
 
 def operand(given: Any) -> StateSpace | None:
-    """Convert a number, a matrix, or a system of this package or python-control to a StateSpace; None for other types
-    and for complex numbers.
+    """Convert a number, a matrix, or a system of this package or python-control to a StateSpace.
+
+    None for other types and for complex numbers.
 
     The types of python-control are recognised by their attributes, because importing the library takes two seconds.
     """

@@ -85,8 +85,8 @@ class RecordHeader:
         count = period_s * self.sample_rate_Hz
         if round(count) < 2:
             raise InputError(
-                f"expected at least two samples in a period; at {self.sample_rate_Hz:g} Hz it is {count:.6g}; is the "
-                "sample rate, or the unit of the time stamps, right?",
+                f"expected at least two samples in a period; at {self.sample_rate_Hz:g} Hz it is {count:.6g}; check "
+                "the sample rate and the unit of the time stamps",
                 field=field,
                 value=period_s,
             )
@@ -133,7 +133,7 @@ def ranges(samples: int, longest: int) -> Iterator[tuple[int, int]]:
 def require_finite(
     array: np.ndarray, names: Sequence[str], field: str | None, place: Callable[[int], str] = "sample {}".format
 ) -> None:
-    """Raise InputError for NaN or Inf in (samples, channels). place : of a row (from 0) in words, for the message."""
+    """Raise InputError for NaN or Inf in (samples, channels). place : gives the place of a row (from 0) in words."""
     good = np.isfinite(array)
     if not good.all():
         row, column = np.argwhere(~good)[0]

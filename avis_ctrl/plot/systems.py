@@ -19,10 +19,10 @@ from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 @dataclass(frozen=True)
 class PlotSettings:
     """samples : number of random systems drawn for an uncertain system: enough to see its range.
-    round_off : a singular value that is at every frequency below this fraction of the largest is zero up to round-off,
-        and is not drawn [1].
-    range_dB : largest range of the magnitude axis below its top [dB]: less than a ten-billionth of the largest value
-        matters to nobody, and would make the rest flat.
+    round_off : a singular value below this fraction of the largest one at every frequency is zero up to round-off, and
+        is not drawn [1].
+    range_dB : largest range of the magnitude axis below its top [dB]: smaller values have no
+        practical meaning, and with them the other curves would look flat.
     """
 
     samples: int = 20
@@ -82,7 +82,7 @@ def bode(
                 bottom.plot(one.f, _phase(one.nominal[:, i, k]), **(line | {"color": colour}))
                 for H in one.samples:
                     faint = FAINT | {"color": _of_samples(colour)}
-                    top.plot(one.f, in_dB(H[:, i, k]), label=_once(top, one, single), **faint)
+                    top.plot(one.f, in_dB(H[:, i, k]), label=_samples_label(top, one, single), **faint)
                     bottom.plot(one.f, _phase(H[:, i, k]), **faint)
     finish(_in_range(top), "", "magnitude [dB]")
     finish(bottom, "frequency [Hz]", "phase [degrees]")
@@ -123,7 +123,7 @@ def sigma(
             colour = _draw(ax, one, in_dB(values[:, k]), None if k else one.label, own, True)
         for H in one.samples:
             for values in in_dB(_singular_values(H)).T:
-                ax.plot(one.f, values, label=_once(ax, one, True), **(FAINT | {"color": _of_samples(colour)}))
+                ax.plot(one.f, values, label=_samples_label(ax, one, True), **(FAINT | {"color": _of_samples(colour)}))
     return finish(_in_range(ax), "frequency [Hz]", "singular values [dB]" if several else "magnitude [dB]")
 
 
@@ -154,12 +154,12 @@ def _curves(system: Any, omega: Any, frequency_Hz: Any, label: Any) -> list[_Cur
     else:
         labels = list(label)
     if not every or len(labels) != len(every):
-        raise InputError(f"expected a system, or a list of systems and as many labels: {len(every)}", field="label")
-    members = [one.nominal if unsure else one for one, unsure in zip(every, uncertain, strict=True)]
+        raise InputError(f"expected at least one system and one label for each; systems: {len(every)}", field="label")
+    members = [one.nominal if is_uncertain else one for one, is_uncertain in zip(every, uncertain, strict=True)]
     grids = _rad_s(omega, frequency_Hz, members)
     found = []
-    for one, member, grid, text, unsure in zip(every, members, grids, labels, uncertain, strict=True):
-        samples = [response_of(each, grid) for each in one.sample(SETTINGS.samples)] if unsure else []
+    for one, member, grid, text, is_uncertain in zip(every, members, grids, labels, uncertain, strict=True):
+        samples = [response_of(each, grid) for each in one.sample(SETTINGS.samples)] if is_uncertain else []
         found.append(_Curves(one, grid / HERTZ, response_of(member, grid), samples, text, alone))
     return found
 
@@ -198,7 +198,7 @@ def _of_samples(colour: Any) -> Any:
     return SAMPLE if colour == NOMINAL else colour
 
 
-def _once(ax: Any, one: _Curves, single: bool) -> str | None:
+def _samples_label(ax: Any, one: _Curves, single: bool) -> str | None:
     """Label of the first of the random samples of a single uncertain system."""
     words = f"{len(one.samples)} random samples"
     return words if single and one.alone and words not in ax.get_legend_handles_labels()[1] else None

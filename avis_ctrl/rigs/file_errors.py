@@ -199,7 +199,7 @@ def _read(path: Path, parse: Callable[[str], Any], language: str, expected: str)
 
 
 def _cause(said: str, text: str) -> str:
-    """The line that a parser of TOML complains of, and the usual cause."""
+    """The line in which the TOML parser found an error, and the usual cause; empty if it names no line."""
     at = re.search(r"\(at line (\d+), column (\d+)\)$", said)
     if at is None:
         return ""

@@ -35,7 +35,7 @@ class SlipCost:
     off_centre : if all properties of the table are at the ends of their usual ranges. apart : if the corrected numbers
     are a decade from the others of their kind (`unit_slips.apart`). near : a second field is named if its cost is
     within this of the best. near_unit : the same for another unit of the same numbers; less than `rank`, so that the
-    usual wrong unit is named alone where nothing else decides. better : an unusual rig is taken for a slip if the
+    most usual wrong unit alone is named if nothing else decides. better : an unusual rig is taken for a slip if the
     correction reduces the cost below this fraction.
     """
 
@@ -85,8 +85,9 @@ def plausible(
 
     Parameters
     ----------
-    content : of the TOML file. build : makes the rig from it, or raises InputError. written : if `content` is answers
-        from which a file is written, the content of this file; messages then name the answers.
+    content : of the TOML file. build : makes the rig from it, or raises InputError. written : if `content`
+        holds the answers from which a file is written: the content of this file for given answers. Messages then name
+        the answers.
 
     Raises
     ------

@@ -34,7 +34,7 @@ LIMITS = RigLimits()
 
 def _not_far(length: float) -> float:
     if abs(length) > LIMITS.farthest_m:
-        raise ValueError(f"expected metres, at most {LIMITS.farthest_m:g}")
+        raise ValueError(f"expected a length in metres, at most {LIMITS.farthest_m:g}")
     return length
 
 

@@ -95,8 +95,8 @@ class Plant:
 def as_plant(P: Any, nmeas: Signals, ncon: Signals) -> tuple[StateSpace, int, int]:
     """The generalized plant with y and u last, and their numbers; InputError for a wrong partition.
 
-    P : an avis_ctrl or python-control system; of an `UncertainSystem` the nominal one. nmeas, ncon : numbers, or names
-    of the measurements and controls, which become the last signals in this order.
+    P : an avis_ctrl or python-control system; of an `UncertainSystem` the nominal system is used.
+    nmeas, ncon : numbers, or names of the measurements and controls, which become the last signals in this order.
     """
     if isinstance(P, UncertainSystem):
         P = as_system(P.nominal).renamed(P.inputs, P.outputs)

@@ -106,7 +106,7 @@ def hinfsyn(
     Parameters
     ----------
     P : StateSpace (avis_ctrl or python-control) from (w, u) to (z, y), u and y last; of an `UncertainSystem` the
-        nominal system is taken (`musyn` takes its uncertainty into account).
+        nominal system is used (`musyn` takes its uncertainty into account).
     nmeas, ncon : number of measurements y and of controls u; or their names, wherever they stand in P.
     backoff : relative distance of the controller from the optimum.
     tolerance : relative width to which the optimum is bracketed.

@@ -50,7 +50,7 @@ def mixed_sensitivity(G: Any, W_S: Any = None, W_KS: Any = None, W_T: Any = None
     ----------
     G : plant (avis_ctrl or python-control), continuous or sampled; of an `UncertainSystem` the nominal system is taken.
     W_S, W_KS, W_T : weights (systems, filters, numbers), with one channel for all signals, or with one input per
-        signal (`matrix([[W, 0], [0, V]])`); None omits the term. W1, W2 and W3 are accepted as names, too.
+        signal (`matrix([[W, 0], [0, V]])`); None omits the term. The names W1, W2 and W3 are accepted, too.
     options : options of `hinfsyn`.
 
     Raises
@@ -96,7 +96,7 @@ def _weights(options: dict[str, Any], **weights: Any) -> dict[str, Any]:
                 f"unknown; expected the weights W_S, W_KS, W_T, or options of hinfsyn: {', '.join(known)}", field=key
             )
         if weights[name] is not None:
-            raise InputError(f"given twice: {key} is {name}", field=name)
+            raise InputError(f"given twice: {key} is another name of {name}", field=name)
         weights[name] = options.pop(key)
     return weights
 
@@ -105,7 +105,7 @@ def _for(weight: Any, n: int, name: str) -> StateSpace:
     W = as_system(weight, name)
     if not W.is_stable():
         raise InputError(
-            "expected a stable weight: move poles on the imaginary axis slightly to its left",
+            "expected a stable weight: move poles on the imaginary axis slightly into the left half-plane",
             field=name,
             value=f"poles {np.array2string(W.poles(), precision=4)}",
         )
@@ -113,5 +113,7 @@ def _for(weight: Any, n: int, name: str) -> StateSpace:
         return append(*[W] * n)
     if W.ninputs != n:
         wanted = f"1 or {n} inputs" if n > 1 else "1 input"
-        raise InputError(f"expected {wanted}, one for each signal", field=name, value=f"a weight with {W.ninputs}")
+        raise InputError(
+            f"expected {wanted}, one for each signal", field=name, value=f"a weight with {W.ninputs} inputs"
+        )
     return W

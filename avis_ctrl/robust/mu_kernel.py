@@ -25,9 +25,9 @@ class PathSettings(NamedTuple):
     reach : fraction of the distance to the boundary by which lambda decreases in one step: values closer to 1 need
         fewer steps, but more Newton steps for each.
     first, shrink : first trial of that distance, relative to its lower bound, and the factor to the next trial.
-    newton, steps : maximum number of Newton steps to a centre, and of centres; neither is reached in practice. Skewed
-        bounds with real and repeated blocks at low frequency need up to 250 centres; with 60 some were four times too
-        large.
+    newton, steps : maximum number of Newton steps to a centre, and of centres; neither is reached in practice. Bounds
+        of skewed mu with real and repeated blocks need up to 250 centres at low frequency; limited to 60, some were
+        four times too large.
     """
 
     central: float = 0.3

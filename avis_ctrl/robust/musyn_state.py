@@ -161,8 +161,8 @@ def analysed(
 ) -> PointwiseScalings:
     """mu and the best scalings of the loop F_l(P, K) at each frequency [rad/s], and at resonances where mu is higher.
 
-    gamma : norm of the scaled loop. mu exceeds it nowhere: if the peak on the grid is as high, no peak was missed.
-    Otherwise mu is computed at the resonances of this loop, too, because between them it changes little.
+    gamma : norm of the scaled loop, which mu exceeds at no frequency. If the peak on the grid is as high, no peak was
+    missed. Otherwise mu is also computed at the resonances of this loop; between them it changes little.
     """
     closed = lft_lower(P, K)
     points = PointwiseScalings.of(omega, closed.frequency_response(omega), structure)

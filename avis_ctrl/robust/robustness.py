@@ -70,8 +70,8 @@ class WorstCaseGain(MuPeak):
 
 @dataclass(frozen=True)
 class RobustnessSettings:
-    """beside : frequency that stands for 0, relative to the slowest pole, and inverse of that for infinity relative to
-        the fastest one [1]: the response there differs by this fraction.
+    """beside : frequency used instead of 0, relative to the slowest pole; its inverse is used instead of
+        infinity, relative to the fastest pole [1]: the response there differs by this fraction.
     real : imaginary part, relative to delta, below which delta is taken as real at 0 and infinity [1]: the phase that
         the search leaves undetermined, since the gain depends on its square.
     """
@@ -208,7 +208,7 @@ def worst_values(peak: MuPeak, P: StateSpace, structure: BlockStructure, element
     """`delta` by name: numbers for real blocks, systems of constant norm for complex ones."""
     if peak.delta is None:
         return {}
-    # No real system is complex at frequency 0 or infinity: such a delta is attained beside them.
+    # The response of a real system is real at 0 and infinity; a complex delta is therefore realised close to them.
     sizes = np.abs(continuous_image(P).poles())
     sizes = sizes[sizes > 0] if np.any(sizes) else np.ones(1)
     at = image_frequency(peak.omega, P.dt)
@@ -224,7 +224,7 @@ def worst_values(peak: MuPeak, P: StateSpace, structure: BlockStructure, element
             delta: Any = float(np.real(value))
         else:
             delta, one = value, ComplexFull(block.rows, block.cols) if block.kind == "full" else ComplexScalar()
-            with contextlib.suppress(ComputationError):  # a full block that is not a dyad
+            with contextlib.suppress(ComputationError):  # a full block of rank above one
                 delta = realise_delta(np.atleast_2d(value), omega, [one], P.dt)
         worst[name] = elements[name].value(delta) if name in elements else delta
     return worst

@@ -140,7 +140,7 @@ def _reduced(
 
 def peak_of_loop(closed: StateSpace, blocks: BlockStructure, omega: np.ndarray, goal: float = 0.0) -> float:
     """Largest upper bound of mu at given frequencies [rad/s] and at the resonances of this loop, where it may be
-    higher: a reduction can remove the damping of a mode. Only an upper bound of this if below the goal."""
+    higher: a reduction can remove the damping of a mode. A result below `goal` is only an upper bound of this."""
     M = closed.frequency_response(np.concatenate([omega, resonances(closed.poles())]))
     return float(np.max(upper_bound(M[:, None], blocks, SETTINGS.accuracy, goal).beta))
 

@@ -217,7 +217,7 @@ class DesignResult:
 
     loop : the sampled loop of all axes: companion loops, simulation, and the cause if it is unstable.
     failed : controllers for comparison that could not be designed or analysed. by_axis : mu against skyhook.
-    limits : sentences on what limits mu, and with mu above 1 on what would help.
+    limits : sentences on the limiting bounds and uncertainties, and with mu above 1 on what would help.
     """
 
     design: Design

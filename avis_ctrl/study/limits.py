@@ -1,6 +1,6 @@
-"""The bounds and uncertainties that limit mu, and what a design with mu above 1 would need.
+"""The limiting bounds and uncertainties at the peak of mu, and how far a design with mu above 1 misses its bounds.
 
-Everything is computed: mu with one bound or uncertainty left out, or one bound wider.
+Every statement is computed: mu without one bound or uncertainty, or with one bound relaxed.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from avis_ctrl.uncertainty.weights import ControlEffort, TransmissibilityBound
 class LimitSettings:
     """worth : fraction of mu by which it must fall without a bound or uncertainty for this to be named; less changes
         no decision.
-    most : number of uncertainties that are named; the first few are the ones to reduce.
+    most : largest number of uncertainties that are named; the first ones are worth reducing.
     idle : a controller whose mu is within this fraction of the passive table's mu is regarded as doing nothing.
     large_spread : uncertainty of an identified response [1] above which a better measurement is recommended.
     accuracy : relative accuracy of mu squared, small compared with `worth`.
-    widest_dB : largest relaxation of a bound that is tried; more would be no bound.
-    halvings : of the interval 0 to widest_dB; eight give 0.2 dB.
+    widest_dB : largest relaxation of a bound that is tried; with more, it would no longer be a bound.
+    halvings : number of bisections of the interval from 0 to widest_dB; eight give 0.2 dB.
     """
 
     worth: float = 0.02
@@ -51,7 +51,7 @@ BOUNDS = {"transmissibility bound": "e_", "control effort bound": "effort_", "co
 
 
 def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
-    """Sentences: where mu peaks, and which bounds and uncertainties limit it there."""
+    """Sentences: where mu peaks, and which bounds and uncertainties are limiting there."""
     if mu.K is None or np.isnan(mu.mu.omega):
         return ""
     P, omega = plant.synthesis, mu.mu.omega
@@ -71,24 +71,24 @@ def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
         peak = mu_peak(*without[name], slack=SETTINGS.worth)
         most = min(peak.upper, mu.mu.upper)
         text += (
-            f" There the {name}{_part(plant, name, omega)} limits it: without this bound mu would be {value:.3g} at "
-            f"this frequency, and at most {most:.3g} over all frequencies, at {_hertz(peak.omega)}."
+            f" The limiting bound there is the {name}{_part(plant, name, omega)}: without it, mu would be {value:.3g} "
+            f"at this frequency, and its peak would be at most {most:.3g}, at {_hertz(peak.omega)}."
         )
         others = [f"the {name} ({value:.3g} without it)" for value, name in bounds[1:]]
-        text += f" Also {listed(others)}." if others else ""
+        text += f" Also limiting: {listed(others)}." if others else ""
     if shares:
         named = [f"{name} ({value:.3g} without it)" for value, name in shares[: SETTINGS.most]]
-        text += f" Uncertainties that raise it most there: {listed(named)}."
+        text += f" The largest contributions of uncertainties there: {listed(named)}."
     if not bounds and not shares:
         text += (
-            f" No single bound or uncertainty limits it there: without any one of them it falls by less than "
+            f" No single bound or uncertainty is limiting there: without any one of them, mu falls by less than "
             f"{100 * SETTINGS.worth:g} %."
         )
     return text
 
 
 def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult]) -> str:
-    """Sentences on a design with mu above 1: what was reached, what limits it, and what would help.
+    """Sentences on a design with mu above 1: what was achieved, what is limiting, and what would help.
 
     This proves that nothing better exists only if the bounds cannot be met without uncertainty. Otherwise the synthesis
     may have stopped early, which the sentences then state.
@@ -119,8 +119,10 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
 
 
 def _not_even_nominal(plant: DesignPlant) -> str:
-    """Proof that no controller meets the bounds even without uncertainty, and how far they would have to be relaxed;
-    empty if there is no such proof."""
+    """Proof that no controller meets the bounds even without uncertainty, and how far they would have to be relaxed.
+
+    Empty if there is no such proof.
+    """
     nominal = plant.synthesis.nominal()
     try:
         least = hinfsyn(nominal.P, nominal.nmeas, nominal.ncon).gamma_optimal_bounds[0]
@@ -139,7 +141,7 @@ def _not_even_nominal(plant: DesignPlant) -> str:
 
     return (
         f"No controller can meet these bounds, even without uncertainty: the smallest H-infinity norm that a "
-        f"controller reaches with the nominal plant is {least:.3g}, which must be below 1. "
+        f"controller can achieve for the nominal plant is {least:.3g}, and it must be below 1. "
         + _enough("Without uncertainty they can be met", _wider(plant, met))
     )
 
@@ -164,20 +166,23 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
     if M.size and (smaller := _least_dB(lambda factor: below_one(range(P.blocks.n_z), factor))) is not None:
         ways.append(f"all uncertainties are reduced to {100 * 10 ** (-smaller / 20):.0f} % of their size")
     return (
-        _enough("At the computed frequencies this controller meets it", ways)
-        + f" It is also enough to divide every uncertainty by {mu.mu.upper:.3g} and to relax every bound by "
+        _enough("At the computed frequencies this controller meets the specification", ways)
+        + f" It is also sufficient to divide every uncertainty by {mu.mu.upper:.3g} and to relax every bound by "
         f"{20 * np.log10(mu.mu.upper):.1f} dB."
     )
 
 
 def _wider(plant: DesignPlant, met: Callable[[str, float], bool]) -> list[str]:
-    """For each bound that is enough alone: how far it must be relaxed. met : whether a bound wider by a factor is."""
+    """How far each bound must be relaxed, for the bounds of which one is sufficient.
+
+    met : whether the specification is met with this bound relaxed by this factor.
+    """
     found = [(name, _least_dB(partial(met, name))) for name in _bounds(plant)]
     return [f"the {name} is relaxed by {value:.1f} dB" for name, value in found if value is not None]
 
 
 def _least_dB(met: Callable[[float], bool]) -> float | None:
-    """Smallest relaxation [dB] with which the bounds are met, by bisection; None if the widest is not enough."""
+    """Smallest relaxation [dB] with which the bounds are met, by bisection; None if the largest is not sufficient."""
     low, high = 0.0, SETTINGS.widest_dB
     if not met(10 ** (high / 20)):
         return None
@@ -189,8 +194,8 @@ def _least_dB(met: Callable[[float], bool]) -> float | None:
 
 def _enough(said: str, ways: list[str]) -> str:
     if not ways:
-        return "Relaxing a single bound is not enough."
-    return f"{said} if {listed(ways, 'or if')}{', each alone' if len(ways) > 1 else ''}."
+        return "Relaxing a single bound is not sufficient."
+    return f"{said} if {listed(ways, 'or if')}{' (one of these is sufficient)' if len(ways) > 1 else ''}."
 
 
 def _bounds(plant: DesignPlant) -> list[str]:
@@ -238,7 +243,7 @@ def _part(plant: DesignPlant, name: str, omega: float) -> str:
         if name == "control effort bound" and isinstance(weight, ControlEffort):
             # Below this frequency the weight is raised to bound the voltage for the offset.
             offset = omega < 2 * np.pi * weight.offset_corner_Hz * weight.offset
-            return " (here on the voltage for the offset of the electronics, offset_percent)" if offset else ""
+            return " (offset_percent: the drive voltage that the offset of the electronics needs)" if offset else ""
     return ""
 
 

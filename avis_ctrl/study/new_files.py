@@ -125,7 +125,7 @@ def rig_of(new: NewRig) -> Rig:
 
     Raises
     ------
-    InputError : answers that no real table has, with the likely unit error; see also `rig_text`.
+    InputError : answers that no real table has; the message names the likely unit error. See also `rig_text`.
     """
     answers = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(new).items()}
     if unusual := plausible(answers, rig_from, written=_content):

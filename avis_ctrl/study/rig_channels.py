@@ -13,7 +13,7 @@ from avis_ctrl.rigs.rig import Rig
 
 # Variables whose columns the readers number if they have no names: "y1", "y2", ...
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output")}
-# Relative difference of two sample rates below which they are the same: models of the two agree to this order.
+# Relative difference below which two sample rates are taken as the same: the models then agree to this order.
 SAME_RATE = 1e-6
 WHAT = {"u": "actuators", "y": "sensors"}
 
@@ -71,8 +71,8 @@ def with_rig_names(
 
 
 def _require_rate(rig: Rig, measured: Campaign) -> None:
-    """Raise InputError for records that the rig's controller has not sampled: the models hold the drive voltage for a
-    sample of the rig.
+    """Raise InputError for records of another sample rate: in the models the drive voltage is held for one sample
+    period of the rig.
     """
     found, expected = measured.sample_rate_Hz, rig.sample_rate_Hz
     ratio = found / expected

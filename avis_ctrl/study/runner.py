@@ -80,7 +80,7 @@ INITIAL = {
 }
 # Steps other than those of D-K iteration, by their kind.
 STEPS = {
-    "start": "D-K iteration anew from constant scalings",
+    "start": "D-K iteration restarted from constant scalings",
     "descent": "descent on gamma over the scalings",
     "growth": "descent on gamma, scalings of higher order",
 }

@@ -100,12 +100,12 @@ def refuse_unstable(result: DesignResult) -> None:
 
 
 def _relaxed(result: DesignResult, moving: Sequence[str]) -> str:
-    """What to change if the design's controller itself makes a plant unstable. moving : axes of that motion."""
+    """What to change if the designed controller itself makes a plant unstable. moving : axes of the unstable motion."""
     mu = result.controller("mu")
     if not mu.stability.upper < 1:
         return (
-            f"the specification asks for too much: mu of the controller is {mu.mu.upper:.3g}, not below 1; relax the "
-            "bound that limits it, or reduce the uncertainty, as the last sentences of the result say"
+            f"the specification is too demanding: mu of the controller is {mu.mu.upper:.3g} and must be below 1; relax "
+            "the limiting bound or reduce the uncertainty (the last sentences of the output name them)"
         )
     if outside := [axis for axis in moving if axis not in result.design.keep]:
         return f"add {listed(outside)} to keep in the design file, or reduce the bandwidth"

@@ -17,8 +17,8 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True)
 class KeySettings:
-    """similar : ratio of matching characters from which a known key is suggested for an unknown one [1]: a typing error
-    leaves more than 0.8, and unrelated keys of the same length share less than half.
+    """similar : smallest fraction of matching characters with which a known key is suggested for an unknown one [1]:
+    it is above 0.8 after a typing error, and below 0.5 for unrelated keys of the same length.
     """
 
     similar: float = 0.7
@@ -76,14 +76,14 @@ def expanded(key: str, known: Mapping[str, bool], rig: Rig) -> list[str]:
 def _nearest(key: str, every: Sequence[str]) -> list[str]:
     """At most three names that resemble a key, as a whole or in their last part, the nearest first."""
 
-    def alike(one: str, other: str) -> float:
+    def similarity(one: str, other: str) -> float:
         return difflib.SequenceMatcher(None, one, other).ratio()
 
     last = key.rpartition(".")[2]
-    alikeness = {name: max(alike(key, name), alike(last, name.rpartition(".")[2])) for name in every}
+    similar = {name: max(similarity(key, name), similarity(last, name.rpartition(".")[2])) for name in every}
     # Of names with the same last part, those that resemble the whole key come first.
-    order = sorted(alikeness, key=lambda name: (-alikeness[name] - alike(key, name), name))
-    return [name for name in order if alikeness[name] >= SETTINGS.similar][:3]
+    order = sorted(similar, key=lambda name: (-similar[name] - similarity(key, name), name))
+    return [name for name in order if similar[name] >= SETTINGS.similar][:3]
 
 
 def with_rig_keys(rig: Rig, point: Mapping[str, Any]) -> Rig:

@@ -330,12 +330,11 @@ def _coefficients(given: Any, field: str) -> list[UncertainSystem]:
     every = list(given) if isinstance(given, (list, tuple, np.ndarray)) else [given]
     if any(isinstance(one, (list, tuple)) for one in every):
         raise InputError(
-            "expected one input and one output: a matrix of uncertain transfer functions is matrix([[tf(...), ...]])",
-            field=field,
+            "expected one input and one output; for several, use matrix([[tf(...), ...], ...])", field=field
         )
     found = [as_uncertain(one) for one in every]
     if any(one.shape != (1, 1) or one.nstates for one in found):
-        raise InputError("expected numbers and uncertain numbers", field=field, value=repr(given))
+        raise InputError("expected coefficients that are numbers or uncertain numbers", field=field, value=repr(given))
     while found and not found[0].uncertain and not found[0].d.item():
         found = found[1:]
     if not found and field == "denominator":

@@ -122,7 +122,7 @@ class UncertainSystem:
 
     @property
     def _plain(self) -> bool:
-        """A matrix or number without names of its own."""
+        """Whether this is a matrix or number with default names."""
         return not self.nstates and self._unnamed
 
     @property

@@ -121,7 +121,7 @@ def uncertainty_weight(
         difference = response_of(one, omega, f"response {k}")
         if difference.shape != G.shape:
             raise InputError(
-                f"expected responses of shape {G.shape[1:]} (a measured one as control.frd(response, omega))",
+                f"expected responses of shape {G.shape[1:]} (give a measured one as control.frd(response, omega))",
                 field=f"response {k}",
                 value=difference.shape[1:],
             )

@@ -217,7 +217,7 @@ def test_a_string_is_one_name_and_a_number_closes_each_channel(rng):
     assert (one.inputs, one.outputs, one.dt) == (("force",), ("x",), 0.1) and one.is_stable()
 
 
-def test_a_sample_time_that_is_open_is_refused():
+def test_an_unspecified_sample_time_is_refused():
     with pytest.raises(InputError, match="expected a sample time in seconds"):
         StateSpace.from_control(control.tf([1.0], [1.0, -0.5], True))
 

@@ -115,7 +115,7 @@ def test_a_list_of_systems_is_drawn_over_one_another():
         mixed = np.ravel(draw([fast, control.frd(LAG, OMEGA), control.tf([0.1], [1.0, -0.9], 0.1)]))[0]
         np.testing.assert_allclose(curve(mixed, 1)[0], OMEGA / (2 * np.pi))
         assert curve(mixed, 2)[0][-1] <= 5.0 < curve(mixed, 0)[0][-1]
-        with pytest.raises(InputError, match="as many labels: 2"):
+        with pytest.raises(InputError, match="one label for each; systems: 2"):
             draw([slow, fast], label=["a"])
         with pytest.raises(InputError, match=r"a list, bode\(\[G, H\]\)"):
             draw(slow, fast)

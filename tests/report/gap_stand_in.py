@@ -169,7 +169,7 @@ def explained(campaign: Campaign) -> Gap:
             "and (−11.9 ± 0.2) mm along y; probability above 99.9 %.",
             "The held-out records confirm it at both levels.",
         ),
-        "records 04 and 05 (for each, another record of the same level is fitted)",
+        "records 04 and 05 (for each of them, another record of the same level is fitted)",
         1,
         41.5,
         np.diag((1e-3 * np.maximum(np.abs(updated.values), 1e-3)) ** 2) if n else None,

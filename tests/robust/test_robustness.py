@@ -153,9 +153,9 @@ def test_weights_under_the_names_of_mixsyn(names):
     ("options", "words"),
     [
         ({"W_S": W_P, "w4": 1.0}, "w4: unknown; expected the weights W_S, W_KS, W_T, or options of hinfsyn: backoff"),
-        ({"W_S": W_P, "W1": 1.0}, "given twice: W1 is W_S"),
+        ({"W_S": W_P, "W1": 1.0}, "given twice: W1 is another name of W_S"),
         ({"W_S": np.ones((1, 2))}, "a weight with 2.*expected 1 input"),
-        ({"W_S": control.tf([1.0], [1.0, 0.0])}, "W_S.*slightly to its left"),
+        ({"W_S": control.tf([1.0], [1.0, 0.0])}, "W_S.*into the left half-plane"),
         ({"W_S": real("k", 1.0, percent=5) * W_P}, r"its nominal system is .nominal"),
         ({}, "at least one weight"),
     ],

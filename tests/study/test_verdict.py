@@ -99,7 +99,7 @@ def test_without_bounds_none_are_said_to_hold():
 @pytest.mark.parametrize(
     ("stability", "moving", "advice"),
     [
-        (1.66, ("z", "phi_x"), "asks for too much: mu of the controller is 3.59"),
+        (1.66, ("z", "phi_x"), "too demanding: mu of the controller is 3.59"),
         (0.8, ("z", "x", "phi_y"), "add x and phi_y to keep"),
         (0.8, ("z", "phi_x"), "reduce the bandwidth, or use a higher sample rate"),
     ],

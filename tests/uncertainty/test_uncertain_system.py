@@ -381,7 +381,7 @@ def test_names_of_products_are_those_of_certain_systems():
     assert (back.inputs, back.outputs, back.states) == (G.inputs, G.outputs, G.states)
 
 
-def test_an_attribute_of_members_says_where_it_is():
+def test_an_attribute_of_certain_systems_is_refused_with_a_hint():
     with pytest.raises(AttributeError, match=r"use \.nominal\.poles"):
         _ = named_plant().poles
 

@@ -293,7 +293,7 @@ def _misfit(chunk: list[str], row: int, sample: int, layout: Layout, use: list[i
         for column in use if line.strip() else ():
             if not is_number(entries[column]) or "_" in entries[column]:
                 found = entries[column].strip()
-                units = "; units belong into the header, such as t [s]" if sample == 0 and found.isalpha() else ""
+                units = "; units belong in the header, such as t [s]" if sample == 0 and found.isalpha() else ""
                 return InputError(
                     f"expected a number{units}" if found else "expected a number, found nothing",
                     field=f"line {number} (sample {sample}), column {layout.names[column]}",

@@ -24,7 +24,7 @@ def bounds(result: DesignResult) -> Section:
             lambda c: c.mu,
             "mu, performance",
             "mu of the weighted performance",
-            "Below 1 (dashed line) every plant of the uncertainty set meets every bound.",
+            "If it is below 1 (dashed line) at all frequencies, every plant of the uncertainty set meets every bound.",
         ),
         _figure(
             "mu_stability",
@@ -51,7 +51,7 @@ def certificate(result: DesignResult) -> list[Paragraph]:
         "guaranteed, although the grid was refined near every local peak."
     )
     reached = (
-        f" The lower bound is reached: within {words.number(1 / mu.lower)} times the declared uncertainty there is a "
+        f" The lower bound is attained: within {words.number(1 / mu.lower)} times the declared uncertainty there is a "
         f"plant whose weighted gain is {words.bound(mu.lower)}."
         if np.isfinite(mu.lower) and mu.lower > 0
         else ""
@@ -133,8 +133,8 @@ def _worst(result: DesignResult) -> Table:
             rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
     return table(
         "The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
-        "perturbations of mu have the size 1/mu: if mu is below 1 they are larger than the declared uncertainty. Those "
-        "of the transmissibility are within it.",
+        "perturbations of mu have the size 1/mu: if mu is below 1, they are larger than the declared uncertainty. "
+        "Those of the transmissibility are within it.",
         ("worst case of", "reaches", "at", "perturbation"),
         rows,
         "lrrl",

@@ -72,7 +72,7 @@ def synthesis(result: DesignResult) -> Section:
             table(
                 'The iterations. Kind: "H-infinity", "nominal" (plant without uncertainty) and "given" (a controller '
                 "for comparison) are initial controllers. Each later step is an H-infinity synthesis with scalings D: "
-                '"D-K" fits them to the last loop, "start" begins anew with the best constant ones, "descent" changes '
+                '"D-K" fits them to the last loop, "start" restarts from the best constant ones, "descent" changes '
                 'them so that gamma falls, "growth" does so with scalings of higher order. Fit: by how much '
                 "the rational scalings D(s) raise the bound, compared with the best scalings at each frequency. The "
                 "controller with the smallest mu is used.",

@@ -31,8 +31,8 @@ def verdict(result: DesignResult) -> Section:
             table(
                 "Requirements of the design and the results of the mu controller. Values in dB are the largest "
                 "singular value from floor to payload, rotations as displacement of the edge; the band is "
-                f"{low:g} to {high:g} Hz. The offset's row: DC voltage of a drive if every sensor channel has the "
-                "largest offset that follows from the rig file, with the worst signs.",
+                f"{low:g} to {high:g} Hz. The row of the offset is the DC voltage of a drive if every sensor channel "
+                "has the largest offset that follows from the rig file, with the worst signs.",
                 ("requirement", "verdict", "result", "limit"),
                 rows,
                 "lcrr",
@@ -67,8 +67,8 @@ def _asked(result: DesignResult, judged: bool) -> Paragraph:
         f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
         f"{result.rig.name}. It must stabilise {members}. The transmissibility must be at most "
         f"{design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and at most "
-        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies; the synthesis uses these bounds as weight."
-        + (" The table has the requirements of the design file:" if judged else "")
+        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies; the synthesis uses them as weights."
+        + (" The table lists the requirements of the design file:" if judged else "")
     )
 
 
@@ -77,8 +77,8 @@ def _achieved(result: DesignResult) -> str:
     low, high = result.design.transmissibility.band_Hz
     if mu.stable and mu.stability.lower >= 1:
         return (
-            f"A plant of the uncertainty set makes the loop unstable: mu of the uncertainty alone is at least "
-            f"{words.bound(mu.stability.lower)} with the mu controller, so there is no worst-case transmissibility."
+            f"With the mu controller, the loop is unstable for a plant of the uncertainty set: mu of the uncertainty "
+            f"alone is at least {words.bound(mu.stability.lower)}. So there is no worst-case transmissibility."
         )
     if not np.isfinite(mu.worst_peak.upper):
         return (
