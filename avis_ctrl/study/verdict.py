@@ -105,7 +105,7 @@ def _relaxed(result: DesignResult, moving: Sequence[str]) -> str:
     if not mu.stability.upper < 1:
         return (
             f"the specification is too demanding: mu of the controller is {mu.mu.upper:.3g} and must be below 1; relax "
-            "the limiting bound or reduce the uncertainty (the last sentences of the output name them)"
+            "the limiting bound or reduce the uncertainty (named below the table of requirements)"
         )
     if outside := [axis for axis in moving if axis not in result.design.keep]:
         return f"add {listed(outside)} to keep in the design file, or reduce the bandwidth"

@@ -67,4 +67,4 @@ class PointsFile(Section):
 
 def read_points_file(path: Path) -> PointsFile:
     """Read and check a points file. Raises InputError: one line naming file, field, value and what was expected."""
-    return validated(PointsFile, read_toml(path, "a file of points as in docs/sweep.md"), path)
+    return validated(PointsFile, read_toml(path, "a sweep file as in docs/sweep.md"), path)
