@@ -26,6 +26,11 @@ def wrapped(sentence: str) -> str:
     return fill(sentence, SETTINGS.line)
 
 
+def digits_apart(value: float, limit: float, least: int) -> int:
+    """Number of significant digits, from `least` to nine, with which a value does not look equal to its limit."""
+    return next((n for n in range(least, 9) if f"{value:.{n}g}" != f"{limit:.{n}g}"), 9 if value != limit else least)
+
+
 def in_short(value: Any) -> str:
     """A number with five digits, an array as its shape, a long text as its beginning."""
     if isinstance(value, bool) or value is None:

@@ -20,6 +20,7 @@ from avis_ctrl.robust.mu_upper import bound_for_goal, bound_of_peak
 from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.summary import digits_apart
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.weights import ControlEffort, TransmissibilityBound
 
@@ -107,8 +108,8 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
         )
     limits = limiting(plant, mu)
     text = (
-        f"The specification is not met for all plants of the set: mu of the mu controller is {mu.mu.upper:.3g} and "
-        f"must be below 1. {limits} {impossible or _relief(plant, mu)}"
+        f"The specification is not met for all plants of the set: mu of the mu controller is "
+        f"{_above_one(mu.mu.upper)} and must be below 1. {limits} {impossible or _relief(plant, mu)}"
     )
     if spread and RESPONSE in limits:
         text += f" {spread}."
@@ -162,14 +163,24 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
     def met(name: str, factor: float) -> bool:
         return below_one(_rows(plant, name), factor)
 
-    ways = _wider(plant, met) if M.size else []
-    if M.size and (smaller := _least_dB(lambda factor: below_one(range(P.blocks.n_z), factor))) is not None:
+    both = (
+        f"sufficient to divide every uncertainty by {_above_one(mu.mu.upper)} and to relax every bound by "
+        f"{20 * np.log10(mu.mu.upper):.3g} dB."
+    )
+    if not M.size:
+        return f"At the computed frequencies mu is below 1; only its bound between them is not. It is {both}"
+    ways = _wider(plant, met)
+    if (smaller := _least_dB(lambda factor: below_one(range(P.blocks.n_z), factor))) is not None:
         ways.append(f"all uncertainties are reduced to {100 * 10 ** (-smaller / 20):.0f} % of their size")
     return (
         _enough("At the computed frequencies this controller meets the specification", ways)
-        + f" It is also sufficient to divide every uncertainty by {mu.mu.upper:.3g} and to relax every bound by "
-        f"{20 * np.log10(mu.mu.upper):.1f} dB."
+        + f" It is{' also' * bool(ways)} {both}"
     )
+
+
+def _above_one(mu: float) -> str:
+    """mu with three digits, and more if it would otherwise look equal to 1."""
+    return f"{mu:.{digits_apart(mu, 1.0, 3)}g}"
 
 
 def _wider(plant: DesignPlant, met: Callable[[str, float], bool]) -> list[str]:

@@ -11,6 +11,7 @@ from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.summary import digits_apart
 
 
 def first_sentence(result: DesignResult) -> str:
@@ -77,7 +78,8 @@ def requirement_rows(result: DesignResult) -> list[tuple[str, str, str, bool]]:
     for one in result.requirements:
         unit = f" {one.unit}" if one.unit else ""
         limit = "yes" if one.comparison == "is" else f"{one.comparison} {one.limit:.4g}{unit}"
-        rows.append((one.name, limit, f"{one.value:.4g}{unit}" if np.isfinite(one.value) else "-", one.met))
+        digits = 4 if one.met else digits_apart(one.value, one.limit, 4)
+        rows.append((one.name, limit, f"{one.value:.{digits}g}{unit}" if np.isfinite(one.value) else "-", one.met))
     return rows
 
 

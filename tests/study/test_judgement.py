@@ -254,6 +254,15 @@ def test_the_bound_that_limits_mu_is_named_with_mu_without_it(one_axis, measured
     assert 0.99 * without.lower < most < 1.03 * without.upper
 
 
+def test_mu_above_1_only_between_the_frequencies_is_said_to_be_so(one_axis, measured):
+    _, plant = one_axis
+    skyhook = measured["skyhook_classical"]
+    curve = 0.999 * skyhook.mu.upper_curve / np.max(skyhook.mu.upper_curve)
+    text = best_found(plant, replace(skyhook, mu=replace(skyhook.mu, upper=1.00036, upper_curve=curve)), [])
+    assert "mu of the mu controller is 1.0004 and must be below 1" in text
+    assert "At the computed frequencies mu is below 1; only its bound between them is not. It is sufficient to" in text
+
+
 def test_bounds_that_no_controller_meets_are_said_to_be_impossible(shipped):
     """band_dB = -40: the optimum without uncertainty is above 1; relaxed as the sentence says it is 1."""
     design, plant = shipped

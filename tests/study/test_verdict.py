@@ -13,7 +13,7 @@ from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import PlantCheck
 from avis_ctrl.study.design_result import DesignResult, Requirement, Simulated
 from avis_ctrl.study.requirements import check_loop
-from avis_ctrl.study.verdict import all_axes, first_sentence, refuse_unstable
+from avis_ctrl.study.verdict import all_axes, first_sentence, refuse_unstable, requirement_rows
 
 CULPRIT = Culprit("nominal", 1.00016, 0.99, 0.16, ("x", "phi_y"), "companions", ("x", "y"))
 
@@ -28,6 +28,11 @@ def result(plants, culprit=None, asked=()) -> DesignResult:
     loop = Simulated(None, check, None, 1.0, culprit)
     rows = (*check_loop(check), *asked)
     return DesignResult(*(None,) * 5, rows, None, None, loop, {}, 1.0)
+
+
+def test_a_value_beyond_its_limit_does_not_look_equal_to_it():
+    missed = Requirement("mu", 1.0, 1.00036, "", False, "at most")
+    assert requirement_rows(result([], asked=[missed]))[-1] == ("mu", "at most 1", "1.0004", False)
 
 
 def test_an_unstable_loop_comes_before_requirements_that_are_met():

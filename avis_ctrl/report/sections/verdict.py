@@ -12,6 +12,7 @@ from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 from avis_ctrl.study.verdict import all_axes, first_sentence
+from avis_ctrl.summary import digits_apart
 
 
 def verdict(result: DesignResult) -> Section:
@@ -21,7 +22,7 @@ def verdict(result: DesignResult) -> Section:
         (
             r.name,
             Mark("met" if r.met else "NOT MET", r.met),
-            words.quantity(r.value, r.unit),
+            words.quantity(r.value, r.unit, 3 if r.met else digits_apart(r.value, r.limit, 3)),
             f"{r.comparison} {words.quantity(r.limit, r.unit)}",
         )
         for r in result.requirements
