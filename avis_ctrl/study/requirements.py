@@ -93,7 +93,7 @@ def check_requirements(
         "mu_gap_percent": (
             "gap between the bounds of mu at its peak",
             lambda: 100 * (1 - mu.mu.lower / mu.mu.upper),
-            "the lower bound has its perturbation",
+            "the report lists the perturbation that attains the lower bound",
         ),
         "worst_case_peak_transmissibility_dB": (
             "worst-case peak transmissibility",

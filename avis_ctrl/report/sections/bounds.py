@@ -10,6 +10,7 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
 from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table, yes_or_no
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
+from avis_ctrl.summary import digits_apart
 
 Pick = Callable[[ControllerResult], Bound]
 
@@ -41,7 +42,7 @@ def bounds(result: DesignResult) -> Section:
 
 
 def certificate(result: DesignResult) -> list[Paragraph]:
-    """Both bounds of mu, whether the upper bound is guaranteed between the computed frequencies, and what limits mu."""
+    """Both bounds of mu, whether the upper one is guaranteed between the computed frequencies, and what is limiting."""
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
     between = (
@@ -51,14 +52,14 @@ def certificate(result: DesignResult) -> list[Paragraph]:
         "guaranteed, although the grid was refined near every local peak."
     )
     reached = (
-        f" The lower bound is attained: within {words.number(1 / mu.lower)} times the declared uncertainty there is a "
-        f"plant whose weighted gain is {words.bound(mu.lower)}."
+        f" The lower bound is attained: within {words.number(1 / mu.lower, 4)} times the declared uncertainty there is "
+        f"a plant whose weighted gain is {words.bound(mu.lower, 4)}."
         if np.isfinite(mu.lower) and mu.lower > 0
         else ""
     )
     bounds = Paragraph(
         f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
-        f"{words.bound(mu.upper, 4)}, at {words.hertz(mu.omega)}"
+        f"{words.bound(mu.upper, digits_apart(mu.upper, 1.0, 4))}, at {words.hertz(mu.omega)}"
         + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
         + f". If mu is below 1, every plant of the uncertainty set meets every bound. {between}{reached}"
     )

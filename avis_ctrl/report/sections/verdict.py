@@ -66,9 +66,9 @@ def _asked(result: DesignResult, judged: bool) -> Paragraph:
     members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
     return Paragraph(
         f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
-        f"{result.rig.name}. It must stabilise {members}. The transmissibility must be at most "
-        f"{design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and at most "
-        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies; the synthesis uses them as weights."
+        f"{result.rig.name}. It must stabilise {members}. The weight of the synthesis demands a transmissibility "
+        f"of at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and of at most "
+        f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
         + (" The table lists the requirements of the design file:" if judged else "")
     )
 
