@@ -74,7 +74,8 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
     ]
     other = sorted({key.partition(".")[0].partition(":")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
     note = (
-        f"mu of the two cannot be compared: it refers to different {', '.join(other)}; transmissibilities can"
+        "mu of the two cannot be compared, because it depends on what was requested differently "
+        f"({', '.join(other)}); transmissibilities can be compared"
         if other
         else ""
     )
