@@ -75,10 +75,10 @@ def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
             f" The limiting bound there is the {name}{_part(plant, name, omega)}: without it, mu would be {value:.3g} "
             f"at this frequency, and its peak would be at most {most:.3g}, at {_hertz(peak.omega)}."
         )
-        others = [f"the {name} ({value:.3g} without it)" for value, name in bounds[1:]]
+        others = [f"the {name} (mu {value:.3g} without it)" for value, name in bounds[1:]]
         text += f" Also limiting: {listed(others)}." if others else ""
     if shares:
-        named = [f"{name} ({value:.3g} without it)" for value, name in shares[: SETTINGS.most]]
+        named = [f"{name} (mu {value:.3g} without it)" for value, name in shares[: SETTINGS.most]]
         text += f" The largest contributions of uncertainties there: {listed(named)}."
     if not bounds and not shares:
         text += (
