@@ -165,7 +165,7 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
         ways.append(f"all uncertainties are reduced to {100 * 10 ** (-smaller / 20):.0f} % of their size")
     return (
         _enough("At the computed frequencies this controller meets it", ways)
-        + f" It is also enough to divide every uncertainty by {mu.mu.upper:.3g} and to relax every bound by "
+        + f" By its mu it meets it with every uncertainty divided by {mu.mu.upper:.3g} and every bound relaxed by "
         f"{20 * np.log10(mu.mu.upper):.1f} dB."
     )
 
@@ -189,7 +189,7 @@ def _least_dB(met: Callable[[float], bool]) -> float | None:
 
 def _enough(said: str, ways: list[str]) -> str:
     if not ways:
-        return "Relaxing a single bound is not enough."
+        return "Relaxing one bound alone is not enough."
     return f"{said} if {listed(ways, 'or if')}{', each alone' if len(ways) > 1 else ''}."
 
 
