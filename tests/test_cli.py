@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from avis_command import ENVIRONMENT, avis
 
 import avis_ctrl
 from avis_ctrl import cli
@@ -18,18 +19,7 @@ from avis_ctrl.cli.console import StopRequest
 from avis_ctrl.errors import ComputationError, InputError
 
 DESIGNS = Path(__file__).resolve().parents[1] / "designs"
-ONE_THREAD = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
-
-
-def avis(*arguments: str, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", "from avis_ctrl.cli import main; main()", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        env=ONE_THREAD,
-        check=False,
-    )
+ONE_THREAD = os.environ | ENVIRONMENT
 
 
 def of_compiled_code() -> SystemError:

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from test_cli import avis
+from avis_command import avis
 
 from avis_ctrl.measurement.formats import write_campaign
 from avis_ctrl.rigs import load_rig

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import functools
 
+import avis_command
 import numpy as np
 import pytest
 
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.study.design_file import read_study
 
+avis = functools.partial(avis_command.avis, answers="\n" * 12, env={"COLUMNS": "120"})
+
 RESPONSE = "RESP.XX.NS388..SHZ.GS11D.4_5.380.1740.26_2"
-
-
-def avis(*arguments: str, answers: str = "\n" * 12, env: dict[str, str] | None = None) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-c", "import sys; sys.argv[0] = 'avis'\nfrom avis_ctrl.cli import main; main()", *arguments],
-        input=answers,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-        env={**os.environ, "COLUMNS": "120", **(env or {})},
-    )
 
 
 @pytest.mark.parametrize(("mounts", "drives"), [(3, 6), (4, 8)])

@@ -63,5 +63,5 @@ def _verdict(console: Console, result: DesignResult) -> None:
     for *row, met in requirement_rows(result):
         table.add_row(*row, "[green]met[/]" if met else "[red]not met[/]")
     console.print(table)
-    for note in filter(None, (result.limits, *result.notes)):
+    for note in result.remarks:
         console.print(note, markup=False)

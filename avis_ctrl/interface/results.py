@@ -75,7 +75,7 @@ class DesignStudy:
             "  " + "  ".join([name.ljust(widths[0]), limit.rjust(widths[1]), value.rjust(widths[2]), met])
             for name, limit, value, met in rows
         ]
-        return "\n".join([*lines, *map(wrapped, self.result.notes)])
+        return "\n".join([*lines, *map(wrapped, self.result.remarks)])
 
     def _rows(self) -> list[tuple[str, ...]]:
         return [(*row, "met" if met else "not met") for *row, met in requirement_rows(self.result)]

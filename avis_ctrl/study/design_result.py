@@ -237,6 +237,11 @@ class DesignResult:
     limits: str = ""
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """The sentences of `limits`, and the notes."""
+        return tuple(filter(None, (self.limits, *self.notes)))
+
+    @property
     def simulation(self) -> SimulationCheck | None:
         """Simulations of the closed loop with the nonlinear rig, plant by plant; None if nothing was simulated."""
         return self.loop.check if self.loop is not None else None

@@ -389,6 +389,7 @@ def recoveries(folder, package, law, speeds, inside: bool = False) -> np.ndarray
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_recovery_is_never_slower_than_without_anti_windup(shipped, package, gcc):
     """Floor motion of 2 to 20 mm/s, at 20 mm/s 15 times what the drives can follow. The lag that helps the Halcyonics
     design would slow this one, so it is not exported."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import shutil
 import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,15 +16,16 @@ import matplotlib.image
 import numpy as np
 import pytest
 import scipy.io
+from avis_command import avis
 
 from avis_ctrl.export import fewer_states, package
+from avis_ctrl.export.anti_windup import AntiWindupSettings, choose_anti_windup
 from avis_ctrl.export.design_folder import open_design
 from avis_ctrl.export.package import CONTINUOUS, FILES, check_package
 from avis_ctrl.export.sampled_controller import read_controller
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import digital_controller
 
-ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
 CERTIFICATE_KEYS = {
     "format",
     "version",
@@ -66,15 +66,13 @@ CONTROLLER_KEYS = {
 }
 
 
-def avis(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        env=ENVIRONMENT,
-        check=False,
-    )
+@pytest.fixture(scope="module", autouse=True)
+def quick_anti_windup():
+    """Simulations at one level with one record; tests of the certificate have all."""
+    with pytest.MonkeyPatch.context() as patch:
+        few = AntiWindupSettings(levels=(3.0,), records=1)
+        patch.setattr(package, "choose_anti_windup", partial(choose_anti_windup, settings=few))
+        yield
 
 
 @pytest.fixture(scope="module")

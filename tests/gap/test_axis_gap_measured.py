@@ -80,6 +80,7 @@ def test_emps_has_no_delay_and_no_lag(emps):
     assert not {"delay", "actuator_lag", "presliding"} & {one.name for one in (*emps.effects, *emps.traces)}
 
 
+@pytest.mark.slow
 def test_emps_first_half_alone_says_the_same(data):
     mat = {k: v.ravel() for k, v in scipy.io.loadmat(folder(data, "emps/DATA_EMPS.mat")).items() if k[0] != "_"}
     half = slice(None, len(mat["t"]) // 2)
@@ -129,6 +130,7 @@ def silverbox_gap(data):
     )
 
 
+@pytest.mark.slow
 def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
     gap = silverbox_gap
     assert named(gap) == [("cubic_stiffness", "oscillator")] and gap.verdict == "explained"
@@ -145,6 +147,7 @@ def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
     assert silverbox_gap.stages[1].nrmse ** 2 < 0.003 * silverbox_gap.stages[0].nrmse ** 2
 
 
+@pytest.mark.slow
 def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_path):
     path = folder(data, "silverbox/Schroeder80mV.mat")
     (record,), rate = signals_in(
@@ -163,6 +166,7 @@ def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_pa
     assert updated < 0.1 * baseline
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap):
     """Independent of the machine: from rest, u alone, Runge-Kutta in time, on a stretch that no fit has seen."""

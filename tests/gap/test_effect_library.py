@@ -77,18 +77,18 @@ def test_parameters_have_units_ranges_and_a_start_within(name, place):
         assert len(start) == len(parameters)
 
 
-def test_effects_that_a_rig_has_no_place_for_have_none():
+@pytest.mark.parametrize("name", ["halcyonics", pytest.param("halcyonics_loaded", marks=pytest.mark.slow)])
+def test_effects_that_a_rig_has_no_place_for_have_none(name):
     """The Halcyonics has no mounts by name and no geophones."""
-    for name in ("halcyonics", "halcyonics_loaded"):
-        rig = load_rig(name)
-        model = TableModel(ResponseModel.of(rig, ()))
-        for effect in OWN.values():
-            for place in effect.places(model):
-                for one in effect.parameters(model, place):
-                    assert np.all(np.isfinite([one.low, one.high, one.size, *one.grid])), effect.name
-                assert np.all(np.isfinite(with_effect(effect.name, place, None, model).response(OMEGA[:3])))
-        assert not OWN["geophone_corner"].places(model)
-        assert not OWN["mount_surge"].places(model)
+    rig = load_rig(name)
+    model = TableModel(ResponseModel.of(rig, ()))
+    for effect in OWN.values():
+        for place in effect.places(model):
+            for one in effect.parameters(model, place):
+                assert np.all(np.isfinite([one.low, one.high, one.size, *one.grid])), effect.name
+            assert np.all(np.isfinite(with_effect(effect.name, place, None, model).response(OMEGA[:3])))
+    assert not OWN["geophone_corner"].places(model)
+    assert not OWN["mount_surge"].places(model)
 
 
 # --- the model itself

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from avis_command import avis
 from truth.cases import draw_case, rig, simulate_case
 
 from avis_ctrl.errors import InputError
@@ -30,6 +28,7 @@ from avis_ctrl.study.gap import GapOptions, find_gap
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "own_effect.md"
 BARE = TableModel(ResponseModel.of(load_rig("avis"), ()))
 TAU, PLACE = 2e-3, "Sz2"
+WIDE = {"COLUMNS": "200"}
 
 
 @pytest.fixture(autouse=True)
@@ -187,23 +186,11 @@ def test_effects_that_do_not_work_are_said_before_the_search(tmp_path, old, new,
     assert "\n" not in str(error.value)
 
 
-def avis(*arguments):
-    threads = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    return subprocess.run(
-        [sys.executable, "-c", "from avis_ctrl.cli import main; main()", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env=threads,
-        check=False,
-    )
-
-
 def test_the_option_refuses_before_anything_is_read(tmp_path):
     bad = tmp_path / "bad.py"
     bad.write_text("x = 1\n", encoding="utf-8")
     for path in (bad, tmp_path / "missing.py"):
-        done = avis("gap", "no_campaign.h5", "--rig", "avis", "--out", tmp_path / "out", "--effects", path)
+        done = avis("gap", "no_campaign.h5", "--rig", "avis", "--out", tmp_path / "out", "--effects", path, env=WIDE)
         assert done.returncode == 2
         assert done.stderr.startswith(f"avis: {path}: expected ")
         assert done.stderr.count("\n") == 1
@@ -213,7 +200,7 @@ def test_the_option_refuses_before_anything_is_read(tmp_path):
 @pytest.mark.slow
 def test_the_option_finds_the_example(example, tmp_path):
     write_campaign(tmp_path / "c.h5", hidden())
-    done = avis("gap", tmp_path / "c.h5", "--rig", "avis", "--out", tmp_path / "out", "--effects", example)
+    done = avis("gap", tmp_path / "c.h5", "--rig", "avis", "--out", tmp_path / "out", "--effects", example, env=WIDE)
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "out" / "gap.json").read_text(encoding="utf-8"))
     assert [(one["name"], one["location"]) for one in found["effects"]] == [("sensor_lowpass", PLACE)]

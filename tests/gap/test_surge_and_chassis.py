@@ -126,6 +126,7 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
         pytest.param(
             [1045.0, 0.0169, 5.86, 9.06, 7.13, 10.2, 6.64, 8.0, 0.558, 0.435, 0.47, -0.347, -0.243],
             id="beside the suspension's modes",
+            marks=pytest.mark.slow,
         ),
         pytest.param(
             [721.0, 0.0159, 15.6, 13.8, 18.2, 23.3, 16.4, 19.7, 0.382, 0.594, 0.523, -0.513, -0.218],

@@ -223,6 +223,7 @@ def test_eight_drives_played_along_six_axes_are_fitted_like_any(avis, monkeypatc
     assert np.allclose(found.fit.values, true.values, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_records_of_a_rig_with_floor_motion(avis):
     """Three records of 60 s, floor unknown: errors as small as claimed, every one of 20 directions."""
     true = off(ResponseModel.of(avis, [*BODY, *MOUNTS]), 5, 0.05)

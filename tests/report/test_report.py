@@ -16,7 +16,7 @@ from avis_ctrl.report import html as page_of
 from avis_ctrl.report import pdf as paper_of
 from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Mark, Table
+from avis_ctrl.report.pieces import Mark, Paragraph, Table
 from avis_ctrl.study.design_result import Bound, DesignResult
 
 HOSTILE = '</script><script>alert(1)</script> <b>x</b> #panic("y") $ *z* {{ 7*7 }} \\ & "'
@@ -129,6 +129,11 @@ def test_first_words_are_what_is_not_met(fabricated: DesignResult) -> None:
     good = replace(fabricated, requirements=fabricated.requirements[:1])
     first = document(good).sections[0].pieces[0]
     assert first.text.startswith("The requirement is met.") and first.good is True
+
+
+def test_what_limits_mu_is_on_the_summary(fabricated: DesignResult) -> None:
+    told = document(replace(fabricated, limits="mu peaks at 3.2 Hz.")).sections[0]
+    assert any(isinstance(piece, Paragraph) and piece.text == "mu peaks at 3.2 Hz." for piece in told.pieces)
 
 
 def test_the_first_page_is_read_alone(fabricated: DesignResult, html: bytes, pdf: bytes, tmp_path) -> None:

@@ -63,7 +63,7 @@ def test_slope_is_that_of_differences(full, states, most):
         assert slope @ d == pytest.approx(numeric, rel=0.02, abs=1e-3 * np.linalg.norm(slope))
 
 
-@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(full, order):
     P, _, made = full
     *_, step = fixed_order(Task(P, ONE_DRIVE), made.K, order)
@@ -115,7 +115,7 @@ def test_starts_of_fewer_states_are_tried(full):
     assert found.peak <= best.peak * (1 + 1e-6) < alone.peak
 
 
-@pytest.mark.parametrize("most", [1, 2])
+@pytest.mark.parametrize("most", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_added_mode_lowers_the_smoothed_peak(full, most):
     """By AB13MD, from the best controller of one state."""
     P, _, made = full

@@ -141,7 +141,8 @@ def test_scalings_of_one_order_keep_to_the_states_allowed():
     assert min(np.max(norm) for norm in scaled) < 1.02 * np.max(mu)
 
 
-@pytest.mark.parametrize("block", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("block", [0, 1])
 def test_a_block_that_no_loop_goes_through_does_not_matter(block):
     """The signals of one block are cut off: the synthesis ends as that of the column with the other block alone."""
     P = distillation()

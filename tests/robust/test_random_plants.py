@@ -33,6 +33,7 @@ def test_optimum_of_zero(index):
     assert row["gamma"] < 1e-5
 
 
+@pytest.mark.slow
 def test_real_blocks_that_make_one_frequency_singular():
     """A repeated real scalar: mu is zero except at a single frequency, and the bounds are those at this frequency."""
     row = solve(2026, 5019)

@@ -146,6 +146,7 @@ def test_worst_case_in_the_band_is_that_of_the_worst_rebuilt_rig(one_axis, measu
     assert max(gains) == pytest.approx(found.upper, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_each_axis_lies_between_what_sampled_plants_reach_and_its_bound(shipped):
     """Axes of the table without control: largest gain from any floor motion, over random plants of the set."""
     design, plant = shipped
