@@ -74,7 +74,9 @@ def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarr
     acting = norm > _ZERO * norm.max(initial=0.0)
     unit = J / np.where(acting, norm, 1.0)[:, None]
     unit[~acting] = 0.0
-    left, sizes, _ = np.linalg.svd(np.linalg.qr(unit.T, mode="r").T)  # same as for the wide matrix, but of a small one
+    # The singular values and left singular vectors of the wide matrix are those of this small factor.
+    small = np.asarray(np.linalg.qr(unit.T, mode="r")).T
+    left, sizes, _ = np.linalg.svd(small)
     sizes = np.concatenate([sizes, np.zeros(len(unit) - len(sizes))])
     null = left[:, sizes <= _ZERO * sizes.max(initial=0.0)] / np.where(acting, norm, 1.0)[:, None]
     return la.orth(null) if null.size else null
