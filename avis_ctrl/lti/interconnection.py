@@ -9,6 +9,8 @@ import numpy as np
 import scipy.linalg as la
 
 Quadruple = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+# Number of times that rows and columns are scaled: the first removes the units, the others change little.
+SWEEPS = 3
 
 
 def series(X: Quadruple, Y: Quadruple) -> Quadruple:
@@ -43,6 +45,16 @@ def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
     out, n = np.vstack([B @ u, b @ y]), A.shape[1] + a.shape[1]
     out[:, :n] += la.block_diag(A, a)
     return out[:, :n], out[:, n:], y[:, :n], y[:, n:]
+
+
+def singular(D: np.ndarray, most: float) -> bool:
+    """Whether the condition number of a square matrix exceeds `most`, with rows and columns scaled to similar size, so
+    that their units do not matter."""
+    for _ in range(SWEEPS):
+        for axis in (1, 0):
+            size = np.linalg.norm(D, axis=axis, keepdims=True)
+            D = D / np.where(size > 0, size, 1.0)
+    return bool(np.linalg.cond(D) > most)
 
 
 def inverse(X: Quadruple) -> Quadruple:

@@ -19,7 +19,7 @@ import scipy.linalg as la
 from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series
+from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series, singular
 from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
@@ -41,6 +41,12 @@ def signal_names(given: Iterable[str] | None, count: int, prefix: str, what: str
         twice = sorted({name for name in names if names.count(name) > 1})
         raise InputError(f"{what} names must differ; {twice} appear more than once")
     return names
+
+
+def names_of_inverse(inputs: Names, outputs: Names) -> tuple[Names, Names]:
+    """(inputs, outputs) of an inverse: those of the system exchanged, unless all are default names."""
+    default = signal_names((), len(inputs), "u", "input"), signal_names((), len(outputs), "y", "output")
+    return (inputs, outputs) if (inputs, outputs) == default else (outputs, inputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,17 +192,19 @@ class StateSpace:
 
     def inverse(self) -> StateSpace:
         """The inverse, for S = (1 + L).inverse() or 1/(1 + L). InputError if D cannot be inverted."""
-        if self.ninputs != self.noutputs or np.linalg.cond(self.D) > 1 / np.finfo(float).eps:
+        if self.ninputs != self.noutputs or singular(self.D, 1 / np.finfo(float).eps):
             raise InputError(
                 "expected as many inputs as outputs, and a D that can be inverted: the inverse of a strictly proper "
                 "system is improper",
                 field="inverse",
                 value=f"D = {self.D.tolist()}",
             )
-        return StateSpace(*inverse(self.matrices), self.dt, self.outputs, self.inputs, self.states)
+        return StateSpace(*inverse(self.matrices), self.dt, *names_of_inverse(self.inputs, self.outputs), self.states)
 
     def __truediv__(self, divisor: Any) -> StateSpace:
         if isinstance(divisor, (int, float, np.number)):
+            if not divisor:
+                raise InputError("division by zero", field="divisor", value=divisor)
             return self.scaled(1 / float(divisor))
         divisor = operand(divisor)
         return NotImplemented if divisor is None else self @ divisor.inverse()

@@ -72,6 +72,7 @@ def bode(
     ['open loop', 'closed loop']
     """
     top, bottom = axes = axes_of(ax, 2)
+    line = _full_names(line)
     for one in _curves(system, omega, frequency_Hz, label):
         for i in range(one.nominal.shape[1]):
             for k in range(one.nominal.shape[2]):
@@ -112,7 +113,7 @@ def sigma(
     >>> len(ac.plot.sigma(G).lines)
     2
     """
-    ax = axes_of(ax)
+    ax, line = axes_of(ax), _full_names(line)
     several = False
     for one in _curves(system, omega, frequency_Hz, label):
         values = _singular_values(one.nominal)
@@ -184,6 +185,14 @@ def _rad_s(omega: Any, frequency_Hz: Any, members: list[Any]) -> list[np.ndarray
         grid if is_response(one) else common[common <= (np.pi / dt if (dt := getattr(one, "dt", 0)) else np.inf)]
         for grid, one in zip(own, members, strict=True)
     ]
+
+
+def _full_names(line: dict[str, Any]) -> dict[str, Any]:
+    """Options of a line without matplotlib's abbreviations, such as "c" for "color"."""
+    from matplotlib.cbook import normalize_kwargs
+    from matplotlib.lines import Line2D
+
+    return dict(normalize_kwargs(line, Line2D))
 
 
 def _draw(ax: Any, one: _Curves, values: np.ndarray, label: str | None, line: dict[str, Any], single: bool) -> Any:

@@ -203,8 +203,9 @@ def _cause(said: str, text: str) -> str:
     at = re.search(r"\(at line (\d+), column (\d+)\)$", said)
     if at is None:
         return ""
-    line = text.splitlines()[int(at[1]) - 1].strip()[:60]
-    if re.match(r",\d", text.splitlines()[int(at[1]) - 1][int(at[2]) - 1 :]):
+    whole = text.split("\n")[int(at[1]) - 1]  # the parser counts no other line ends
+    line = whole.strip()[:60]
+    if re.match(r",\d", whole[int(at[2]) - 1 :]):
         return f": {line!r}; write a decimal point, not a comma"
     if said.startswith("Cannot overwrite a value"):
         return f": {line!r}; a section that occurs several times is written in double brackets, such as [[record]]"

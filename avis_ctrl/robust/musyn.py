@@ -147,7 +147,7 @@ def musyn(
     >>> round(ac.robust_performance(loop).lower, 2)
     1.1
     """
-    if isinstance(P, UncertainSystem) and ncon is None and nmeas is not None:
+    if isinstance(P, UncertainSystem) and ncon is None and blocks is not None:
         blocks, nmeas, ncon = None, blocks, nmeas
     if isinstance(P, UncertainSystem) or blocks is None:
         P, blocks, _ = opened(P, blocks)

@@ -31,7 +31,7 @@ class Robustness(Shown):
 
     lower : the loop is robust for all uncertainty below `lower` times the declared uncertainty (at every frequency if
         `guaranteed`, otherwise at the computed frequencies). upper : the perturbation `delta` of this size violates
-        robustness at `omega` [rad/s]; inf if none was found.
+        robustness at `omega` [rad/s]; inf if none was found, or only one with an infinite parameter.
     worst : `delta` as values for `system.substitute`: numbers for real parameters; for complex ones and dynamics,
         stable systems of constant norm, equal to `delta` at `omega` (a matrix of rank above one stays a matrix). With
         `blocks`: normalised, by the names of the blocks ("block 0" and so on if they have none).
@@ -193,13 +193,16 @@ def opened(
 
 
 def _robustness(peak: MuPeak, P: StateSpace, structure: BlockStructure, elements: dict[str, Any]) -> Robustness:
+    worst = worst_values(peak, P, structure, elements)
+    # A parameter with an asymmetric range is infinite at a finite delta: that is no counterexample.
+    reached = peak.lower > 0 and all(np.isfinite(one) for one in worst.values() if isinstance(one, float))
     return Robustness(
         1 / peak.upper if peak.upper > 0 else np.inf,
-        1 / peak.lower if peak.lower > 0 else np.inf,
+        1 / peak.lower if reached else np.inf,
         peak.omega,
         peak.guaranteed,
-        worst_values(peak, P, structure, elements),
-        peak.delta,
+        worst if reached else {},
+        peak.delta if reached else None,
         peak,
     )
 

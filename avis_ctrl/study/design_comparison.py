@@ -117,8 +117,8 @@ def _rig_values(text: Any) -> Iterator[tuple[str, Any]]:
             yield name, one
 
     try:
-        yield from values(tomllib.loads(text), "")
-    except (TypeError, tomllib.TOMLDecodeError):
+        yield from values(tomllib.loads(text) if isinstance(text, str) else {"text": text}, "")
+    except tomllib.TOMLDecodeError:
         yield "text", text
 
 

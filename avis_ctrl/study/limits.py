@@ -1,6 +1,8 @@
-"""The limiting bounds and uncertainties at the peak of mu, and how far a design with mu above 1 misses its bounds.
+"""The bounds and uncertainties that limit mu, and what would help a design whose mu is not below 1.
 
-Every statement is computed: mu without one bound or uncertainty, or with one bound relaxed.
+The figures are upper bounds of mu of the given controller with one bound or uncertainty left out, or one bound wider;
+no other controller is computed for them. Without uncertainty, they are H-infinity optima. They are rounded in the safe
+direction.
 """
 
 from __future__ import annotations
@@ -15,12 +17,11 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.hinfsyn import hinf_suboptimal, hinfsyn
-from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
 from avis_ctrl.robust.mu_upper import bound_for_goal, bound_of_peak
-from avis_ctrl.study.design_result import ControllerResult
+from avis_ctrl.study.design_result import Bound, ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import DesignPlant
-from avis_ctrl.summary import digits_apart
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.weights import ControlEffort, TransmissibilityBound
 
@@ -52,10 +53,10 @@ BOUNDS = {"transmissibility bound": "e_", "control effort bound": "effort_", "co
 
 
 def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
-    """Sentences: where mu peaks, and which bounds and uncertainties are limiting there."""
+    """Sentences: where the upper bound of mu peaks, and which bounds and uncertainties limit it there."""
     if mu.K is None or np.isnan(mu.mu.omega):
         return ""
-    P, omega = plant.synthesis, mu.mu.omega
+    P, omega = plant.synthesis, _peak(mu.mu)
     closed = P.closed(mu.K)
     M = closed.frequency_response(np.array([omega]))
     worth = (1 - SETTINGS.worth) * _mu(M, P.all_blocks)[0]
@@ -66,63 +67,73 @@ def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
         if blocks.blocks and (value := _mu(rest.frequency_response(np.array([omega])), blocks)[0]) < worth
     )
     shares = sorted((value, name) for name, value in _without_uncertainties(plant, M) if value < worth)
-    text = f"mu peaks at {_hertz(omega)}."
+    text = f"The upper bound of mu peaks at {_hertz(omega)}."
     if bounds:
         value, name = bounds[0]
-        peak = mu_peak(*without[name], slack=SETTINGS.worth)
-        most = min(peak.upper, mu.mu.upper)
+        rest = mu_peak(*without[name], slack=SETTINGS.worth)
+        most = rest if rest.upper <= mu.mu.upper else mu.mu
+        where = _unproved(most) or " over all frequencies"
         text += (
-            f" The limiting bound there is the {name}{_part(plant, name, omega)}: without it, mu would be {value:.3g} "
-            f"at this frequency, and its peak would be at most {most:.3g}, at {_hertz(peak.omega)}."
+            f" The limiting bound there is the {name}{_part(plant, name, omega)}: without it, mu of this controller is "
+            f"at most {_up(value):g} at this frequency, and at most {_up(most.upper):g}{where}; its upper bound then "
+            f"peaks at {_hertz(_peak(rest))}."
         )
-        others = [f"the {name} (mu {value:.3g} without it)" for value, name in bounds[1:]]
+        others = [f"the {name} (mu at most {_up(value):g} without it)" for value, name in bounds[1:]]
         text += f" Also limiting: {listed(others)}." if others else ""
     if shares:
-        named = [f"{name} (mu {value:.3g} without it)" for value, name in shares[: SETTINGS.most]]
+        named = [f"{name} (mu at most {_up(value):g} without it)" for value, name in shares[: SETTINGS.most]]
         text += f" The largest contributions of uncertainties there: {listed(named)}."
     if not bounds and not shares:
-        text += (
-            f" No single bound or uncertainty is limiting there: without any one of them, mu falls by less than "
+        return (
+            f"{text} No single bound or uncertainty is limiting there: without any one of them, mu falls by less than "
             f"{100 * SETTINGS.worth:g} %."
         )
-    return text
+    return f"{text} These values are for this controller, without a new synthesis."
 
 
 def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[ControllerResult]) -> str:
-    """Sentences on a design with mu above 1: what was achieved, what is limiting, and what would help.
+    """Sentences on a design whose mu is not below 1: what was reached, what limits it, and what would help.
 
-    This proves that nothing better exists only if the bounds cannot be met without uncertainty. Otherwise the synthesis
-    may have stopped early, which the sentences then state.
+    That no controller has mu below 1 is proved only if the optimum without uncertainty is not below 1. Otherwise the
+    synthesis may have stopped early, which the sentences then state.
     """
     if mu.K is None:
         return ""
-    spread = _spread_there(plant, mu.mu.omega)
+    omega = _peak(mu.mu)
+    spread = _spread_there(plant, omega)
     impossible = _not_even_nominal(plant)
     if no_better_than_none(mu, others):
         return (
-            f"The synthesis found no controller better than none: with the best controller found mu is "
-            f"{mu.mu.upper:.3g}, at {_hertz(mu.mu.omega)}, which is not smaller than without control. "
-            f"No D-K iteration came closer to the bounds with this uncertainty. "
+            f"The synthesis found no controller better than none: with the best controller found mu is at most "
+            f"{_up(mu.mu.upper):g}, at {_hertz(omega)}; this bound is less than {100 * SETTINGS.idle:g} % below that "
+            f"without control. No D-K iteration came closer to the bounds with this uncertainty. "
             f"{spread or impossible or 'Specify less uncertainty or wider bounds'}".rstrip(".")
             + "."
         )
     limits = limiting(plant, mu)
     text = (
-        f"The specification is not met for all plants of the set: mu of the mu controller is "
-        f"{_above_one(mu.mu.upper)} and must be below 1. {limits} {impossible or _relief(plant, mu)}"
+        f"The specification (weighted norm below 1 for all plants of the set) is not "
+        f"{'met' if mu.mu.lower >= 1 else 'proved to be met'}: mu of the mu controller is between "
+        f"{_down(mu.mu.lower, 4):g} and {_up(mu.mu.upper, 4):g}{_unproved(mu.mu)} and must be below 1. "
+        f"{limits} {impossible or _relief(plant, mu)}"
     )
     if spread and RESPONSE in limits:
         text += f" {spread}."
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
         best = min(better, key=lambda c: c.mu.upper)
-        text += f" The controller {best.title!r} has a smaller mu, {best.mu.upper:.3g}: the iteration ended too early."
+        text += (
+            f" The controller {best.title!r} has a smaller upper bound of mu, {_up(best.mu.upper):g}: the iteration "
+            f"ended too early."
+        )
     return text
 
 
 def _not_even_nominal(plant: DesignPlant) -> str:
-    """Proof that no controller meets the bounds even without uncertainty, and how far they would have to be relaxed.
+    """That no controller has a weighted norm below 1 even without uncertainty, and how far a bound would have to be
+    relaxed; empty if this is not proved.
 
-    Empty if there is no such proof.
+    The norm is that of all bounds from all disturbances together. Below 1 it is sufficient for each bound, but not
+    necessary, so that this does not prove that the bounds cannot be met.
     """
     nominal = plant.synthesis.nominal()
     try:
@@ -141,9 +152,9 @@ def _not_even_nominal(plant: DesignPlant) -> str:
         return True
 
     return (
-        f"No controller can meet these bounds, even without uncertainty: the smallest H-infinity norm that a "
-        f"controller can achieve for the nominal plant is {least:.3g}, and it must be below 1. "
-        + _enough("Without uncertainty they can be met", _wider(plant, met))
+        f"No controller has a weighted norm (all bounds and disturbances together) below 1, even without uncertainty: "
+        f"it is at least {_down(least, 4):g}. Each bound alone may still be met. "
+        + _enough("Without uncertainty a controller reaches 1", _wider(plant, met))
     )
 
 
@@ -163,37 +174,27 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
     def met(name: str, factor: float) -> bool:
         return below_one(_rows(plant, name), factor)
 
-    both = (
-        f"sufficient to divide every uncertainty by {_above_one(mu.mu.upper)} and to relax every bound by "
-        f"{20 * np.log10(mu.mu.upper):.3g} dB."
+    text = (
+        f"By its mu, this controller meets it with every uncertainty divided by {_up(mu.mu.upper, 4):g} and every "
+        f"bound relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
     )
     if not M.size:
-        return f"At the computed frequencies mu is below 1; only its bound between them is not. It is {both}"
+        return text
     ways = _wider(plant, met)
     if (smaller := _least_dB(lambda factor: below_one(range(P.blocks.n_z), factor))) is not None:
-        ways.append(f"all uncertainties are reduced to {100 * 10 ** (-smaller / 20):.0f} % of their size")
-    return (
-        _enough("At the computed frequencies this controller meets the specification", ways)
-        + f" It is{' also' * bool(ways)} {both}"
-    )
-
-
-def _above_one(mu: float) -> str:
-    """mu with three digits, and more if it would otherwise look equal to 1."""
-    return f"{mu:.{digits_apart(mu, 1.0, 3)}g}"
+        ways.append(f"all uncertainties are reduced to {_down(100 * 10 ** (-smaller / 20), 2):g} % of their size")
+    return f"{_enough('At the computed frequencies this controller meets it', ways)} {text}"
 
 
 def _wider(plant: DesignPlant, met: Callable[[str, float], bool]) -> list[str]:
-    """How far each bound must be relaxed, for the bounds of which one is sufficient.
-
-    met : whether the specification is met with this bound relaxed by this factor.
-    """
+    """For each bound that is shown to be enough alone: by how much it is relaxed. met : whether a bound wider by a
+    factor is shown to be enough."""
     found = [(name, _least_dB(partial(met, name))) for name in _bounds(plant)]
-    return [f"the {name} is relaxed by {value:.1f} dB" for name, value in found if value is not None]
+    return [f"the {name} is relaxed by {_decibel(value)}" for name, value in found if value is not None]
 
 
 def _least_dB(met: Callable[[float], bool]) -> float | None:
-    """Smallest relaxation [dB] with which the bounds are met, by bisection; None if the largest is not sufficient."""
+    """Smallest relaxation [dB] found to be enough, by bisection; None if the widest is not shown to be."""
     low, high = 0.0, SETTINGS.widest_dB
     if not met(10 ** (high / 20)):
         return None
@@ -205,7 +206,7 @@ def _least_dB(met: Callable[[float], bool]) -> float | None:
 
 def _enough(said: str, ways: list[str]) -> str:
     if not ways:
-        return "Relaxing a single bound is not sufficient."
+        return f"No single bound, relaxed by up to {SETTINGS.widest_dB:g} dB, is shown to be sufficient."
     return f"{said} if {listed(ways, 'or if')}{' (one of these is sufficient)' if len(ways) > 1 else ''}."
 
 
@@ -245,17 +246,47 @@ def _mu(M: np.ndarray, blocks: BlockStructure) -> np.ndarray:
 
 
 def _part(plant: DesignPlant, name: str, omega: float) -> str:
-    """The key of the design file that sets a bound at this frequency, in brackets; empty if several do."""
+    """The keys of the design file that set a bound at this frequency, in brackets; empty if they are not known."""
     for weight in plant.weights.values():
         if name == "transmissibility bound" and isinstance(weight, TransmissibilityBound):
-            band = weight.bands[0]
-            inside = 2 * np.pi * band.low_Hz <= omega <= 2 * np.pi * band.high_Hz
-            return " (band_dB)" if inside else " (outside band_Hz)"
+            band, f, beside = weight.bands[0], omega / (2 * np.pi), 2.0**weight.transition_octaves
+            if band.low_Hz <= f <= band.high_Hz:
+                return " (band_dB)"
+            # The weight may be stricter than peak_dB here.
+            near = band.low_Hz / beside < f < band.high_Hz * beside
+            return " (transition of band_dB)" if near else " (peak_dB)"
         if name == "control effort bound" and isinstance(weight, ControlEffort):
             # Below this frequency the weight is raised to bound the voltage for the offset.
             offset = omega < 2 * np.pi * weight.offset_corner_Hz * weight.offset
             return " (offset_percent: the drive voltage that the offset of the electronics needs)" if offset else ""
     return ""
+
+
+def _peak(bound: Bound | MuPeak) -> float:
+    """Frequency [rad/s] of the largest upper bound; `omega` is that of the lower bound."""
+    return float(bound.frequencies[np.argmax(bound.upper_curve)])
+
+
+def _unproved(bound: Bound | MuPeak) -> str:
+    """Words for an upper bound that is not proved between the computed frequencies."""
+    return "" if bound.guaranteed else " at the computed frequencies"
+
+
+def _up(value: float, digits: int = 3) -> float:
+    """Rounded up to some significant digits."""
+    if not (np.isfinite(value) and value):
+        return value
+    step = 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1)
+    return float(f"{np.ceil(value / step - 1e-9) * step:.{digits}g}")
+
+
+def _down(value: float, digits: int = 3) -> float:
+    return -_up(-value, digits)
+
+
+def _decibel(value: float) -> str:
+    """Rounded up to 0.1 dB."""
+    return f"{np.ceil(10 * value - 1e-9) / 10:.1f} dB"
 
 
 def _hertz(omega: float) -> str:

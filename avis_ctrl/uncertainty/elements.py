@@ -16,6 +16,18 @@ from avis_ctrl.uncertainty.blocks import Block, ComplexFull, ComplexScalar, Real
 
 
 @dataclass(frozen=True)
+class ElementSettings:
+    """pole : 1 + skew delta at and below which a parameter is taken as infinite [1]: far above the accuracy of delta; a
+    finite value there is a million times the range.
+    """
+
+    pole: float = 1e-6
+
+
+SETTINGS = ElementSettings()
+
+
+@dataclass(frozen=True)
 class Element:
     """An uncertain element with a name. rows, cols : size of one copy of its Delta."""
 
@@ -82,9 +94,14 @@ class RealParameter(Element):
         return (value - self.nominal) / (b - a * value)
 
     def value(self, delta: float) -> float:
-        """The value of a normalised delta."""
+        """The value of a normalised delta; inf at delta = -1/skew, and beyond it."""
         a = self.skew
-        return (self.nominal + (self.high + a * self.high - self.nominal) * delta) / (1 + a * delta)
+        below = 1 + a * delta
+        return (
+            (self.nominal + (self.high + a * self.high - self.nominal) * delta) / below
+            if below > SETTINGS.pole
+            else np.inf
+        )
 
     def __str__(self) -> str:
         up, down = self.high - self.nominal, self.nominal - self.low

@@ -19,8 +19,8 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
-from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series
-from avis_ctrl.lti.statespace import StateSpace, new_names, positions, signal_names
+from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series, singular
+from avis_ctrl.lti.statespace import StateSpace, names_of_inverse, new_names, positions, signal_names
 from avis_ctrl.summary import count_of, html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
@@ -200,6 +200,8 @@ class UncertainSystem:
                     deltas[name] = one.delta(float(value))
                 except (TypeError, ValueError):
                     raise InputError("expected a number", field=name, value=value) from None
+                except ZeroDivisionError:
+                    raise InputError("expected a value nearer to the range", field=name, value=value) from None
             elif isinstance(one, ComplexDisk):
                 deltas[name] = (as_system(value, name) + as_system(-one.centre)).scaled(1 / one.radius)
             else:
@@ -302,7 +304,7 @@ class UncertainSystem:
         """The inverse. ComputationError if the nominal value is not invertible."""
         if self.shape[0] != self.shape[1]:
             raise InputError("expected as many inputs as outputs", field="inverse", value=self.shape)
-        if np.linalg.cond(self.d) > SETTINGS.singular:
+        if singular(self.d, SETTINGS.singular):
             raise ComputationError(
                 "the nominal value cannot be inverted",
                 measured=f"D = {self.d.tolist()}",
@@ -310,15 +312,8 @@ class UncertainSystem:
                 next_step="choose a nominal value other than zero",
             )
         a, b, c, d = inverse(self.matrices)
-        return replace(
-            self,
-            a=a,
-            b=b,
-            c=c,
-            d=d,
-            inputs=self.inputs if self._unnamed else self.outputs,
-            outputs=self.outputs if self._unnamed else self.inputs,
-        )
+        inputs, outputs = names_of_inverse(self.inputs, self.outputs)
+        return replace(self, a=a, b=b, c=c, d=d, inputs=inputs, outputs=outputs)
 
     def __truediv__(self, other: Any) -> UncertainSystem:
         return self * as_uncertain(other).inverse()

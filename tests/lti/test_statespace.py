@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, gain, tf
+from avis_ctrl.uncertainty.uncertain_models import matrix, real
 
 coefficients = st.lists(st.floats(0.1, 50), min_size=1, max_size=5)
 
@@ -231,10 +232,25 @@ def test_inverse_and_powers_are_those_of_the_transfer_matrix(rng):
     G = StateSpace(-np.eye(2), np.eye(2), rng.standard_normal((2, 2)), np.eye(2), 0.1, ("a", "b"), ("c", "d"))
     np.testing.assert_allclose((G**-1)(0.5j), np.linalg.inv(G(0.5j)))
     assert (G**-1).inputs == ("c", "d") and (G**-1).dt == 0.1
+    assert (S.inputs, S.outputs) == (L.inputs, L.outputs)  # default names, as with uncertain systems
+    assert ((1 + L * real("k", 1.0, percent=20)).inverse().inputs) == L.inputs
     with pytest.raises(InputError, match="strictly proper"):
         _ = 1 / L
+    with pytest.raises(InputError, match="division by zero"):
+        _ = L / 0
     with pytest.raises(InputError, match="whole number"):
         _ = L**0.5
+
+
+@pytest.mark.parametrize("uncertain", [False, True])
+def test_whether_a_matrix_can_be_inverted_does_not_depend_on_units(rng, uncertain):
+    X, left, right = rng.standard_normal((3, 3)), 10.0 ** np.array([-9, 0, 8]), 10.0 ** np.array([7, -8, 0])
+    D = left[:, None] * X * right
+    made = matrix(D * real("k", 1.0, percent=20)).inverse().nominal if uncertain else gain(D).inverse().D
+    np.testing.assert_allclose(made, np.linalg.inv(X) / left / right[:, None], rtol=1e-9)
+    rank_two = left[:, None] * np.outer([1, 2, 3], [1, 2, 3]) * right + np.diag(left * right * [0, 0, 1])
+    with pytest.raises((InputError, ComputationError), match="inverted"):
+        (matrix(rank_two * real("k", 1.0, percent=20)) if uncertain else gain(rank_two)).inverse()
 
 
 @pytest.mark.parametrize(

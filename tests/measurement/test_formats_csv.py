@@ -151,6 +151,15 @@ def test_latin_1_units_and_closing_separators(path):
     assert campaign.y_unit == "m/s^2" and np.ptp(campaign.records[0].load().y) == 0.0  # a constant channel is read
 
 
+@pytest.mark.parametrize("mark", [";", "\t", ","])
+def test_the_separator_line_of_excel(path, mark):
+    path.write_text(
+        f"sep={mark}\n" + "".join(mark.join(line) + "\n" for line in (["t", "a", "s"], *["012", "103", "214"]))
+    )
+    campaign = read_measurements(path, {"t": "t", "u": "a", "y": "s"})
+    np.testing.assert_allclose(campaign.records[0].load().y[:, 0], [2.0, 3.0, 4.0])
+
+
 @pytest.mark.parametrize("byte", [0x80, 0xFF])
 def test_every_byte_that_is_no_utf_8_is_a_latin_1_letter(path, byte):
     path.write_bytes(b"t,A1,S" + bytes([byte]) + b"\n0,1,2\n1,0,2\n2,1,3\n")

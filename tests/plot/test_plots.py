@@ -65,6 +65,12 @@ def test_frequencies_may_be_in_hertz():
             draw(LAG, OMEGA, frequency_Hz=OMEGA)
 
 
+@pytest.mark.parametrize("system", [LAG, real("k", 1.0, percent=20) * tf([2.0], [0.5, 1.0])])
+def test_options_of_a_line_may_be_abbreviated(system):
+    for ax in (plot.bode(system, OMEGA, c="red", lw=3)[1], plot.sigma(system, OMEGA, c="red", lw=3)):
+        assert (ax.lines[0].get_color(), ax.lines[0].get_linewidth()) == ("red", 3)
+
+
 def test_axes_given_are_the_axes_returned():
     _, pair = plt.subplots(2)
     assert plot.bode(LAG, ax=pair) is pair

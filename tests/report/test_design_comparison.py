@@ -77,6 +77,13 @@ def test_rigs_of_one_name_differ_by_their_values(folders, tmp_path):
     assert "differently (rig file);" in found.note
 
 
+def test_studies_without_a_rig_file_are_compared(folders, tmp_path):
+    content = json.loads((folders[0] / "study.json").read_text())
+    (tmp_path / "study.json").write_text(json.dumps({**content, "rig": None}))
+    (tmp_path / "result.json").write_text((folders[0] / "result.json").read_text())
+    assert "different rig file;" in compare_designs(folders[0], tmp_path).note
+
+
 @pytest.mark.parametrize(
     "spoil, words",
     [

@@ -159,6 +159,7 @@ def test_files_that_are_no_rigs(tmp_path):
         "absent.toml": (None, "one of"),
         "broken.toml": ("mass = = 3", "TOML"),
         "comma.toml": ("a = 1\nmass = 3,5", "'mass = 3,5'; write a decimal point"),
+        "lines.toml": ("# a\u2028b\x85c\nmass = 3,5\ny = 2", "'mass = 3,5'; write a decimal point"),
         "single.toml": ("[isolator]\n[[isolator]]", "is written in double brackets"),
         "empty.toml": ("", "sections"),
         "other.toml": ("[motor]\nx = 1", "sections"),
@@ -166,7 +167,7 @@ def test_files_that_are_no_rigs(tmp_path):
     }
     for name, (text, expected) in cases.items():
         if text is not None:
-            (tmp_path / name).write_text(text)
+            (tmp_path / name).write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=expected):
             load_rig(tmp_path / name)
     (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"')

@@ -469,6 +469,8 @@ def test_the_nominal_plant_of_hinfsyn():
     [
         (lambda P: musyn(P, [RealScalar(1)], 1, 1), "the system has its own"),
         (lambda P: musyn(P.nominal, nmeas=1, ncon=1), "a system with its blocks"),
+        (lambda P: musyn(P, nmeas=1), "ncon: expected a whole number of at least 1, or names"),
+        (lambda P: musyn(P, 1), "ncon: expected a whole number of at least 1, or names"),
         (lambda P: musyn(P), "nmeas: expected a whole number of at least 1, or names"),
         (lambda P: musyn(P, "z", "u"), "no output named 'z'"),
         (lambda P: hinfsyn(P, ["y", "y"], "u"), "expected different names"),

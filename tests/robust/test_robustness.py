@@ -42,6 +42,24 @@ def test_stability_ends_where_routh_says():
     assert edge.omega == pytest.approx(np.sqrt(10.0), rel=1e-2)
 
 
+@pytest.mark.parametrize("around", [(0.5, 1.2), (0.8, 1.5)])
+def test_an_infinite_parameter_is_no_counterexample(around):
+    """k/(s + 1) is stable for every k; delta = -1/skew, where k is infinite, is found nevertheless."""
+    k = real("k", 1.0, range=around)
+    found = robust_stability(k * tf([1.0], [1.0, 1.0]))
+    assert found.upper == np.inf and found.worst == {} and found.delta is None and found.robust
+    assert found.lower == pytest.approx(1 / abs(k.uncertain["k"].skew), rel=1e-2)
+
+
+@pytest.mark.parametrize(("around", "end"), [((0.5, 1.2), -0.4), ((0.8, 1.5), 3.6), ((0.2, 2.5), 3.6)])
+def test_stability_ends_where_routh_says_with_an_asymmetric_range(around, end):
+    """As above, stable for -0.4 < k < 3.6; the first end that delta reaches is found."""
+    k = real("k", 1.0, range=around)
+    found = robust_stability((k * tf([25.0], [1.0, 10.0, 10.0, 10.0])).feedback())
+    assert found.worst["k"] == pytest.approx(end, rel=1e-3)
+    assert found.upper == pytest.approx(abs(k.uncertain["k"].delta(end)), rel=1e-3)
+
+
 def test_performance_at_its_own_margin_is_the_worst_case_gain():
     """lower = a: for a times the uncertainty the gain is at most 1/a, and just reaches it."""
     found = robust_performance(oscillator())

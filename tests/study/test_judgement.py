@@ -21,6 +21,7 @@ from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_gain import perturbed
 from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.study import limits
 from avis_ctrl.study.analysis import analyse, bound, worst_of_axis
 from avis_ctrl.study.controllers import passive, peak_of_loop, reduction_grid
 from avis_ctrl.study.design_file import Design, RequirementSection, design_from_table, read_study, study_of
@@ -146,7 +147,6 @@ def test_worst_case_in_the_band_is_that_of_the_worst_rebuilt_rig(one_axis, measu
     assert max(gains) == pytest.approx(found.upper, rel=1e-2)
 
 
-@pytest.mark.slow
 def test_each_axis_lies_between_what_sampled_plants_reach_and_its_bound(shipped):
     """Axes of the table without control: largest gain from any floor motion, over random plants of the set."""
     design, plant = shipped
@@ -242,45 +242,94 @@ def test_the_bound_that_limits_mu_is_named_with_mu_without_it(one_axis, measured
     _, plant = one_axis
     skyhook = measured["skyhook_classical"]
     text = limiting(plant, skyhook)
-    P, omega = plant.synthesis, skyhook.mu.omega
+    P, omega = plant.synthesis, skyhook.mu.frequencies[np.argmax(skyhook.mu.upper_curve)]
     rest = P.closed(skyhook.K).select([name for name in P.closed(skyhook.K).outputs if not name.startswith("e_")], None)
     blocks = P.blocks.with_performance(len(P.w), sum(not name.startswith("e_") for name in P.z))
     without = mu_peak(rest, blocks, slack=1e-3)
-    assert f"mu peaks at {omega / (2 * np.pi):.3g} Hz. The limiting bound there is the transmissibility bound" in text
+    assert f"upper bound of mu peaks at {omega / (2 * np.pi):.3g} Hz. The limiting bound there is the trans" in text
     there, most = (
-        float(one)
-        for one in re.findall(r"would be (\S+) at this frequency, and its peak would be at most (\S+),", text)[0]
+        float(one) for one in re.findall(r"at most (\S+) at this frequency, and at most (\S+) over all", text)[0]
     )
-    assert there == pytest.approx(mu_upper(rest.frequency_response(np.array([omega])), blocks).upper[0], rel=0.01)
+    upper = mu_upper(rest.frequency_response(np.array([omega])), blocks).upper[0]
+    assert upper * (1 - 1e-6) <= there < 1.01 * upper
     assert 0.99 * without.lower < most < 1.03 * without.upper
 
 
-def test_mu_above_1_only_between_the_frequencies_is_said_to_be_so(one_axis, measured):
+def test_the_peak_named_is_that_of_the_upper_bound(one_axis, measured):
+    """The lower bound may be attained elsewhere; what is not guaranteed is not said of all frequencies."""
     _, plant = one_axis
     skyhook = measured["skyhook_classical"]
-    curve = 0.999 * skyhook.mu.upper_curve / np.max(skyhook.mu.upper_curve)
-    text = best_found(plant, replace(skyhook, mu=replace(skyhook.mu, upper=1.00036, upper_curve=curve)), [])
-    assert "mu of the mu controller is 1.0004 and must be below 1" in text
-    assert "At the computed frequencies mu is below 1; only its bound between them is not. It is sufficient to" in text
+    at = skyhook.mu.frequencies[np.argmax(skyhook.mu.upper_curve)] / (2 * np.pi)
+    text = limiting(plant, replace(skyhook, mu=replace(skyhook.mu, omega=2 * np.pi * 70, upper=0.01, guaranteed=False)))
+    assert f"peaks at {at:.3g} Hz." in text and "70 Hz" not in text
+    assert "over all frequencies" not in text and "at most 0.01 at the computed frequencies" in text
 
 
-def test_bounds_that_no_controller_meets_are_said_to_be_impossible(shipped):
+@pytest.mark.parametrize(
+    ("lower", "upper", "curve", "said"),
+    [
+        (0.8, 1.2, 1.2, "is not proved to be met: mu of the mu controller is between 0.8 and 1.2 and"),
+        (1.1, 1.20001, 1.2, "is not met: mu of the mu controller is between 1.1 and 1.201 and"),
+        (0.9, 1.0004, 0.9, "every uncertainty divided by 1.001 and every bound relaxed by 0.1 dB"),
+    ],
+)
+def test_what_is_said_of_mu_above_one_was_computed(one_axis, measured, monkeypatch, lower, upper, curve, said):
+    """No sentence on single bounds if mu is below 1 at all computed frequencies."""
+    _, plant = one_axis
+    monkeypatch.setattr(limits, "_not_even_nominal", lambda plant: "")
+    skyhook = measured["skyhook_classical"]
+    scaled = skyhook.mu.upper_curve * (curve / np.max(skyhook.mu.upper_curve))
+    mu = replace(skyhook, mu=replace(skyhook.mu, lower=lower, upper=upper, upper_curve=scaled))
+    text = best_found(plant, mu, [])
+    assert said in text
+    assert ("single bound, relaxed" in text or "this controller meets it if" in text) == (curve >= 1)
+
+
+def test_figures_of_the_advice_are_rounded_in_the_safe_direction(one_axis, measured):
+    """Relaxed or reduced as the sentences say, mu of the loop is below 1 at the computed frequencies."""
+    _, plant = one_axis
+    skyhook, P = measured["skyhook_classical"], plant.synthesis
+    text = limits._relief(plant, skyhook)
+    M = P.closed(skyhook.K).frequency_response(skyhook.mu.frequencies)
+    n_z, is_e = P.blocks.n_z, np.array([name.startswith("e_") for name in P.z])
+    divisor, every = (
+        float(one) for one in re.findall(r"divided by (\S+) and every bound relaxed by (\S+) dB", text)[0]
+    )
+    ways = [np.r_[np.full(n_z, 1 / divisor), np.full(len(P.z), 10 ** (-every / 20))]]
+    (alone,) = re.findall(r"the transmissibility bound is relaxed by (\S+) dB", text)
+    ways.append(np.r_[np.ones(n_z), np.where(is_e, 10 ** (-float(alone) / 20), 1.0)])
+    for left in ways:
+        assert np.max(mu_upper(M * left[:, None], P.all_blocks).upper) <= 1 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("hertz", "part"),
+    [(0.4, "(peak_dB)"), (0.8, "(transition of band_dB)"), (3.0, "(band_dB)"), (13.0, "(transition of band_dB)")],
+)
+def test_the_keys_of_a_bound_are_those_at_the_frequency(one_axis, hertz, part):
+    """-7 dB from 1 to 10 Hz, with a transition of 0.8 octaves."""
+    assert limits._part(one_axis[1], "transmissibility bound", 2 * np.pi * hertz) == f" {part}"
+
+
+def test_a_nominal_optimum_above_one_is_reported_as_such(shipped):
     """band_dB = -40: the optimum without uncertainty is above 1; relaxed as the sentence says it is 1."""
     design, plant = shipped
     asked = design.transmissibility.model_copy(update={"band_dB": -40.0})
     plant = build_plant(design.model_copy(update={"transmissibility": asked}), load_rig("avis"))
     idle = gain(np.zeros((2, 2)), plant.synthesis.y, plant.synthesis.u)
-    none = np.zeros(0)
-    mu = SimpleNamespace(
-        K=idle, mu=SimpleNamespace(upper=9.0, omega=10.0, frequencies=np.array([10.0]), upper_curve=none)
+    at, curve = np.array([10.0]), np.array([9.0])
+    found = SimpleNamespace(upper=9.0, lower=8.0, omega=10.0, guaranteed=True, frequencies=at, upper_curve=curve)
+    text = best_found(plant, SimpleNamespace(K=idle, mu=found), [])
+    assert "mu of the mu controller is between 8 and 9 and must be below 1" in text
+    (least,) = re.findall(
+        r"No controller has a weighted norm .*even without uncertainty: it is at least (\S+)\. ", text
     )
-    text = best_found(plant, mu, [])
-    assert "mu of the mu controller is 9 and must be below 1" in text
-    assert "No controller can meet these bounds, even without uncertainty" in text
+    assert "can meet" not in text and "Each bound alone may still be met." in text
     relaxed = 10 ** (-float(re.findall(r"the transmissibility bound is relaxed by (\S+) dB", text)[0]) / 20)
     nominal = plant.synthesis.nominal()
     left = [relaxed if name.startswith("e_") else 1.0 for name in nominal.P.outputs]
-    assert hinfsyn(nominal.P.scaled(left=np.array(left)), 2, 2).gamma_optimal_bounds[1] == pytest.approx(1.0, abs=0.02)
+    assert 1 <= float(least) <= hinfsyn(nominal.P, 2, 2).gamma_optimal_bounds[0]
+    assert hinfsyn(nominal.P.scaled(left=np.array(left)), 2, 2).gamma_optimal_bounds[1] == pytest.approx(1.0, abs=0.03)
 
 
 def test_reduction_is_compared_where_the_table_at_rest_peaks(shipped):

@@ -179,6 +179,17 @@ def test_nominal_is_at_delta_zero_even_where_the_range_is_lopsided():
         assert pole[0, 0] == pytest.approx(-value)
 
 
+@given(st.floats(-5, 5), st.floats(0.01, 10), st.floats(0.01, 10), st.floats(-1, 1))
+def test_values_and_deltas_of_any_range_belong_together(nominal, down, up, delta):
+    one = real("k", nominal, range=(nominal - down, nominal + up)).uncertain["k"]
+    value = one.value(delta)
+    assert one.low - 1e-9 <= value <= one.high + 1e-9
+    assert one.delta(value) == pytest.approx(delta, abs=1e-6)
+    if abs(one.skew) > 1e-3:
+        assert one.value(-1 / one.skew) == one.value(-1.1 / one.skew) == np.inf
+        assert np.isfinite(one.value(-0.999 / one.skew))
+
+
 def test_badly_scaled_parameters_keep_their_values():
     k, m = real("k", 2.0e9, percent=10), real("m", 1e-7, percent=1)
     G = ss([[0, 1], [-k / m, 0]], [[0], [1 / m]], [[1, 0]])
@@ -304,6 +315,8 @@ def test_two_parameters_of_one_name_are_refused():
         (lambda: ELEMENTS["p"] + "x", InputError, "expected a StateSpace"),
         (lambda: ELEMENTS["p"].substitute(x=1.0), InputError, "expected some of p"),
         (lambda: ELEMENTS["p"].substitute(p="wide"), InputError, "expected a number"),
+        (lambda: real("k", 1.0, range=(0.0, 4.0)).substitute(k=-2.0), InputError, "nearer to the range"),
+        (lambda: ELEMENTS["p"] / 0, ComputationError, "cannot be inverted"),
         (lambda: matrix([[1.0, 2.0], [ELEMENTS["p"]]]), InputError, "rows of one length"),
         (lambda: ss([[ELEMENTS["p"]]], [[1.0], [1.0]], [[1.0]]), InputError, "shapes do not fit"),
         (lambda: ss([[ELEMENTS["p"]]], [[1.0]], [[1.0]], inputs=["a", "b"]), InputError, "expected 1 input names"),

@@ -118,7 +118,7 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
             key, equals, value = line.strip().lstrip("#").partition("=")
             if equals:
                 stated[key.strip()] = value.strip()
-        elif line.strip() and not re.fullmatch(r"sep=.", line.strip()):  # Excel's line with the separator
+        elif line.strip() and not re.fullmatch(r"\s*sep=.\s*", line):  # Excel's line with the separator
             break
     else:
         raise InputError(f"expected a header line with the names of the columns; there are {count} lines without one")

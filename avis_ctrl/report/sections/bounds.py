@@ -12,7 +12,7 @@ from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, tabl
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.summary import digits_apart
 
-Pick = Callable[[ControllerResult], Bound]
+BoundOf = Callable[[ControllerResult], Bound]
 
 
 def bounds(result: DesignResult) -> Section:
@@ -33,8 +33,8 @@ def bounds(result: DesignResult) -> Section:
             lambda c: c.stability,
             "mu, stability",
             "mu of the uncertainty alone",
-            "Below 1 the loop is stable for every plant of the set; the inverse of its peak is the factor "
-            "by which the whole set may grow.",
+            "Below 1 the loop is stable for every plant of the set; the whole set may grow at least by the inverse of "
+            "the peak of the upper bound.",
         ),
     ]
     pieces += [_stability(result), _worst(result)]
@@ -57,26 +57,26 @@ def certificate(result: DesignResult) -> list[Paragraph]:
         if np.isfinite(mu.lower) and mu.lower > 0
         else ""
     )
-    bounds = Paragraph(
+    peak = Paragraph(
         f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
         f"{words.bound(mu.upper, digits_apart(mu.upper, 1.0, 4))}, at {words.hertz(mu.omega)}"
         + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
         + f". If mu is below 1, every plant of the uncertainty set meets every bound. {between}{reached}"
     )
-    return [bounds, *([Paragraph(result.limits)] if result.limits else [])]
+    return [peak, *([Paragraph(result.limits)] if result.limits else [])]
 
 
-def _figure(name: str, result: DesignResult, pick: Pick, label: str, what: str, meaning: str) -> Figure:
+def _figure(name: str, result: DesignResult, bound_of: BoundOf, label: str, what: str, meaning: str) -> Figure:
     curves = []
     for c in result.controllers:
         if c.name == "passive":
             continue
-        b, style = pick(c), controller_style(c.name)
+        b, style = bound_of(c), controller_style(c.name)
         order = np.argsort(b.frequencies)
         f = b.frequencies[order] / (2 * np.pi)
         curves.append(Curve(f, b.upper_curve[order], c.title, style))
         curves.append(Curve(f, b.lower_curve[order], "", Style(style.colour, "dot", 0.9)))
-    passive = pick(result.controller("passive"))
+    passive = bound_of(result.controller("passive"))
     order = np.argsort(passive.frequencies)
     curves.append(
         Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive", STYLES["passive"])
