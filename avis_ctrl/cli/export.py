@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -79,6 +80,7 @@ def export(
     from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
     from avis_ctrl.export.package import FILES, FORMATS, check_package, formats_of, make_package
     from avis_ctrl.files import write_together
+    from avis_ctrl.lti.norms import decibels
     from avis_ctrl.study.files import output_folder
 
     console, asked = Console(highlight=False), FORMATS if formats is None else formats_of(formats)
@@ -120,6 +122,13 @@ def export(
     _summary(console, made)
     if (mu := made.certificate.content["mu_upper"]) > (allowed := mu_asked(folder.design)):
         console.print(f"mu of the code is at most {mu:.4g}; the design requires at most {allowed:g}.")
+    peak_dB = min(folder.design.upper_limits("worst_case_peak_transmissibility_dB"), default=math.inf)
+    if made.replay and (simulated := decibels(made.replay.gain)) > peak_dB:
+        console.print(
+            f"With all six axes, the compiled code reaches {simulated:.2f} dB simulated in the worst plant. The "
+            f"design requires at most {peak_dB:g} dB for its axes, with the others locked; to include the others, add "
+            "them to keep in the design file."
+        )
     console.print(f"{len(files)} files in {path}")
 
 

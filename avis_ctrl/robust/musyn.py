@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avis_ctrl.errors import InputError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import continuous_image, sampled_image
 from avis_ctrl.lti.interchange import as_system
@@ -27,9 +27,10 @@ from avis_ctrl.robust.dstep import PointwiseScalings, tightened
 from avis_ctrl.robust.fixed_order import fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
+from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
-from avis_ctrl.robust.musyn_iteration import Options, Problem, iterate
+from avis_ctrl.robust.musyn_iteration import Options, Problem, initial_controllers, initial_loop, iterate
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
 from avis_ctrl.robust.robustness import opened
 from avis_ctrl.robust.scalings import Scalings
@@ -117,8 +118,8 @@ def musyn(
     polish : when D-K iteration stalls, continue with descent on gamma (and scalings of higher order if they lower
         it), then with D-K iteration again, until a whole round no longer improves the result.
     max_added_states : maximum number of states that all scalings together may add to the plant.
-    starts : known controllers u = K y. The iteration starts from the best of these and the H-infinity controllers; the
-        result is never worse (in complex mu on the grid) than any of them that stabilises P.
+    starts : known controllers u = K y. The iteration starts from the best of these and the H-infinity controllers. The
+        result is not worse than any of them that stabilises P: in complex mu on the grid, or, with real blocks, in mu.
     state : `saved_state` of an earlier result, to continue from. If it belongs to another plant with the same y and u
         (a changed weight, more uncertainty), its controllers are used as `starts`.
     order : maximum number of states of the controller. The order of the full controller is reduced; the result is
@@ -186,7 +187,8 @@ def musyn(
                 f"instead of {best.mu:.4g}",
             )
             best = Loop(K, best.scalings, np.nan, peak)
-        return _result(made, best, sample_rate_Hz, notes)
+            return _result(made, best, sample_rate_Hz, notes)
+        return _best_with_real_blocks(made, _result(made, best, sample_rate_Hz, notes), sample_rate_Hz)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +196,7 @@ class DKIteration:
     """Result of D-K iteration, before the final bounds are computed.
 
     P, uncertainty : as given, performance as the last block. problem : P and blocks as used in the synthesis.
+    initial : kind and constructor of each initial controller.
     best : the controller with the smallest complex mu on the grid; for a sampled plant its continuous image.
     """
 
@@ -202,6 +205,7 @@ class DKIteration:
     uncertainty: BlockStructure
     state: State
     status: str
+    initial: Sequence[tuple[str, Callable[[], StateSpace]]]
 
     @property
     def best(self) -> Loop:
@@ -252,7 +256,8 @@ def dk_iteration(
         if state is not None:
             current, known = State.from_dict(state, complexified, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, (*known, *given), options)
-        return DKIteration(P, problem, uncertainty, current, status)
+        initial = initial_controllers(problem, given, backoff)
+        return DKIteration(P, problem, uncertainty, current, status, initial)
 
 
 def _structures(
@@ -318,6 +323,29 @@ def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scal
         tighter = tightened(points, closed, best.scalings, TIGHT, 10 * problem.P.nstates).scalings
         candidates.append((tighter, bound(tighter)))
     return min(candidates, key=lambda pair: pair[1])
+
+
+def _best_with_real_blocks(made: DKIteration, result: MuSynthesis, sample_rate_Hz: float | None) -> MuSynthesis:
+    """The result, or that of an initial controller whose mu with real blocks is smaller.
+
+    D-K iteration minimises mu with complex blocks, by which it also chooses the best controller.
+    """
+    if all(block.kind != "real" for block in made.uncertainty.blocks):
+        return result
+    for kind, make in made.initial:
+        try:
+            loop, points = initial_loop(made.problem, make())
+        except ComputationError:
+            continue
+        response = lft_lower(made.problem.P, loop.K).frequency_response(points.omega)
+        if np.max(mu_upper(response, made.uncertainty).upper) < result.mu_upper:
+            note = (
+                f"an initial controller ({kind}) has a smaller mu with real blocks than that of the D-K iteration, "
+                f"{result.mu_upper:.4g}, and is the result"
+            )
+            other = _result(made, loop, sample_rate_Hz, (note,))
+            result = min(result, other, key=lambda one: one.mu_upper)
+    return result
 
 
 def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, given_notes: tuple[str, ...]) -> MuSynthesis:

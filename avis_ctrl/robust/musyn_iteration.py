@@ -141,7 +141,7 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
     """
     state, failure = State(), None
     many = problem.structure.many
-    candidates = _candidates(problem, starts, options)
+    candidates = initial_controllers(problem, starts, options.backoff)
     # With many unscaled blocks, the first candidate does not act and takes longest. The order is therefore reversed,
     # and the search ends when a given controller, or the nominal one, stabilises the plant.
     for kind, make in reversed(candidates) if many else candidates:
@@ -149,7 +149,7 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
             break
         began = time.monotonic()
         try:
-            loop, points = _start(problem, make())
+            loop, points = initial_loop(problem, make())
         except ComputationError as error:
             failure = failure or error
             continue
@@ -166,13 +166,13 @@ def _first(problem: Problem, starts: tuple[StateSpace, ...], options: Options) -
     return replace(state, phase="first start" if idle else "D-K"), False
 
 
-def _candidates(
-    problem: Problem, starts: tuple[StateSpace, ...], options: Options
+def initial_controllers(
+    problem: Problem, starts: tuple[StateSpace, ...], backoff: float
 ) -> list[tuple[str, Callable[[], StateSpace]]]:
     """Kind and constructor of each initial controller."""
 
     def optimal(P: StateSpace) -> StateSpace:
-        return hinf_controller(P, problem.nmeas, problem.ncon, options.backoff).K
+        return hinf_controller(P, problem.nmeas, problem.ncon, backoff).K
 
     performance = problem.structure.blocks[-1]
     n_z, n_w = problem.structure.n_z - performance.cols, problem.structure.n_w - performance.rows
@@ -186,7 +186,7 @@ def _itself(K: StateSpace) -> StateSpace:
     return K
 
 
-def _start(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
+def initial_loop(problem: Problem, K: StateSpace) -> tuple[Loop, PointwiseScalings]:
     """Loop of an initial controller with its analysis; ComputationError if it does not stabilise the plant."""
     closed = lft_lower(problem.P, K)
     if not closed.is_stable():
