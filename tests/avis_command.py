@@ -16,11 +16,18 @@ NEW_INTERPRETER = "import sys; sys.argv[0] = 'avis'\nfrom avis_ctrl.cli import m
 
 
 def avis(
-    *arguments: object, answers: str = "", env: dict[str, str] | None = None, timeout: float = 600.0
+    *arguments: object,
+    answers: str = "",
+    env: dict[str, str] | None = None,
+    timeout: float = 600.0,
+    new_interpreter: bool = False,
 ) -> subprocess.CompletedProcess[str]:
-    """Run `avis` with these arguments and answers at its standard input."""
+    """Run `avis` with these arguments and answers at its standard input.
+
+    new_interpreter : for commands that use clarabel or typst: their threads do not survive a fork.
+    """
     words, variables = [str(one) for one in arguments], ENVIRONMENT | (env or {})
-    if sys.platform != "linux":  # elsewhere a fork of a process with threads is not safe
+    if new_interpreter or sys.platform != "linux":  # elsewhere a fork of a process with threads is not safe
         return subprocess.run(
             [sys.executable, "-c", NEW_INTERPRETER, *words],
             input=answers,

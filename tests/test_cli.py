@@ -143,7 +143,7 @@ def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch):
 
 
 def test_doctor_finds_that_everything_works_here():
-    done = avis("doctor", timeout=120.0)
+    done = avis("doctor", timeout=120.0, new_interpreter=True)
     assert done.returncode == 0, done.stdout
     for word in ("numpy", "slycot", "clarabel", "typst", "H-infinity"):
         assert word in done.stdout

@@ -11,9 +11,9 @@ import numpy as np
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.priors import Tolerance
+from avis_ctrl.rigs.rigid_body import COORDINATES
 
 Verdict = Literal["none", "explained", "partly explained", "unexplained"]
-AXES = ("x", "y", "z")
 VERDICTS: tuple[str, ...] = get_args(Verdict)
 
 
@@ -67,7 +67,7 @@ class NamedEffect:
         for name, p in self.parameters.items():
             if not name.startswith("uneven_"):
                 words = spoken(name, p.unit)
-                stem, _, axis = words.rpartition(" ") if words[-2:].strip() in AXES else (words, "", "")
+                stem, _, axis = words.rpartition(" ") if words[-2:].strip() in COORDINATES[:3] else (words, "", "")
                 groups.setdefault(stem, []).append((axis, p))
         # Of these all components are given, also those that are zero.
         direction, position = groups.pop("direction", []), groups.pop("", [])

@@ -200,7 +200,18 @@ def test_the_option_refuses_before_anything_is_read(tmp_path):
 @pytest.mark.slow
 def test_the_option_finds_the_example(example, tmp_path):
     write_campaign(tmp_path / "c.h5", hidden())
-    done = avis("gap", tmp_path / "c.h5", "--rig", "avis", "--out", tmp_path / "out", "--effects", example, env=WIDE)
+    done = avis(
+        "gap",
+        tmp_path / "c.h5",
+        "--rig",
+        "avis",
+        "--out",
+        tmp_path / "out",
+        "--effects",
+        example,
+        env=WIDE,
+        new_interpreter=True,
+    )
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "out" / "gap.json").read_text(encoding="utf-8"))
     assert [(one["name"], one["location"]) for one in found["effects"]] == [("sensor_lowpass", PLACE)]
