@@ -16,6 +16,7 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import simulate_campaign
 from avis_ctrl.study.plan_file import plan_from_table
 
+DESIGN = Path(__file__).resolve().parents[1] / "designs/avis_z_phix.toml"
 PLAN = {
     "title": "short",
     "duration_s": 20.0,
@@ -105,6 +106,8 @@ def test_truncated_files_are_one_line(campaign, tmp_path, keep):
         (("identify", "C", "--rig", "avis", "--out", "o", "--hold-out", "77"), "77"),
         (("identify", "C", "--rig", "avis", "--out", "o", "--columns", "u"), "columns"),
         (("identify", "C", "--rig", "avis"), "--out"),
+        (("identify", "C", "--rig", "avis", "--out", "o", "--design", "none.toml"), "none.toml: no such file"),
+        (("identify", "C", "--rig", str(DESIGN), "--out", "o"), "this is a design file"),
         (("predict", "nowhere", "C", "--out", "p.h5"), "nowhere"),
         (("excite", "--rig", "avis", "--out", "s.h5", "--kind", "chirp"), "chirp"),
         (("excite", "--rig", "avis", "--out", "s.h5", "--rms", "9"), "9"),
@@ -209,6 +212,15 @@ def test_files_that_say_little_are_refused_in_one_line(campaign, flat, tmp_path,
     done = avis(*({"C": str(campaign), "F": str(flat[0])}.get(one, one) for one in arguments))
     assert done.returncode == 2 and done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
     assert said in done.stderr and not list(tmp_path.glob("o*/result.json"))
+
+
+def test_columns_with_other_names_are_refused_with_the_names_of_the_rig(tmp_path):
+    path = tmp_path / "m.csv"
+    path.write_text("t,out0,in0\n" + "".join(f"{k / 1000},0,0\n" for k in range(20)), encoding="utf-8")
+    done = avis("identify", str(path), "--rig", "avis", "--out", str(tmp_path / "o"))
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "--columns u=NAME+NAME,y=NAME+NAME" in done.stderr and "drives Ay1, Az1" in done.stderr
+    assert "sensors Sy1, Sz1" in done.stderr
 
 
 def test_what_the_file_does_not_say_may_be_said(flat, tmp_path):

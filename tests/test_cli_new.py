@@ -143,6 +143,11 @@ def test_unusual_values_are_pointed_out(tmp_path):
     assert done.returncode == 0 and "unusual for a table: damping ratio" in done.stderr
 
 
+def test_a_fraction_instead_of_a_percentage_is_pointed_out(tmp_path):
+    done = avis("new", "design", str(tmp_path / "d.toml"), "--rig", "avis", "--mass", "0.08", "--stiffness", "12")
+    assert done.returncode == 0 and "for a fraction of 0.08 give 8" in done.stderr and "stiffness" not in done.stderr
+
+
 def test_the_shell_completes_commands_and_options():
     """What bash asks the program for, as `avis --install-completion` sets it up."""
     for words, expected in (("avis sim", "simulate-campaign"), ("avis new ", "rig"), ("avis design --o", "--out")):

@@ -50,7 +50,15 @@ def read_measured(path: Path, rig: Rig, columns: str | None = None, **hints: Any
     from avis_ctrl.study.rig_channels import with_rig_names
 
     mapping = parse_columns(columns) if columns else None
-    measured = read_measurements(path, mapping, **hints)
+    try:
+        measured = read_measurements(path, mapping, **hints)
+    except InputError as error:
+        if error.field not in ("u", "y"):  # columns that no usual name assigns
+            raise
+        names = f"drives {', '.join(rig.equations_of_motion().actuators)}; sensors {', '.join(rig.sensor_rows()[0])}"
+        raise InputError(
+            f"{error.expected}; the rig {rig.name} has {names}", file=error.file, field=error.field, value=error.value
+        ) from None
     try:
         return with_rig_names(rig, measured, mapping)
     except InputError as error:

@@ -116,11 +116,13 @@ def identify(
 
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.rigs import load_rig
+    from avis_ctrl.study.design_file import read_design
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.identification_files import FILES
 
     console = Console(highlight=False)
     start = load_rig(rig)
+    template = None if design is None else read_design(design)  # raises at once, not after the fit
     measured = read_measured(measurement, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
         console.print(f"[dim]{note}[/]")
@@ -146,7 +148,7 @@ def identify(
         progress("uncertainty for design")
         try:
             require_readable(found)
-            more, made = design_start(found, design)
+            more, made = design_start(found, template)
             then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
         except AvisError as error:
             # The identification is valid without the design files.

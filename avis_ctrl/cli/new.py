@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -137,6 +138,28 @@ def _check_design(ctx: typer.Context, name: str, value: Any) -> None:
     elif name == "band_dB":
         fields["peak_dB"] = ctx.params.get("peak_dB", NewDesign.peak_dB)
     new_design(NewDesign(**fields), load_rig(ctx.params["rig"]), "rig.toml")
+    if name.endswith("_percent"):
+        _doubt(name, value)
+
+
+@dataclass(frozen=True)
+class PercentSettings:
+    """fraction : a percentage below this [%] is probably meant as a fraction: stiffness and damping are never known so
+    well, and a weighed mass hardly.
+    """
+
+    fraction: float = 0.5
+
+
+PERCENT = PercentSettings()
+
+
+def _doubt(field: str, value: float) -> None:
+    """State on the standard error that a percentage looks like a fraction."""
+    if value < PERCENT.fraction:
+        what = field.removesuffix("_percent")
+        meant = f"for a fraction of {value:g} give {100 * value:g}"
+        print(f"avis: {what} known to within {value:g} %: unusually small; {meant}", file=sys.stderr)
 
 
 DESIGN = ("title", "keep", "band_Hz", "band_dB", "peak_dB", "mass_percent", "stiffness_percent", "damping_percent")

@@ -554,12 +554,12 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
     place = np.unique(np.linspace(0, points.size - 1, RESOLVENT_PROBES).astype(int))
     probes = order[place]
     exact = _eliminated(A, B, C, points[probes])
-    size = np.linalg.norm(exact, axis=(1, 2))
     # At a pole both are infinite and cannot be compared.
-    finite = np.isfinite(size)
+    finite = np.isfinite(exact).all(axis=(1, 2))
     wrong = np.zeros(place.size)
+    size = np.linalg.norm(exact[finite], axis=(1, 2))
     error = np.linalg.norm(response[probes[finite]] - exact[finite], axis=(1, 2))
-    wrong[finite] = ~(error <= RESOLVENT_TOLERANCE * size[finite])
+    wrong[finite] = ~(error <= RESOLVENT_TOLERANCE * size)
     doubtful = order[np.interp(np.arange(points.size), place, wrong) > 0]
     response[doubtful] = _eliminated(A, B, C, points[doubtful])
     return response

@@ -84,6 +84,8 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
         rig = _avis(validated(AvisFile, content))
     elif "suspension" in content:
         rig = _halcyonics(validated(HalcyonicsFile, content), loaded)
+    elif {"rig", "keep"} <= set(content):
+        raise InputError("this is a design file; expected a rig file, such as the one that it names under rig")
     else:
         raise InputError(
             "expected the sections of a rig: [[isolator]] (air mounts) or [suspension] (springs)",

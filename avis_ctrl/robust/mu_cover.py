@@ -68,13 +68,15 @@ def possible_crossings(N: StateSpace, scalings: LmiScalings) -> Array:
 
 
 def _positive(N: StateSpace, scalings: LmiScalings, omega: Array) -> Array:
-    """Whether Phi(omega) > 0 at each frequency, with a round-off margin."""
+    """Whether Phi(omega) > 0 at each frequency, with a round-off margin; not at a pole."""
     M = N.frequency_response(omega)[:, None]
+    finite = np.isfinite(M).all(axis=(1, 2, 3))
+    M = np.where(finite[:, None, None, None], M, 0.0)
     repeated = LmiScalings(*(np.broadcast_to(s, (omega.size, *s.shape)) for s in scalings))
     level = np.ones(N.ninputs, bool)
     F = residual(M, repeated, np.ones(omega.size), level)[:, 0]
     root = np.linalg.inv(np.linalg.cholesky(scalings.X_w))
-    return np.linalg.eigvalsh(root @ F @ dagger(root))[:, 0] > 1e-10
+    return finite & (np.linalg.eigvalsh(root @ F @ dagger(root))[:, 0] > 1e-10)
 
 
 def proved_intervals(N: StateSpace, scalings: LmiScalings, inside: Interval) -> list[Interval]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
+import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance
@@ -51,11 +52,13 @@ CURVES = CurveSettings()
 
 @dataclass(frozen=True)
 class StabilitySettings:
-    """round_off : real part over the largest magnitude of all poles above which a pole may lie on the imaginary axis
-    [1]: a few rounding errors of an eigenvalue.
+    """round_off : relative change of A [1] that counts as round-off: a few rounding errors of the eigenvalues.
+    near : distance of a pole from the limit of stability, over the norm of A [1], below which this is tested. Round-off
+        moves a double pole by its square root (1e-8), a triple pole by its cube root (1e-5).
     """
 
     round_off: float = 1e-15
+    near: float = 1e-5
 
 
 STABILITY = StabilitySettings()
@@ -232,19 +235,38 @@ def _checked(
     if not 1e-5 <= slack <= 0.1:
         raise InputError("expected 1e-5 to 0.1", field="slack", value=slack)
     N = as_system(N, "N")
-    poles = N.poles()
-    # Positive for an unstable pole; eigenvalues are known to round-off of the largest one.
-    growth = np.abs(poles) - 1 if N.dt else poles.real / max(float(np.max(np.abs(poles), initial=0.0)), 1e-300)
-    if poles.size and np.max(growth) >= -STABILITY.round_off:
+    if (pole := _not_stable(N)) is not None:
         raise ComputationError(
             "the bounds of mu need a stable system",
-            measured=f"pole {poles[np.argmax(growth)]:.6g}",
+            measured=f"pole {pole:.6g}",
             cause="the nominal closed loop is unstable, or has a mode at the limit of stability that the controller "
             "does not affect",
             next_step="stabilise the loop, or leave out the states of this mode if no output depends on them "
-            "(avis_ctrl.lti.minimal)",
+            "(avis_ctrl.lti.minimal; for free motion of a whole mechanism, use differences of positions as states)",
         )
     return N, BlockStructure.of(blocks)
+
+
+def _not_stable(N: StateSpace) -> complex | None:
+    """A pole that is unstable, or at the limit of stability up to round-off; None if there is none.
+
+    At the limit: a change of A by round-off moves a pole to the nearest point s of the imaginary axis (unit circle).
+    The smallest such change has the norm sigma_min(s I - A).
+    """
+    if not N.nstates:
+        return None
+    poles = N.poles()
+    growth = np.abs(poles) - 1 if N.dt else poles.real
+    worst = int(np.argmax(growth))
+    if growth[worst] >= 0:
+        return complex(poles[worst])
+    A = la.matrix_balance(N.A, permute=False)[0]
+    size = np.linalg.norm(A, 2)
+    close = poles[(growth >= -STABILITY.near * size) & (poles.imag >= 0)]
+    points = close / np.abs(close) if N.dt else 1j * close.imag
+    distances = np.linalg.svd(points[:, None, None] * np.eye(N.nstates) - A, compute_uv=False)[:, -1]
+    doubtful = close[distances <= STABILITY.round_off * size]
+    return complex(doubtful[np.argmax(doubtful.real)]) if doubtful.size else None
 
 
 def _prepared(N: StateSpace, structure: BlockStructure) -> Coupled:

@@ -88,6 +88,9 @@ def robust_stability(
 ) -> Robustness:
     """Size of the uncertainty, relative to the declared uncertainty, up to which a loop is stable.
 
+    The size is that of the normalised delta. If the range of a real parameter is not symmetric about its nominal value,
+    its value is a fractional function of delta (see `real`), so 0.73 times the uncertainty is not 0.73 times the range.
+
     Parameters
     ----------
     system : an `UncertainSystem`, or an LFT (w_delta, d -> z_delta, e) as StateSpace (avis_ctrl or python-control) with

@@ -277,6 +277,11 @@ def read_design(path: str | Path) -> Design:
 
 def design_from_table(table: dict[str, Any], file: object = None) -> Design:
     """Check a design given as nested dictionaries."""
+    if {"isolator", "suspension"} & set(table):
+        raise InputError(
+            "this is a rig file; expected a design file, which names it under rig (avis new design writes one)",
+            file=file,
+        )
     design = validated(Design, table, file)
     try:
         _require_band_below_crossovers(design)

@@ -35,7 +35,9 @@ def real(
     """An uncertain real number, given by exactly one of percent, plus_minus and range.
 
     percent, plus_minus : half the range, relative or absolute; a pair is (below, above). range : (low, high).
-    If the range is not symmetric about the nominal value, delta = 0 is still the nominal value.
+    If the range is not symmetric about the nominal value, delta = 0 is still the nominal value, and the value is a
+    fractional function of delta. A result such as "stable for 0.73 times the declared uncertainty" means
+    |delta| < 0.73; the ends of this range are not at 0.73 times the distances of low and high from the nominal value.
 
     Raises InputError for a range that does not contain the nominal value.
 

@@ -177,8 +177,9 @@ class UncertainSystem:
     def substitute(self, values: Mapping[str, Any] | None = None, **more: Any) -> Any:
         """The system with some elements at given values; a StateSpace or an array if no uncertain element remains.
 
-        A real parameter takes a number; a complex one a real number or a stable system (its value over frequency);
-        dynamics take a number, a matrix or a stable system in place of Delta, of norm at most 1.
+        A real parameter takes a number, also one outside its declared range; a complex one a real number or a stable
+        system (its value over frequency); dynamics take a number, a matrix or a stable system in place of Delta, of
+        norm at most 1.
 
         Raises
         ------

@@ -548,3 +548,33 @@ def test_a_hidden_mode_at_the_limit_of_stability_is_an_error():
         loop = StateSpace(A - shift * np.eye(4), [[0], [1 / J[0]], [0], [0]], [[0, 1, 0, 0]], [[0.0]])
         with pytest.raises(ComputationError, match=r"need a stable system.*at the limit of stability"):
             mu_peak(loop, [ComplexScalar(1)])
+
+
+def test_free_motion_of_a_mechanism_is_an_error():
+    """Two inertias and a spring. With a damper to ground at the motor the common angle is one integrator that round-off
+    moves to about -1e-13; without it, a double integrator that round-off moves to about -1e-15 +- 1e-7 j."""
+    k, b, J1, J2 = 120.0, 0.03, 0.02, 0.05
+    for ground in (0.05, 0.0):
+        A = np.array(
+            [
+                [0, 0, 1, 0],
+                [0, 0, 0, 1],
+                [-k / J1, k / J1, -(b + ground) / J1, b / J1],
+                [k / J2, -k / J2, b / J2, -b / J2],
+            ]
+        )
+        for sign in (1, -1):  # round-off may fall on either side
+            loop = StateSpace(A + sign * 1e-15 * np.eye(4), [[0], [0], [1 / J1], [0]], [[0, 0, 1, 0]], [[0.0]])
+            with pytest.raises(ComputationError, match=r"at the limit of stability.*differences of positions"):
+                mu_peak(loop, [ComplexScalar(1)])
+
+
+def test_many_equal_or_slow_poles_are_not_at_the_limit_of_stability():
+    lag = StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
+    chain = lag
+    for _ in range(9):
+        chain = chain @ lag
+    slow = StateSpace([[-1e-3, 0.0], [1e3, -1e6]], [[1.0], [0.0]], [[0.0, 1e3]], [[0.0]])
+    sampled = StateSpace([[1 - 1e-6, 1.0], [0.0, 1 - 1e-6]], [[0.0], [1.0]], [[1e-13, 0.0]], [[0.0]], dt=1e-3)
+    for loop in (chain, slow, sampled):
+        assert mu_peak(loop, [ComplexScalar(1)]).guaranteed

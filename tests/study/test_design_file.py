@@ -221,6 +221,13 @@ def test_negative_stiffness_in_a_rig_file_beside_the_design(tmp_path):
         read_study(written(tmp_path, changed("rig", "mine.toml")))
 
 
+def test_a_rig_file_is_no_design_file_and_the_reverse():
+    with pytest.raises(InputError, match=r"avis\.toml: this is a rig file"):
+        read_design(DESIGNS.parent / "avis_ctrl/rigs/data/avis.toml")
+    with pytest.raises(InputError, match=r"avis_z_phix\.toml: this is a design file"):
+        load_rig(DESIGNS / "avis_z_phix.toml")
+
+
 @pytest.mark.parametrize("kind", ["missing", "folder", "empty", "binary", "not TOML", "deep nesting", "null byte"])
 def test_files_that_are_no_design_end_in_one_line_and_code_2(kind, tmp_path, monkeypatch, capsys):
     path, out = tmp_path / "d.toml", tmp_path / "out"

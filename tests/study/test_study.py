@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,13 @@ import pytest
 from avis_ctrl.lti import StateSpace
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu import mu
+from avis_ctrl.robust.musyn_state import HINF, Iteration
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot, mu_upper_slicot
+from avis_ctrl.study import runner
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.controllers import passive
 from avis_ctrl.study.design_file import Design, design_from_table, read_study
-from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.study.design_result import Candidate, DesignResult
 from avis_ctrl.study.output import write_study
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.random_plants import random_perturbations
@@ -406,3 +409,21 @@ def test_whole_study_of_a_shipped_design(name, tmp_path):
     assert any("D-K iteration" in line for line in said)
     numbers = [int(line.split()[1].rstrip(",")) for line in said if line.startswith("step ")]
     assert numbers == [row["iteration"] for row in stored["dk_history"]] == [*range(len(numbers))]
+
+
+def test_a_stop_request_is_heard_from_the_first_initial_controller_on(monkeypatch):
+    """Ctrl-C after the line of step 0 keeps this controller, also before the first D-K step is done."""
+    answers, events = [], []
+
+    def mu_optimal(design, plant, rig, callback, rivals):
+        answers.append(callback(Iteration(0, 2.0, 1.9, 30, 0.0, 0, 0.1, HINF)))
+        return Candidate("mu", "mu synthesis", "mu", None, ("stopped",)), None
+
+    def stop_requested():
+        events.append("listens")
+        return True
+
+    monkeypatch.setattr(runner, "mu_optimal", mu_optimal)
+    given: Any = None
+    runner.synthesise(given, given, given, [], lambda line: events.append(line[:6]), nullcontext(stop_requested))
+    assert answers == [False] and events[:2] == ["listens", "step 0"]

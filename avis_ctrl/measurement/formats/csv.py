@@ -179,8 +179,8 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
                     value=", ".join(layout.names)[:60],
                 )
             raise InputError(
-                f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns "
-                "(roles t, u, y, floor)",
+                f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns, on "
+                "the command line --columns u=NAME+NAME,y=NAME+NAME (roles t, u, y, floor)",
                 field=role,
                 value=roles[role],
             )
