@@ -101,6 +101,17 @@ class Scenarios:
         a, f = len(self.payload), len(self.floor)
         return Channels(P[..., :a, :f], P[..., :a, f:], P[..., a:, :f], P[..., a:, f:])
 
+    def open_loop(self) -> np.ndarray:
+        """det(j omega I - A) of every plant, the loops open, divided by that of the nominal plant (plants, n_omega)."""
+        P, n_w, n_z = self.plant.P, self.plant.blocks.n_w, self.plant.blocks.n_z
+        deltas = self.deltas[: self.plants, 0]
+        poles = np.linalg.eigvals(
+            P.A + P.B[:, :n_w] @ deltas @ np.linalg.solve(np.eye(n_z) - P.D[:n_z, :n_w] @ deltas, P.C[:n_z])
+        )
+        poles = np.take_along_axis(poles, np.argsort(np.abs(poles), axis=-1), axis=-1)  # factors of similar size
+        factors = 1j * self.omega[:, None] - poles[:, None, :]
+        return np.prod(factors / factors[:1], axis=-1)
+
 
 def _boundary(plant: GeneralizedPlant, rng: np.random.Generator, phase: complex) -> np.ndarray:
     """Real scalars at +-1, complex blocks of unit norm with the given phase."""
@@ -170,7 +181,7 @@ class Merit:
     """Figure of merit of a tuning, on samples or on the whole set; smaller is better.
 
     Stable tunings that meet the limit on the peak rank before all others, by their transmissibility in the band. The
-    others rank by `unstable`, then by their peak. unstable : half turns of the return difference about the origin.
+    others rank by `unstable`, then by their peak. unstable : number of unstable poles.
     """
 
     peak: float
@@ -204,6 +215,11 @@ class Search:
         return self.scenarios.channels()
 
     @cached_property
+    def open_loop(self) -> np.ndarray:
+        """Characteristic polynomials of the sampled plants without control, relative to the nominal one."""
+        return self.scenarios.open_loop()
+
+    @cached_property
     def inside(self) -> np.ndarray:
         """Mask of the frequencies inside the band (n_omega,)."""
         low, high = (2 * np.pi * f for f in self.band_Hz)
@@ -212,12 +228,23 @@ class Search:
     def merit(self, point: np.ndarray, limit: float) -> Merit:
         """Merit of a tuning on the samples."""
         K, _ = self._loops(point)
-        # Unstable loops have finite responses too: for stability the return difference must not encircle the origin. A
-        # sample with the worst case of each frequency by itself is not a plant, so its encirclements have no meaning.
-        plants = self.channels.yu[: self.scenarios.plants]
-        turns = encirclements(np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :]))
         sigma = largest_singular_value(self.channels.closed(K))
-        return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, turns)
+        return Merit(float(np.max(sigma)), float(np.max(sigma[:, self.inside])), limit, self._unstable(point, K))
+
+    def _unstable(self, point: np.ndarray, K: np.ndarray) -> float:
+        """Largest number of unstable poles over the sampled plants; unstable loops have finite responses too.
+
+        The poles of the nominal closed loop are computed. Those of the other plants follow from the phase of their
+        characteristic polynomial relative to the nominal one. This phase is smooth if the closed loops are damped. The
+        phase of det(I - P K) by itself is not: at each lightly damped mode of the table without control it turns by 180
+        degrees between two frequencies of the grid. A sample with the worst case of each frequency by itself is not a
+        plant and does not count.
+        """
+        nominal = self.scenarios.plant.closed(self.search.skyhook(self.axes, point).controller()).poles()
+        plants = self.channels.yu[: self.scenarios.plants]
+        returned = np.linalg.det(np.eye(len(self.axes)) - plants * K[:, None, :])
+        turned = half_turns(returned / returned[:1] * self.open_loop)
+        return float(np.count_nonzero(nominal.real >= 0) + max(0.0, -np.min(turned)))
 
     def starts(self) -> list[np.ndarray]:
         """The classical tunings: multiples of critical damping with the usual corners and corners around them."""
@@ -303,7 +330,8 @@ def _minimax_step(
     return program.x[:n] if program.status == 0 else np.zeros(n)
 
 
-def encirclements(return_difference: np.ndarray) -> float:
-    """Largest number of half turns of det(I - P K) about the origin over the samples, from its phase."""
-    phase = np.unwrap(np.angle(return_difference), axis=-1)
-    return float(np.max(np.round(np.abs(phase[..., -1] - phase[..., 0]) / np.pi)))
+def half_turns(curves: np.ndarray) -> np.ndarray:
+    """Number of half turns of each curve (n, n_omega) about the origin over frequency, counter-clockwise positive."""
+    phase = np.unwrap(np.angle(curves), axis=-1)
+    turned: np.ndarray = np.round((phase[..., -1] - phase[..., 0]) / np.pi)
+    return turned

@@ -28,7 +28,8 @@ class PlantCheck:
     peak_V, limit_V : largest demanded voltage of the drive that comes closest to its limit, and that limit.
     rms_V : of the demanded voltages, maximum over the drives.
     clipped_dac, clipped_adc : number of samples beyond the limits.
-    payload_rms : r.m.s. velocity by controlled axis [m/s], rotations at the edge.
+    payload_rms : r.m.s. velocity by controlled axis [m/s], rotations at the edge; at all frequencies of the
+        record.
     """
 
     name: str

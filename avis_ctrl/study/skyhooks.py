@@ -37,6 +37,8 @@ class SkyhookSettings:
     rounds : maximum number of times that the worst case of the best tuning is added to the samples.
     agreement : relative excess of a worst case over the samples' largest value above which it is added to them.
     room : fraction of the limit that is the target of the search, so that the worst case ends below the limit.
+    restrained : fraction of the target, and of the limit times room, above which a peak counts as at it. Below it the
+        limit does not restrain the search; above it nothing is left to gain.
     certified : number of tunings, besides the classical one, for which the bound over the whole set is computed; if a
         bound is above the limit, its worst case and frequency are added to the samples for the next tuning.
     beside : frequencies added around the worst one, as factors, so that a narrow peak is not missed.
@@ -47,7 +49,8 @@ class SkyhookSettings:
     rounds: int = 12
     agreement: float = 0.01
     room: float = 0.99
-    certified: int = 5
+    restrained: float = 0.97
+    certified: int = 8
     beside: tuple[float, ...] = (0.95, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05)
     ascents: int = 2
     ascent_steps: int = 12
@@ -69,7 +72,7 @@ def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
 def tuned_skyhook(
     plant: DesignPlant, rig: Rig, design: Design, peak_limit: float, settings: SkyhookSettings = SkyhookSettings()
 ) -> Candidate:
-    """The best skyhook found for a limit on the worst-case peak.
+    """The best skyhook found for a limit on the worst-case peak: gains of all axes and both corners.
 
     Of the tunings that meet the limit, it has the smallest worst-case transmissibility in the band. If none meets it,
     it has the smallest worst-case peak, and a note states this. By the bounds over the whole set it is never worse than
@@ -82,19 +85,28 @@ def tuned_skyhook(
     evaluation = WorstCaseTuning(plant, design, peak_limit, settings)
     classical = classical_loops(plant, rig, design)
     ranked = [(evaluation.certified(classical)[0], classical)]
-    task, target = evaluation.search(rig), settings.room * peak_limit
+    task, highest = evaluation.search(rig), settings.room * peak_limit
+    target = highest
     points = [task.search.point(1.0, CUSTOMARY_CORNERS_HZ)]
     for _ in range(settings.certified):
         found, points, task = evaluation.tuned(task, points, target)
         loops = task.search.skyhook(plant.axes, found)
+        if loops in [known for _, known in ranked[1:]]:
+            break
         bound, worst = evaluation.certified(loops)
         ranked.append((bound, loops))
-        if bound.meets or worst is None:
+        if worst is None:
             break
+        if bound.meets:
+            # What the bound leaves below the limit is given to the search, if its target restrained it.
+            if bound.peak < settings.restrained * target or bound.peak > settings.restrained * highest:
+                break
+            target = min(highest, target * highest / bound.peak)
+            continue
         task = evaluation.with_worst_case(task, worst)
         # The bound lies above the worst case found: the search has to stay below the limit by the same ratio.
-        missed = evaluation.worst(task, found)[0].peak / bound.peak if np.isfinite(bound.peak) else 1.0
-        target = settings.room * peak_limit * min(1.0, missed)
+        attained = max(worst.lower, evaluation.worst(task, found)[0].peak)
+        target = highest * min(1.0, attained / bound.peak) if np.isfinite(bound.peak) else highest
     best, loops = min(ranked, key=lambda one: one[0].key())
     if best.unstable:
         raise ComputationError(
@@ -104,11 +116,15 @@ def tuned_skyhook(
             cause="the phase of the sensors and the delay turns damping into excitation",
             next_step="change the corners in [skyhook], or use sensors with a lower corner",
         )
-    notes = [in_words(loops), *at_limits(loops, task.search)]
+    low, high = evaluation.band_Hz
+    notes = [
+        in_words(loops),
+        f"tuned for the smallest worst-case transmissibility from {low:g} to {high:g} Hz with a worst-case peak of at "
+        f"most {decibels(peak_limit):+.2f} dB, not for mu; the drive voltage is not limited",
+        *at_limits(loops, task.search),
+    ]
     if loops is classical:
-        notes.append(
-            "this is critical damping with the usual corners: no better tuning was found for the whole uncertainty set"
-        )
+        notes.append("this is critical damping with the usual corners: none of the other tunings tried is better")
     if not best.meets:
         reached = (
             f"this one has the lowest, {decibels(best.peak):+.2f} dB"

@@ -60,9 +60,11 @@ def test_the_peak_voltage_is_that_of_the_drive_nearest_to_its_limit(limited: Des
     assert table.rows[0][4].endswith(" of 4.00 V")
 
 
-def test_one_limit_is_said_once(simulated: DesignResult) -> None:
+def test_caption_states_the_frequencies_of_the_velocity_and_one_limit_once(simulated: DesignResult) -> None:
     table = next(p for p in simulation(simulated).pieces if isinstance(p, Table) and "Every" in p.caption)
     assert "Commanded voltages, limit 10.0 V;" in table.caption and table.rows[0][4] == "0 V"
+    half_rate = simulated.rig.sample_rate_Hz / 2
+    assert f"The velocity contains all frequencies up to {half_rate:.0f} Hz" in table.caption
 
 
 def test_each_axis_is_weighed_against_the_drive_that_reaches_its_limit_first(limited: DesignResult) -> None:

@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 
 from avis_ctrl.classical.skyhook import Skyhook
-from avis_ctrl.classical.tuning import TuningRange
-from avis_ctrl.lti import gain
+from avis_ctrl.classical.tuning import Merit, TuningRange
+from avis_ctrl.lti import gain, lft_lower
+from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import worst_case_gain
 from avis_ctrl.study.controllers import best_of, mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.design_result import Bound, Candidate, ControllerResult
+from avis_ctrl.study.new_files import NewDesign, NewRig, new_design, rig_text
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.skyhooks import (
+    CUSTOMARY_CORNERS_HZ,
     SkyhookSettings,
     WorstCaseTuning,
     at_limits,
@@ -27,6 +30,7 @@ from avis_ctrl.study.skyhooks import (
     critical_gains,
     tuned_skyhook,
 )
+from avis_ctrl.uncertainty.generalized_plant import sample_lft
 
 DESIGN = Path(__file__).resolve().parents[2] / "designs" / "avis_z_phix.toml"
 
@@ -48,13 +52,13 @@ def bounds(design: Design, plant: DesignPlant, K) -> tuple[float, float]:
     closed = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(K)
     band = tuple(2 * np.pi * f for f in design.transmissibility.band_Hz)
     return (
-        worst_case_gain(closed, plant.full.blocks, slack=5e-3).upper,
-        worst_case_gain(closed, plant.full.blocks, band=band, slack=5e-3).upper,
+        worst_case_gain(closed, plant.full.blocks, slack=5e-3, points=8).upper,
+        worst_case_gain(closed, plant.full.blocks, band=band, slack=5e-3, points=8).upper,
     )
 
 
 def test_the_worst_case_of_a_bound_is_a_plant_whose_stability_counts(one_axis):
-    """A perturbation that destabilises a tuning makes its encirclements count, not only its largest gain."""
+    """A perturbation that destabilises a tuning makes its instability count, not only its largest gain."""
     design, plant = one_axis
     evaluation = WorstCaseTuning(plant, design, 2.0, SkyhookSettings(samples=2))
     task = evaluation.search(load_rig("avis"))
@@ -62,6 +66,45 @@ def test_the_worst_case_of_a_bound_is_a_plant_whose_stability_counts(one_axis):
     more = evaluation.with_worst_case(task, SimpleNamespace(omega=2 * np.pi * 3.3, delta=delta))
     assert more.scenarios.plants == task.scenarios.plants + 1 == len(more.scenarios.deltas)
     assert 2 * np.pi * 3.3 in more.scenarios.omega
+
+
+@pytest.fixture(scope="module")
+def light_table(tmp_path_factory) -> tuple[Design, DesignPlant, Rig]:
+    """z and phi_y of a table on mounts of 3 % damping: peaks narrower than the grid of the search."""
+    file = tmp_path_factory.mktemp("light") / "rig.toml"
+    file.write_text(rig_text(NewRig("light", 180.0, (0.9, 0.7, 0.25), 3, 4.0, 3.2, sample_rate_Hz=2000.0)))
+    rig = load_rig(str(file))
+    design = new_design(
+        NewDesign("light", keep=("z", "phi_y"), band_Hz=(3.0, 15.0), band_dB=-8.0, peak_dB=4.0), rig, "rig.toml"
+    )
+    return design, build_plant(design, rig), rig
+
+
+def test_lightly_damped_modes_are_not_taken_for_instability(light_table):
+    """They turn the phase of det(I - P K) by 180 degrees between two frequencies of the grid."""
+    design, plant, rig = light_table
+    search = WorstCaseTuning(plant, design, 2.0, SkyhookSettings()).search(rig)
+    motion = search.scenarios.plant
+    for factor in (0.3, 1.0, 2.5):
+        point = search.search.point(factor, CUSTOMARY_CORNERS_HZ)
+        K = search.search.skyhook(search.axes, point).controller()
+        for delta in search.scenarios.deltas[:, 0].real:
+            assert lft_lower(sample_lft(motion.P, motion.blocks, delta), K).is_stable()
+        assert search.merit(point, 2.0).unstable == 0
+
+
+def test_no_multiple_of_the_tuned_gains_is_better(light_table):
+    """By the bounds over the whole set: least transmissibility in the band of all that keep the limit on the peak."""
+    design, plant, rig = light_table
+    limit = 10 ** (4 / 20)
+    tuned = tuned_skyhook(plant, rig, design, limit, SkyhookSettings(samples=4))
+    assert "from 3 to 15 Hz with a worst-case peak of at most +4.00 dB" in " ".join(tuned.notes)
+    merits = {
+        factor: Merit(*bounds(design, plant, tuned.K.scaled(left=factor)), limit)
+        for factor in (1.0, 0.5, 1.25, 1.6, 2.5, 4.0)
+    }
+    assert merits[1.0].meets
+    assert min(merits, key=lambda factor: merits[factor].key()) == 1.0
 
 
 @pytest.mark.slow

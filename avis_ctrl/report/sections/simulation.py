@@ -56,7 +56,9 @@ def _plants(check: SimulationCheck) -> Table:
     nearest = "of the drive that comes closest to its limit;" if differ else "limit"
     return table(
         f"Every simulated plant. Commanded voltages, {nearest} {words.limits(limits)}; clipped samples of "
-        "drives and converter together.",
+        "drives and converter together. The velocity contains all frequencies up to "
+        f"{words.number(loop.rig.sample_rate_Hz / 2)} Hz, unlike the comparison of controllers, which is for the band "
+        "of the floor only.",
         ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped", "velocity r.m.s. [µm/s]"),
         rows,
         "lcccrrl",
