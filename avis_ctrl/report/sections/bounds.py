@@ -17,7 +17,7 @@ BoundOf = Callable[[ControllerResult], Bound]
 
 def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and the perturbations that attain the lower bounds."""
-    pieces: list[Piece] = [*certificate(result)]
+    pieces: list[Piece] = [certificate(result), *([Paragraph(result.limits)] if result.limits else [])]
     pieces += [
         _figure(
             "mu_performance",
@@ -41,8 +41,8 @@ def bounds(result: DesignResult) -> Section:
     return Section("Bounds of mu", "bounds", tuple(pieces))
 
 
-def certificate(result: DesignResult) -> list[Paragraph]:
-    """Both bounds of mu, whether the upper one is guaranteed between the computed frequencies, and what is limiting."""
+def certificate(result: DesignResult) -> Paragraph:
+    """Both bounds of mu, and whether the upper one is guaranteed between the computed frequencies."""
     mu = result.controller("mu").mu
     gap = 100 * (1 - mu.lower / mu.upper) if np.isfinite(mu.upper) and mu.upper > 0 else np.nan
     between = (
@@ -57,13 +57,12 @@ def certificate(result: DesignResult) -> list[Paragraph]:
         if np.isfinite(mu.lower) and mu.lower > 0
         else ""
     )
-    peak = Paragraph(
+    return Paragraph(
         f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
         f"{words.bound(mu.upper, digits_apart(mu.upper, 1.0, 4))}, at {words.hertz(mu.omega)}"
         + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
         + f". If mu is below 1, every plant of the uncertainty set meets every bound. {between}{reached}"
     )
-    return [peak, *([Paragraph(result.limits)] if result.limits else [])]
 
 
 def _figure(name: str, result: DesignResult, bound_of: BoundOf, label: str, what: str, meaning: str) -> Figure:

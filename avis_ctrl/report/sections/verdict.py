@@ -45,7 +45,7 @@ def verdict(result: DesignResult) -> Section:
     return Section(
         "Summary",
         "verdict",
-        (_sentence(result), _asked(result, bool(met)), *met, *certificate(result), summary_figure(result)),
+        (_sentence(result), _asked(result, bool(met)), *met, certificate(result), summary_figure(result)),
         alone=True,
     )
 
