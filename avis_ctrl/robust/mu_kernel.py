@@ -25,9 +25,8 @@ class PathSettings(NamedTuple):
     reach : fraction of the distance to the boundary by which lambda decreases in one step: values closer to 1 need
         fewer steps, but more Newton steps for each.
     first, shrink : first trial of that distance, relative to its lower bound, and the factor to the next trial.
-    newton, steps : maximum number of Newton steps to a centre, and of centres; neither is reached in practice. Bounds
-        of skewed mu with real and repeated blocks need up to 250 centres at low frequency; limited to 60, some were
-        four times too large.
+    newton, steps : maximum number of Newton steps to a centre, and of centres. A path that ends at its last centre
+        gives a valid bound that is larger than necessary.
     """
 
     central: float = 0.3
@@ -36,10 +35,13 @@ class PathSettings(NamedTuple):
     first: float = 3.0
     shrink: float = 0.7
     newton: int = 40
-    steps: int = 400
+    steps: int = 60
 
 
 SETTINGS = PathSettings()
+# Skewed mu with real and repeated blocks needs up to 250 centres at low frequency; limited to 60, some bounds were four
+# times too large.
+SKEWED = PathSettings(steps=400)
 
 
 class Entries(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 
 from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal, level_squares
 from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
+from avis_ctrl.robust.mu_kernel import SKEWED
 from avis_ctrl.robust.mu_lmi import Array, LmiScalings, ScalingSpace, dagger, follow, least_level, residual
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -264,7 +265,7 @@ def _skewed_from(
     first = np.maximum(least_level(unit, space.scalings(theta), space.level), 1e-300)
     size = np.sqrt(first)
     scaled = unit / np.where(space.level, size[:, None], 1.0)[:, None, None, :]
-    theta, _ = follow(space, scaled, theta, np.full(batch, 2.0), -1e-8, tolerance)
+    theta, _ = follow(space, scaled, theta, np.full(batch, 2.0), -1e-8, tolerance, SKEWED)
     scalings = space.scalings(theta)
     beta = size * np.sqrt(np.maximum(least_level(scaled, scalings, space.level), 0.0))
     return beta, rescaled(scalings, d_z, d_w, np.ones(batch))

@@ -81,7 +81,7 @@ def test_studies_without_a_rig_file_are_compared(folders, tmp_path):
     content = json.loads((folders[0] / "study.json").read_text())
     (tmp_path / "study.json").write_text(json.dumps({**content, "rig": None}))
     (tmp_path / "result.json").write_text((folders[0] / "result.json").read_text())
-    assert "different rig file;" in compare_designs(folders[0], tmp_path).note
+    assert "requested differently (rig file)" in compare_designs(folders[0], tmp_path).note
 
 
 @pytest.mark.parametrize(
