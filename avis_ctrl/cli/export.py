@@ -125,9 +125,9 @@ def export(
     peak_dB = min(folder.design.upper_limits("worst_case_peak_transmissibility_dB"), default=math.inf)
     if made.replay and (simulated := decibels(made.replay.gain)) > peak_dB:
         console.print(
-            f"With all six axes, the compiled code reaches {simulated:.2f} dB simulated in the worst plant. The "
-            f"design requires at most {peak_dB:g} dB for its axes, with the others locked; to include the others, add "
-            "them to keep in the design file."
+            f"With all six axes, the gain of the worst plant simulated with the compiled code is {simulated:.2f} dB. "
+            f"The design requires at most {peak_dB:g} dB for its axes, with the others locked; to include these, "
+            "add them to keep in the design file."
         )
     console.print(f"{len(files)} files in {path}")
 

@@ -49,21 +49,6 @@ def _with_options(ctx: typer.Context, error: InputError) -> InputError:
     return InputError(error.expected, file=error.file, field=option, value=error.value)
 
 
-RIG = (
-    "name",
-    "mass_kg",
-    "size_m",
-    "mounts",
-    "vertical_Hz",
-    "horizontal_Hz",
-    "damping",
-    "constant_N_per_V",
-    "limit_V",
-    "geophone",
-    "sample_rate_Hz",
-)
-
-
 def _check_rig(ctx: typer.Context, name: str, value: Any) -> None:
     from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
@@ -109,7 +94,7 @@ def rig(
     from avis_ctrl.files import write_whole
     from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
-    new = NewRig(**_rig_fields({field: ctx.params[field] for field in RIG}))
+    new = NewRig(**_rig_fields({field: ctx.params[field] for field in vars(NewRig())}))
     try:
         modes = rig_of(new).equations_of_motion().natural_frequencies().frequencies_Hz
     except InputError as error:

@@ -76,13 +76,13 @@ class NamedEffect:
             for stem, group in groups.items()
             if (kept := [(axis, p) for axis, p in group if not (p.std or 0.0) > abs(p.value) / 2])
         }
-        told = dict(list((certain or groups).items())[:3])
+        shown = dict(list((certain or groups).items())[:3])
         if direction:
-            told["direction"] = direction
+            shown["direction"] = direction
         if known := [(axis, p) for axis, p in position if p.std and np.isfinite(p.std)]:
-            told["line of action through" if direction else "position"] = known
+            shown["line of action through" if direction else "position"] = known
         sizes = ", ".join(
-            f"{stem} {', '.join(f'{axis} {p}'.lstrip() for axis, p in group)}" for stem, group in told.items()
+            f"{stem} {', '.join(f'{axis} {p}'.lstrip() for axis, p in group)}" for stem, group in shown.items()
         )
         ties = (
             f"; these data cannot distinguish it from {' or '.join(self.indistinguishable_from)}"

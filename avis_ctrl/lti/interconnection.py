@@ -5,12 +5,23 @@ The internal signals, at A, can be closed by integrators or by uncertain element
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.linalg as la
 
 Quadruple = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-# Number of times that rows and columns are scaled: the first removes the units, the others change little.
-SWEEPS = 3
+
+
+@dataclass(frozen=True)
+class ScalingSettings:
+    """sweeps : number of times that rows and columns are scaled: the first removes the units, the others change
+    little."""
+
+    sweeps: int = 3
+
+
+SETTINGS = ScalingSettings()
 
 
 def series(X: Quadruple, Y: Quadruple) -> Quadruple:
@@ -50,7 +61,7 @@ def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
 def singular(D: np.ndarray, most: float) -> bool:
     """Whether the condition number of a square matrix exceeds `most`, with rows and columns scaled to similar size, so
     that their units do not matter."""
-    for _ in range(SWEEPS):
+    for _ in range(SETTINGS.sweeps):
         for axis in (1, 0):
             size = np.linalg.norm(D, axis=axis, keepdims=True)
             D = D / np.where(size > 0, size, 1.0)

@@ -30,9 +30,14 @@ RESOLVENT_BLOCK = 16
 RESOLVENT_PROBES, RESOLVENT_TOLERANCE = 6, 1e-6
 
 
+def as_names(given: Iterable[str] | None) -> Names:
+    """Names as a tuple; a string is one name."""
+    return () if given is None else (given,) if isinstance(given, str) else tuple(str(name) for name in given)
+
+
 def signal_names(given: Iterable[str] | None, count: int, prefix: str, what: str, different: bool = True) -> Names:
-    """Checked names of inputs, outputs or states: a string is one name; prefix0, prefix1, ... if none are given."""
-    names = () if given is None else (given,) if isinstance(given, str) else tuple(str(name) for name in given)
+    """Checked names of inputs, outputs or states; prefix0, prefix1, ... if none are given."""
+    names = as_names(given)
     if not names:
         return tuple(f"{prefix}{k}" for k in range(count))
     if len(names) != count:
@@ -43,10 +48,15 @@ def signal_names(given: Iterable[str] | None, count: int, prefix: str, what: str
     return names
 
 
+def default_names(ninputs: int, noutputs: int) -> tuple[Names, Names]:
+    """(inputs, outputs) of a system whose signals have no names."""
+    return signal_names((), ninputs, "u", "input"), signal_names((), noutputs, "y", "output")
+
+
 def names_of_inverse(inputs: Names, outputs: Names) -> tuple[Names, Names]:
     """(inputs, outputs) of an inverse: those of the system exchanged, unless all are default names."""
-    default = signal_names((), len(inputs), "u", "input"), signal_names((), len(outputs), "y", "output")
-    return (inputs, outputs) if (inputs, outputs) == default else (outputs, inputs)
+    unnamed = (inputs, outputs) == default_names(len(inputs), len(outputs))
+    return (inputs, outputs) if unnamed else (outputs, inputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,13 +223,7 @@ class StateSpace:
         return dividend * self.inverse()
 
     def __pow__(self, power: int) -> StateSpace:
-        if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
-            raise InputError("expected a whole number", field="power", value=power)
-        base = self if power >= 0 else self.inverse()
-        result = base if power else gain(np.eye(self.noutputs), dt=self.dt)
-        for _ in range(abs(int(power)) - 1):
-            result = result @ base
-        return result
+        return to_power(self, power, gain(np.eye(self.noutputs), dt=self.dt))
 
     def __add__(self, other: Any) -> StateSpace:
         """Parallel connection of two systems of equal shape; a number can be added to a scalar system."""
@@ -367,6 +371,17 @@ class StateSpace:
         return f"StateSpace({size}, {clock}, {list(self.inputs)} -> {list(self.outputs)})"
 
 
+def to_power(system: Any, power: int, identity: Any) -> Any:
+    """Whole power of a square system. Raises InputError for another power, and the errors of `inverse`."""
+    if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
+        raise InputError("expected a whole number", field="power", value=power)
+    base = system if power >= 0 else system.inverse()
+    result = base if power else identity
+    for _ in range(abs(int(power)) - 1):
+        result = result @ base
+    return result
+
+
 def new_names(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names:
     """Names after `renamed`: a full list, or a dict from old to new names."""
     if given is None:
@@ -375,7 +390,7 @@ def new_names(old: Names, given: Sequence[str] | dict[str, str] | None) -> Names
         if missing := [name for name in given if name not in old]:
             raise InputError(f"no signal {missing} among {old}")
         return tuple(given.get(name, name) for name in old)
-    return (given,) if isinstance(given, str) else tuple(given)
+    return as_names(given)
 
 
 def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] = (), dt: float = 0.0) -> StateSpace:
@@ -387,8 +402,8 @@ def gain(matrix: ArrayLike, inputs: Sequence[str] = (), outputs: Sequence[str] =
         np.zeros((D.shape[0], 0)),
         D,
         dt,
-        new_names((), inputs),
-        new_names((), outputs),
+        as_names(inputs),
+        as_names(outputs),
     )
 
 
@@ -422,9 +437,7 @@ def tf(
             A.append(part.A)
             B.append(part.B @ np.eye(shape[1])[[k]])
             C.append(np.eye(shape[0])[:, sharing] @ part.C)
-    return StateSpace(
-        la.block_diag(*A), np.vstack(B), np.hstack(C), D, dt, new_names((), inputs), new_names((), outputs)
-    )
+    return StateSpace(la.block_diag(*A), np.vstack(B), np.hstack(C), D, dt, as_names(inputs), as_names(outputs))
 
 
 def _table(given: Any, field: str) -> list[list[np.ndarray]]:

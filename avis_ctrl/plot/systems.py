@@ -74,10 +74,10 @@ def bode(
     top, bottom = axes = axes_of(ax, 2)
     line = _full_names(line)
     for one in _curves(system, omega, frequency_Hz, label):
+        single = one.nominal[0].size == 1
         for i in range(one.nominal.shape[1]):
             for k in range(one.nominal.shape[2]):
                 pair = f"{_name(one.system, 'outputs', i)} / {_name(one.system, 'inputs', k)}"
-                single = one.nominal[0].size == 1
                 words = " ".join(part for part in (one.label, None if single else pair) if part) or None
                 colour = _draw(top, one, in_dB(one.nominal[:, i, k]), words, line, single)
                 bottom.plot(one.f, _phase(one.nominal[:, i, k]), **(line | {"color": colour}))

@@ -15,7 +15,7 @@ from avis_ctrl.robust.mu_lmi import Array
 class ModalSettings:
     """defective : condition number of the eigenvectors of the balanced A above which A counts as defective [1]: they
         lose twelve of sixteen digits.
-    changes : relative changes of A that are tried in turn until it is not [1]; none for other A.
+    changes : relative changes of A that are tried in turn, the first being none, until A is not defective [1].
     """
 
     defective: float = 1e12

@@ -106,21 +106,22 @@ def _reduced(
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
-    def peak(K: StateSpace, goal: float = 0.0) -> float:
-        return peak_of_loop(P.closed(K), blocks, omega, goal)
+    def peak(closed: StateSpace, goal: float = 0.0) -> float:
+        return peak_of_loop(closed, blocks, omega, goal)
 
     K = made.best.K
-    full = peak(K)
+    full = peak(P.closed(K))
     limit = (1 + cost) * full
 
     def harmless(candidate: StateSpace) -> bool:
-        return P.closed(candidate).is_stable() and peak(candidate, limit) <= limit
+        closed = P.closed(candidate)
+        return closed.is_stable() and peak(closed, limit) <= limit
 
     def lowest_order(start: StateSpace) -> StateSpace:
         # No weight changes below the corner up to which the offset may drift.
         lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
-        return reduce_controller(P.P, start, lambda one: peak(one, limit), limit=limit).K
+        return reduce_controller(P.P, start, lambda one: peak(P.closed(one), limit), limit=limit).K
 
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
     # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.
@@ -134,7 +135,7 @@ def _reduced(
     reduced = next((one for one in candidates if np.max(np.abs(one.poles()), initial=0.0) <= nyquist), first)
     return reduced, (
         f"reduced from {K.nstates} to {reduced.nstates} states: complex mu, at {omega.size} frequencies "
-        f"and the resonances of each loop, changes from {full:.4f} to {peak(reduced):.4f}"
+        f"and the resonances of each loop, changes from {full:.4f} to {peak(P.closed(reduced)):.4f}"
     )
 
 

@@ -101,13 +101,12 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
         return ""
     omega = _peak(mu.mu)
     spread = _spread_there(plant, omega)
-    impossible = _not_even_nominal(plant)
     if no_better_than_none(mu, others):
         return (
             f"The synthesis found no controller better than none: with the best controller found mu is at most "
             f"{_up(mu.mu.upper):g}, at {_hertz(omega)}; this bound is less than {100 * SETTINGS.idle:g} % below that "
             f"without control. No D-K iteration came closer to the bounds with this uncertainty. "
-            f"{spread or impossible or 'Specify less uncertainty or wider bounds'}".rstrip(".")
+            f"{spread or _not_even_nominal(plant) or 'Specify less uncertainty or wider bounds'}".rstrip(".")
             + "."
         )
     limits = limiting(plant, mu)
@@ -115,7 +114,7 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
         f"The specification (weighted norm below 1 for all plants of the set) is not "
         f"{'met' if mu.mu.lower >= 1 else 'proved to be met'}: mu of the mu controller is between "
         f"{_down(mu.mu.lower, 4):g} and {_up(mu.mu.upper, 4):g}{_unproved(mu.mu)} and must be below 1. "
-        f"{limits} {impossible or _relief(plant, mu)}"
+        f"{limits} {_not_even_nominal(plant) or _relief(plant, mu)}"
     )
     if spread and RESPONSE in limits:
         text += f" {spread}."
@@ -175,8 +174,8 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
         return below_one(_rows(plant, name), factor)
 
     text = (
-        f"By its mu, this controller meets it with every uncertainty divided by {_up(mu.mu.upper, 4):g} and every "
-        f"bound relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
+        f"It follows from mu that this controller meets it with every uncertainty divided by {_up(mu.mu.upper, 4):g} "
+        f"and every bound relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
     )
     if not M.size:
         return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign
@@ -13,9 +13,18 @@ from avis_ctrl.rigs.rig import Rig
 
 # Variables whose columns the readers number if they have no names: "y1", "y2", ...
 USUAL = {"u": ("u", "U", "input"), "y": ("y", "Y", "output")}
-# Relative difference below which two sample rates are taken as the same: the models then agree to this order.
-SAME_RATE = 1e-6
 WHAT = {"u": "actuators", "y": "sensors"}
+
+
+@dataclass(frozen=True)
+class RateSettings:
+    """same : relative difference below which two sample rates are taken as the same [1]: the models then agree to this
+    order."""
+
+    same: float = 1e-6
+
+
+SETTINGS = RateSettings()
 
 
 def with_rig_names(
@@ -76,11 +85,11 @@ def _require_rate(rig: Rig, measured: Campaign) -> None:
     """
     found, expected = measured.sample_rate_Hz, rig.sample_rate_Hz
     ratio = found / expected
-    if abs(ratio - 1) <= SAME_RATE:
+    if abs(ratio - 1) <= SETTINGS.same:
         return
-    if abs(1e3 * ratio - 1) <= SAME_RATE:
+    if abs(1e3 * ratio - 1) <= SETTINGS.same:
         likely = "are the time stamps in ms (column t [ms]), or is the sample rate in kHz?"
-    elif abs(1e-3 * ratio - 1) <= SAME_RATE:
+    elif abs(1e-3 * ratio - 1) <= SETTINGS.same:
         likely = "is the sample rate in mHz, or the rig file's sample_rate_Hz in kHz?"
     else:
         likely = "check the time stamps; if the rate is right, change sample_rate_Hz and loop_delay_s of the rig file"

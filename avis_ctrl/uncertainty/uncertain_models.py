@@ -10,7 +10,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import connect as connect_systems
 from avis_ctrl.lti.interchange import as_system
-from avis_ctrl.lti.statespace import StateSpace, new_names
+from avis_ctrl.lti.statespace import StateSpace, as_names
 from avis_ctrl.lti.statespace import tf as tf_of_numbers
 from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealParameter
 from avis_ctrl.uncertainty.uncertain_system import (
@@ -252,7 +252,7 @@ def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], out
     >>> ac.connect({"plant": G, "controller": K, "error": error}, ["r"], ["x"]).is_stable()
     True
     """
-    inputs, outputs = new_names((), inputs), new_names((), outputs)
+    inputs, outputs = as_names(inputs), as_names(outputs)
     named = dict(parts) if isinstance(parts, Mapping) else {f"part {k}": one for k, one in enumerate(parts)}
     whole, elements, w, z = {}, list[tuple[Element, int]](), list[str](), list[str]()
     for key, part in named.items():
@@ -312,9 +312,9 @@ def _of_matrix(
         (*[STATES] * bool(n), *M.elements),
         (*[n] * bool(n), *M.copies),
         float(dt),
-        new_names((), inputs),
-        new_names((), outputs),
-        new_names((), states),
+        as_names(inputs),
+        as_names(outputs),
+        as_names(states),
     )
     if system.uncertain:
         return system

@@ -20,7 +20,15 @@ import scipy.linalg as la
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
 from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series, singular
-from avis_ctrl.lti.statespace import StateSpace, names_of_inverse, new_names, positions, signal_names
+from avis_ctrl.lti.statespace import (
+    StateSpace,
+    default_names,
+    names_of_inverse,
+    new_names,
+    positions,
+    signal_names,
+    to_power,
+)
 from avis_ctrl.summary import count_of, html_table
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import ComplexDisk, Element, RealParameter
@@ -115,15 +123,9 @@ class UncertainSystem:
         return sum(n for one, n in zip(self.elements, self.copies, strict=True) if one == STATES)
 
     @property
-    def _unnamed(self) -> bool:
-        """Whether all signals have their default names."""
-        default = UncertainSystem(self.a, self.b, self.c, self.d, self.elements, self.copies)
-        return (self.inputs, self.outputs) == (default.inputs, default.outputs)
-
-    @property
     def _plain(self) -> bool:
         """Whether this is a matrix or number with default names."""
-        return not self.nstates and self._unnamed
+        return not self.nstates and (self.inputs, self.outputs) == default_names(*self.shape[::-1])
 
     @property
     def _number(self) -> bool:
@@ -323,13 +325,7 @@ class UncertainSystem:
         return as_uncertain(other) * self.inverse()
 
     def __pow__(self, power: int) -> UncertainSystem:
-        if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
-            raise InputError("expected a whole number", field="power", value=power)
-        base = self if power >= 0 else self.inverse()
-        result = base if power else as_uncertain(np.eye(self.shape[0]))
-        for _ in range(abs(int(power)) - 1):
-            result = result @ base
-        return result
+        return to_power(self, power, as_uncertain(np.eye(self.shape[0])))
 
     # -- connection --------------------------------------------------------------------------
     def feedback(self, other: Any = 1.0, sign: int = -1) -> UncertainSystem:
