@@ -33,11 +33,14 @@ class SilentLineSettings:
     bands_per_octave : bands per octave in which these lines are weighted by their residual.
     weightings : number of times these weights are computed, starting from weights that are equal over frequency.
     settled : minimum number of periods of a record for its first period to be dropped as transient.
+    rest : minimum length of the records at rest, over that of the longest driven record, for the noise to be measured
+        at rest alone [1]: a shorter one has too few lines to resolve the modes.
     """
 
     bands_per_octave: int = 2
     weightings: int = 4
     settled: int = 3
+    rest: float = 0.5
 
 
 SETTINGS = SilentLineSettings()
@@ -110,16 +113,17 @@ def with_noise(
 ) -> tuple[list[SpectralBlock], str]:
     """The blocks with noise that is not affected by errors of the modelled response to the drives, and a sentence.
 
-    The noise is measured where u is silent: in records at rest, and on the lines between the harmonics of periodic
-    records, without the first period. If there are none, it is the residual of a local polynomial model (Schoukens,
-    Vandersteen, Barbe, Pintelon 2009) of `left`, the campaign minus the model's prediction. The local model absorbs
-    what is missing from the modelled response to the drives; this error is smooth where the response itself is sharp.
+    The noise is measured where u is silent: in records at rest or, without them, on the lines between the harmonics of
+    periodic records after their first period. If there are none, it is the residual of a local polynomial model
+    (Schoukens, Vandersteen, Barbe, Pintelon 2009) of `residual`, the campaign minus the model's prediction. The local
+    model absorbs what is missing from the modelled response to the drives; this error is smooth where the response
+    itself is sharp.
 
     Raises
     ------
     InputError : the noise cannot be estimated from the records.
     """
-    quiet = [found for record in campaign.records if (found := _silent(record, model, band_Hz)) is not None]
+    quiet = _silent(campaign, model, band_Hz)
     kinds = {one.block.kind for one in quiet}
     known: dict[tuple[str, bytes], SpectralBlock] = {}
     made = []
@@ -134,10 +138,13 @@ def with_noise(
         like = known[key]
         assert like.noise is not None
         made.append(block.with_noise(like.noise, like.dof))
-    dof = f"{made[0].dof:.0f} degrees of freedom per line"
+    dof, better = f"{made[0].dof:.0f} degrees of freedom per line", "; a record at rest gives a better estimate"
     if kinds:
-        return made, f"noise measured where the drives are silent (at rest, or between the harmonics): {dof}"
-    return made, f"noise estimated with a local polynomial model: {dof}; a record at rest gives a better estimate"
+        at_rest = {not driven_inputs(campaign.named(one.block.name)) for one in quiet}
+        words = ["in records at rest"] * (True in at_rest)
+        words += ["between the harmonics of periodic records"] * (False in at_rest)
+        return made, f"noise measured {' and '.join(words)}: {dof}{'' if True in at_rest else better}"
+    return made, f"noise estimated with a local polynomial model: {dof}{better}"
 
 
 def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
@@ -145,7 +152,7 @@ def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
     kinds = {
         "floor measured" if r.header.floor_names else "floor not measured"
         for r in campaign.records
-        if (r.header.period_samples and r.header.periods >= SETTINGS.settled) or not driven_inputs(r)
+        if _is_periodic(r) or not driven_inputs(r)
     }
     return {block.kind for block in blocks} <= kinds
 
@@ -172,20 +179,38 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
         ) from None
 
 
-def _silent(record: RecordSource, model: TableModel, band_Hz: tuple[float, float]) -> Residual | None:
-    """Residual of the model on lines without drive; None if there are none. At rest these are all lines; for a periodic
-    record they are the lines between its harmonics, after the first period, which contains the starting transient."""
+def _silent(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]) -> list[Residual]:
+    """Residuals of the model on lines without drive: at rest, if the records at rest are long enough."""
+    longest = max((r.header.duration_s for r in campaign.records if driven_inputs(r)), default=0.0)
+    found = []
+    for floor in (False, True):
+        alike = [record for record in campaign.records if bool(record.header.floor_names) == floor]
+        rest = [record for record in alike if not driven_inputs(record)]
+        found += [_residual(record_block(record.load(), model.base, band_Hz), model) for record in rest]
+        if sum(record.header.duration_s for record in rest) < SETTINGS.rest * longest:
+            periodic = (record for record in alike if record not in rest and _is_periodic(record))
+            found += [_between_harmonics(record, model, band_Hz) for record in periodic]
+    return found
+
+
+def _is_periodic(record: RecordSource) -> bool:
+    return bool(record.header.period_samples) and record.header.periods >= SETTINGS.settled
+
+
+def _between_harmonics(record: RecordSource, model: TableModel, band_Hz: tuple[float, float]) -> Residual:
+    """Residual on the lines between the harmonics of a periodic record, after the first period, which contains most of
+    the starting transient. What a model error leaves of the rest counts as noise."""
     h = record.header
-    if h.period_samples and h.periods >= SETTINGS.settled:
-        segment = record.load(h.period_samples, h.periods * h.period_samples)
-        block = record_block(segment, model.base, band_Hz)
-        lines = np.rint(block.omega * segment.header.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
-        block = block.lines(np.flatnonzero(lines % (h.periods - 1)))
-        block.U[:, : len(model.actuators)] = 0
-    elif not driven_inputs(record):
-        block = record_block(record.load(), model.base, band_Hz)
-    else:
-        return None
+    period = h.period_samples or 0
+    segment = record.load(period, h.periods * period)
+    block = record_block(segment, model.base, band_Hz)
+    lines = np.rint(block.omega * segment.header.samples / (2 * np.pi * h.sample_rate_Hz)).astype(int)
+    block = block.lines(np.flatnonzero(lines % (h.periods - 1)))
+    block.U[:, : len(model.actuators)] = 0
+    return _residual(block, model)
+
+
+def _residual(block: SpectralBlock, model: TableModel) -> Residual:
     # The transient of the record's ends is estimated by weighted least squares. With equal weights its error at all
     # frequencies would be as large as the largest noise.
     power = np.broadcast_to(np.mean(np.abs(block.Y) ** 2, axis=(0, 2)), block.Y.shape[:2])
