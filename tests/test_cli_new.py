@@ -49,6 +49,15 @@ def test_a_geophone_from_the_response_library(tmp_path, data):
     assert not (tmp_path / "other.toml").exists()
 
 
+def test_a_rig_with_accelerometers(tmp_path):
+    path = tmp_path / "mine.toml"
+    assert avis("new", "rig", str(path), "--sensors", "accelerometer").returncode == 0
+    rig = load_rig(path)
+    assert "10 V/g" in path.read_text()
+    assert [9.80665 * one.sensitivity_Vs2_per_m for one in rig.instruments] == pytest.approx([10.0] * 8, rel=1e-3)
+    assert np.linalg.matrix_rank(rig.sensor_rows()[1]) == 6
+
+
 def test_a_design_for_this_rig(tmp_path):
     rig, path = tmp_path / "rigs" / "mine.toml", tmp_path / "mine_design.toml"
     rig.parent.mkdir()
@@ -90,6 +99,7 @@ def test_a_design_for_this_rig(tmp_path):
         (("rig", "OUT", "--mass", "500000"), "avis: --mass = 500000.0: "),
         (("rig", "OUT", "--name", 'a"b'), "expected a name without quotes"),
         (("rig", "OUT", "--geophone", "RESP.absent"), "RESP.absent"),
+        (("rig", "OUT", "--sensors", "seismometer"), "--sensors = 'seismometer': expected geophone or accelerometer"),
         (("rig", "OLD"), "this file exists"),
         (("design", "OUT", "--rig", "absent.toml"), "absent.toml"),
         (("design", "OUT", "--keep", "up"), "up"),

@@ -85,6 +85,7 @@ def rig(
     damping: Annotated[float, _asked("--damping", "Damping ratio, 0.03 for 3 %", _check_rig)] = 0.03,
     constant_N_per_V: Annotated[float, _asked("--force-constant", "Force of a drive [N/V]", _check_rig)] = 2.0,
     limit_V: Annotated[float, _asked("--limit", "Largest drive voltage [V]", _check_rig)] = 10.0,
+    sensors: Annotated[str, _asked("--sensors", "Sensors: geophone or accelerometer", _check_rig)] = "geophone",
     geophone: Annotated[str, _asked("--geophone", "RESP file of the geophones (empty: a common one)", _check_rig)] = "",
     sample_rate_Hz: Annotated[
         float, _asked("--sample-rate", "Sample rate of the controller [Hz]", _check_rig)

@@ -23,7 +23,7 @@ from avis_ctrl.study.identification_design import default_design, design_toml
 
 @dataclass(frozen=True)
 class NewRig:
-    """A box on equal mounts near its lower corners, with a vertical and a horizontal drive and geophone at each mount.
+    """A box on equal mounts near its lower corners, with a vertical and a horizontal drive and sensor at each mount.
 
     Attributes
     ----------
@@ -33,6 +33,7 @@ class NewRig:
     vertical_Hz, horizontal_Hz : natural frequencies of the payload on its mounts, without rotation. The vertical mode
         has no rotation; horizontal modes include rocking, because the mounts are below the centre of mass.
     damping : damping ratio of all mounts. constant_N_per_V, limit_V : of a drive.
+    sensors : "geophone" or "accelerometer" (a seismic one of 10 V/g).
     geophone : RESP file of the sensor; None for a 4.5 Hz geophone of 28.8 V s/m.
     sample_rate_Hz : of the controller.
     """
@@ -46,6 +47,7 @@ class NewRig:
     damping: float = 0.03
     constant_N_per_V: float = 2.0
     limit_V: float = 10.0
+    sensors: str = "geophone"
     geophone: Path | None = None
     sample_rate_Hz: float = 1000.0
 
@@ -55,9 +57,13 @@ def rig_text(new: NewRig) -> str:
 
     Raises
     ------
-    InputError : not 3 or 4 mounts, a size, mass or frequency that is not positive, an invalid name, a RESP file that
-        cannot be read or contradicts itself.
+    InputError : not 3 or 4 mounts, a size, mass or frequency that is not positive, an invalid name, other sensors, a
+        RESP file that cannot be read or contradicts itself.
     """
+    if new.sensors not in ("geophone", "accelerometer"):
+        raise InputError("expected geophone or accelerometer", field="sensors", value=new.sensors)
+    if new.sensors == "accelerometer" and new.geophone is not None:
+        raise InputError("expected no RESP file of a geophone for accelerometers", field="geophone", value=new.geophone)
     if new.mounts not in (3, 4):
         raise InputError("expected 3 or 4; add further mounts to the file afterwards", field="mounts", value=new.mounts)
     for field in (
@@ -104,11 +110,11 @@ def rig_text(new: NewRig) -> str:
                 f'\n[[drive]]\nname = "A{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
                 f"direction = {_row(direction)}\nconstant_N_per_V = {new.constant_N_per_V:g}\n"
             )
-    sensor = _geophone(new.geophone)
+    sensor = _ACCELEROMETER if new.sensors == "accelerometer" else _geophone(new.geophone)
     for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
         for letter, direction in (("z", (0, 0, 1)), axis):
             text += (
-                f'\n[[geophone]]\nname = "S{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
+                f'\n[[{new.sensors}]]\nname = "S{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
                 f"direction = {_row(direction)}\n{sensor}"
             )
     return text + (
@@ -156,6 +162,13 @@ def _horizontal(new: NewRig) -> list[tuple[str, tuple[int, int, int]]]:
     """Horizontal direction of the drive and sensor at each mount; together they cover x, y and the rotation about z."""
     along_x, along_y = ("x", (1, 0, 0)), ("y", (0, 1, 0))
     return [along_y, along_y, along_x] if new.mounts == 3 else [along_y, along_x, along_y, along_x]
+
+
+# Sensitivity, corner and noise as in data sheets of seismic accelerometers of 10 V/g.
+_ACCELEROMETER = (
+    "sensitivity_Vs2_per_m = 1.02          # assumed: 10 V/g\nlow_corner_Hz = 0.1                   # assumed\n"
+    "noise_m_per_s2_rtHz = 5e-7            # assumed\npreamplifier_gain = 100.0            # assumed\n"
+)
 
 
 def _geophone(path: Path | None) -> str:
