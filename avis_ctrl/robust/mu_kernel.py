@@ -39,9 +39,6 @@ class PathSettings(NamedTuple):
 
 
 SETTINGS = PathSettings()
-# Skewed mu with real and repeated blocks needs up to 250 centres at low frequency; limited to 60, some bounds were four
-# times too large.
-SKEWED = PathSettings(steps=400)
 
 
 class Entries(NamedTuple):

@@ -64,14 +64,9 @@ class LinearForm:
 
 @dataclass(frozen=True)
 class ScalingSpace:
-    """Real coordinates theta of the scalings that commute with a block structure.
-
-    `level` marks the entries of w whose X_w is multiplied by lambda: all entries for mu, only the performance channel
-    for the worst-case gain (skewed mu).
-    """
+    """Real coordinates theta of the scalings that commute with a block structure."""
 
     structure: BlockStructure
-    level: Array
     form: LinearForm
     core: LinearForm
     is_level: Array
@@ -79,10 +74,9 @@ class ScalingSpace:
     is_g: Array
 
     @staticmethod
-    def of(structure: BlockStructure, level: Array | None = None) -> ScalingSpace:
-        """Scalings of a structure; level (n_w,) : the columns that lambda multiplies, all by default."""
+    def of(structure: BlockStructure) -> ScalingSpace:
+        """Scalings of a structure."""
         n_w, n_z = structure.n_w, structure.n_z
-        level = np.ones(n_w, bool) if level is None else np.asarray(level, bool)
         form: list[tuple[int, int, complex, int]] = []
         core: list[tuple[int, int, complex, int]] = []
         p = c = 0
@@ -108,9 +102,9 @@ class ScalingSpace:
                         ]
                     p += 1
         kform, kcore = LinearForm(n_w + n_z, p, form), LinearForm(c, p, core)
-        on_level = (kform.row < n_w) & (kform.col < n_w) & np.r_[level, np.zeros(n_z, bool)][kform.row]
+        on_level = (kform.row < n_w) & (kform.col < n_w)
         in_core = np.any(kcore.incidence > 0, axis=1)
-        return ScalingSpace(structure, level, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0], ~in_core)
+        return ScalingSpace(structure, kform, kcore, on_level, kcore.gradient(np.eye(c)[None])[0], ~in_core)
 
     def scalings(self, theta: Array) -> LmiScalings:
         """Matrices of the parameters theta (B, p)."""

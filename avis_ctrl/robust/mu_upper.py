@@ -14,8 +14,7 @@ import numpy as np
 
 from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal, level_squares
 from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
-from avis_ctrl.robust.mu_kernel import SKEWED
-from avis_ctrl.robust.mu_lmi import Array, LmiScalings, ScalingSpace, dagger, follow, least_level, residual
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, ScalingSpace, follow, least_level
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -27,12 +26,16 @@ class UpperBoundSettings:
     most_decades : maximum distance of a squared scaling from the middle of the range, in decades: chains of blocks that
         are closed only by round-off would need a range beyond that of floating-point numbers.
     room : a search that starts from scalings that prove a level begins at this multiple of the squared level.
+    bisections : maximum number of trial gains in the bisection for skewed mu.
+    negligible : gain relative to the norm of the performance rows below which skewed mu need not be resolved.
     """
 
     batch_bytes: float = 64e6
     worth: float = 0.97
     most_decades: float = 80.0
     room: float = 1.1
+    bisections: int = 60
+    negligible: float = 1e-9
 
 
 SETTINGS = UpperBoundSettings()
@@ -200,72 +203,42 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
 
     M (B, n_shared, n_z, n_w). beta = inf if the scalings cannot prove robust stability (the upper bound of mu of the
     other blocks is not below 1).
+
+    The gain is below g if and only if mu of M with the performance rows divided by g is below 1 (main loop theorem). g
+    is found by bisection: scalings that prove mu < 1 prove the smallest gain that they allow, and where mu is beta > 1,
+    the bound of the gain is at least beta g.
     """
     robust = BlockStructure(structure.blocks[:-1])
     r_w, r_z = robust.n_w, robust.n_z
     if not r_w:
         return upper_bound(M, structure, tolerance)
-    # Normalise the performance channel, so that the search does not depend on its units.
+    batch, performance = M.shape[0], np.arange(structure.n_w) >= r_w
+    shapes = ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))
+    found = UpperBound(np.full(batch, np.inf), LmiScalings(*(np.zeros((batch, *shape), complex) for shape in shapes)))
+    if not batch:
+        return found
+    least = np.max(np.linalg.norm(M[:, :, r_z:, r_w:], ord=2, axis=(2, 3)), axis=1)
+    most = np.full(batch, np.inf)
     unit = np.max(np.linalg.norm(M[:, :, r_z:], axis=(2, 3)), axis=1)
     unit = np.where(unit > 0, unit, 1.0)
-    scale = np.ones((M.shape[0], structure.n_z))
-    scale[:, r_z:] /= unit[:, None]
-    beta, (X_z, X_w, G) = _skewed(M * scale[:, None, :, None], structure, robust, tolerance)
-    X_z[:, r_z:, r_z:] /= unit[:, None, None] ** 2
-    X_w[:, r_w:, r_w:] /= unit[:, None, None] ** 2
-    return UpperBound(unit * beta, LmiScalings(X_z, X_w, G))
-
-
-def _skewed(M: Array, structure: BlockStructure, robust: BlockStructure, tolerance: float) -> UpperBound:
-    """`skewed_upper_bound` for a normalised performance channel."""
-    batch, r_w, r_z = M.shape[0], robust.n_w, robust.n_z
-    beta = np.full(batch, np.inf)
-    found = LmiScalings(
-        *(
-            np.zeros((batch, *shape), complex)
-            for shape in ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))
-        )
-    )
-    inner = upper_bound(M[:, :, :r_z, :r_w], robust, tolerance)
-    safe = np.flatnonzero(inner.beta < 1.0 - 1e-9)
-    if safe.size:
-        # At a level between the minimum and 1, the analytic centre has a margin for the performance block.
-        goal = np.maximum(np.sqrt(inner.beta[safe]), 0.3)
-        start = upper_bound(M[safe][:, :, :r_z, :r_w], robust, tolerance, goal).scalings
-        beta[safe], part = _skewed_from(M[safe], structure, start, tolerance)
-        for whole, piece in zip(found, part, strict=True):
-            whole[safe] = piece
-    return UpperBound(beta, found)
-
-
-def _skewed_from(
-    M: Array, structure: BlockStructure, start: LmiScalings, tolerance: float
-) -> tuple[Array, LmiScalings]:
-    """Skewed bound, starting from scalings of the robust blocks that are feasible with a margin at level 1."""
-    batch, r_w, r_z = M.shape[0], start.X_w.shape[1], start.X_z.shape[1]
-    space = ScalingSpace.of(structure, np.arange(structure.n_w) >= r_w)
-    X_w = np.repeat(np.eye(structure.n_w, dtype=complex)[None], batch, axis=0)
-    X_z = np.repeat(np.eye(structure.n_z, dtype=complex)[None], batch, axis=0)
-    G = np.zeros((batch, structure.n_w, structure.n_z), complex)
-    X_w[:, :r_w, :r_w], X_z[:, :r_z, :r_z], G[:, :r_w, :r_z] = start.X_w, start.X_z, start.G
-    room = residual(M[:, :, :r_z, :r_w], start, np.ones(batch), np.ones(r_w, bool))
-    L = np.linalg.inv(np.linalg.cholesky(room))
-    taken = np.max(np.linalg.norm(M[:, :, r_z:, :r_w] @ dagger(L), ord=2, axis=(2, 3)), axis=1)
-    X_p = np.minimum(0.3 / np.maximum(taken, 1e-150) ** 2, np.linalg.norm(start.X_w, ord=2, axis=(1, 2)))
-    X_w[:, r_w:, r_w:] *= X_p[:, None, None]
-    X_z[:, r_z:, r_z:] *= X_p[:, None, None]
-    # Coordinates in which these scalings are near the identity and the first level is 2.
-    d = np.stack(
-        [np.sqrt(np.trace(X_w[:, w, w], axis1=1, axis2=2).real / (w.stop - w.start)) for _, w, _ in structure.slices()],
-        axis=1,
-    )
-    d_z, d_w = expand(structure, d)
-    unit = M * d_z[:, None, :, None] / d_w[:, None, None, :]
-    theta = space.theta(rescaled(LmiScalings(X_z, X_w, G), 1 / d_z, 1 / d_w, np.ones(batch)))
-    first = np.maximum(least_level(unit, space.scalings(theta), space.level), 1e-300)
-    size = np.sqrt(first)
-    scaled = unit / np.where(space.level, size[:, None], 1.0)[:, None, None, :]
-    theta, _ = follow(space, scaled, theta, np.full(batch, 2.0), -1e-8, tolerance, SKEWED)
-    scalings = space.scalings(theta)
-    beta = size * np.sqrt(np.maximum(least_level(scaled, scalings, space.level), 0.0))
-    return beta, rescaled(scalings, d_z, d_w, np.ones(batch))
+    least, trial = np.maximum(least, SETTINGS.negligible * unit), np.where(least > 0, 2 * least, unit)
+    inner = bound_for_goal(M[:, :, :r_z, :r_w], robust, tolerance, 1.0 - 1e-9).beta
+    left = np.flatnonzero(inner < 1.0)
+    for _ in range(SETTINGS.bisections):
+        if not left.size:
+            break
+        g = trial[left]
+        scaled = M[left].copy()
+        scaled[:, :, r_z:] /= g[:, None, None, None]
+        bound = bound_for_goal(scaled, structure, tolerance, 1.0)
+        gain = g * np.sqrt(np.maximum(least_level(scaled, bound.scalings, performance), 0.0))
+        better = gain < most[left]
+        for scaling, side in ((bound.scalings.X_z, r_z), (bound.scalings.X_w, r_w)):
+            scaling[:, side:, side:] /= g[:, None, None] ** 2
+        _replace(found, left[better], UpperBound(gain, bound.scalings).at(better))
+        most[left] = np.minimum(most[left], gain)
+        least[left] = np.where(bound.beta > 1, np.maximum(least[left], bound.beta * g), least[left])
+        left = left[most[left] > (1 + tolerance) * least[left]]
+        bounded = np.isfinite(most[left])
+        trial[left] = np.where(bounded, np.sqrt(least[left] * most[left]), 10 * trial[left])
+    return found
