@@ -8,7 +8,20 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, places, steps
+from avis_ctrl.report.figures import (
+    STYLES,
+    Axis,
+    Curve,
+    Figure,
+    Panel,
+    Style,
+    bars,
+    hertz,
+    level,
+    log_limits,
+    places,
+    steps,
+)
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.response_panels import difference, drives, magnitude
@@ -86,19 +99,12 @@ def ladder(gap: Gap) -> Figure:
     noise = 100 * gap.noise_nrmse
     low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
     limits = float(10 ** np.floor(np.log10(low))), high
-    bars = Curve(
-        place,
-        np.where(np.isfinite(values) & (values > 0), values, np.nan),
-        "error of the model",
-        Style("#8fbbdc"),
-        line=False,
-        bars=0.6,
-    )
+    errors = bars(place, np.where(values > 0, values, np.nan), "error of the model", Style("#8fbbdc"), 0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
     return Figure(
         "ladder",
         "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. Logarithmic scale.",
-        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), (bars, *lines)),),
+        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), (errors, *lines)),),
         height=0.7,
     )
 

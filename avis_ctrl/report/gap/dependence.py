@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, steps
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, markers, steps
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
 from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
@@ -99,13 +99,11 @@ def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> P
         for held, word in ((False, "fitted"), (True, "held out")):
             some = [one for one in gap.records if one.held_out == held]
             curves.append(
-                Curve(
+                markers(
                     np.array([of(one) for one in some]),
                     np.array([value(one) for one in some]),
                     f"{label}, {word}",
                     Style(style.colour),
-                    points=True,
-                    line=False,
                     hollow=not held,
                 )
             )

@@ -11,7 +11,7 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
 # The colour scale runs from half the noise power to at least ten times the noise power.
@@ -79,19 +79,19 @@ def _short(name: str) -> str:
     return name if len(name) <= LETTERS else f"{name[: LETTERS - 1]}…"
 
 
-def table_of(listed: Sequence[Where], caption: str) -> Table:
+def table_of(places: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
-    rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value)) for one in listed]
-    return table(
+    return listed(
         f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
         "noise power. p-value: probability of such a residual by noise alone, family-wise over all places.",
-        ("place", "fraction", "over noise", "p-value"),
-        rows,
+        places,
+        {
+            "place": wording.place,
+            "fraction": lambda one: words.percent(one.share),
+            "over noise": lambda one: words.number(one.excess) if np.isfinite(one.excess) else "not stated",
+            "p-value": lambda one: _chance(one.p_value),
+        },
     )
-
-
-def _stated(value: float) -> str:
-    return words.number(value) if np.isfinite(value) else "not stated"
 
 
 def _chance(value: float) -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.identification.ekf_result import EkfResult, kinds
+from avis_ctrl.identification.ekf_result import EkfResult, Innovations, kinds
 from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
-from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table, yes_or_no
+from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
 
@@ -160,26 +160,23 @@ def _names(found: Identification, result: EkfResult) -> list[str]:
 
 
 def _consistency(found: Identification, result: EkfResult) -> Table:
-    rows = []
-    for name, one in zip(_names(found, result), result.innovations, strict=True):
-        n_y = one.autocorrelation.shape[1]
-        low, high = (v / n_y for v in one.nis_interval)
-        rows.append(
-            (
-                name,
-                words.number(one.nis_per_output, 4),
-                f"{low:.4f} to {high:.4f}",
-                f"{words.number(100 * one.outside, 2)} %",
-                yes_or_no(one.consistent),
-            )
-        )
-    return table(
+    def expected(one: Innovations) -> str:
+        low, high = (v / one.autocorrelation.shape[1] for v in one.nis_interval)
+        return f"{low:.4f} to {high:.4f}"
+
+    return listed(
         "Innovations of the filter: mean normalised square per output, the interval that contains 99.9 % of "
         "such means for a consistent filter, and the fraction of autocorrelations outside the 95 % limits of "
         "white noise. If the innovations are larger than the filter's covariance predicts, its standard "
         "deviations are too small.",
-        ("record", "mean square", "expected", "beyond the bound", "consistent"),
-        rows,
+        list(zip(_names(found, result), result.innovations, strict=True)),
+        {
+            "record": lambda row: row[0],
+            "mean square": lambda row: words.number(row[1].nis_per_output, 4),
+            "expected": lambda row: expected(row[1]),
+            "beyond the bound": lambda row: f"{words.number(100 * row[1].outside, 2)} %",
+            "consistent": lambda row: yes_or_no(row[1].consistent),
+        },
         "lrrrc",
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level
+from avis_ctrl.report.figures import Axis, Figure, Panel, Style, level, markers
 from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.identification import Identification
 
@@ -69,7 +69,7 @@ def _directions(found: Identification) -> Figure:
         else ""
     )
     curves = (
-        Curve(place, shown, "relative standard deviation", Style("#0072b2"), points=True, line=False),
+        markers(place, shown, "relative standard deviation", Style("#0072b2")),
         level(0.5, n + 0.5, 1.0, "not determined above"),
     )
     return Figure(

@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, markers
 from avis_ctrl.report.identification.validation import errors, modes
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.tolerances import tolerances
@@ -113,35 +113,25 @@ def _changes(found: Identification) -> Figure:
     information, start = found.information, found.campaign_fit.start.values
     size = np.where(start == 0, information.scale, np.abs(start))
     change = 100 * (information.values - start) / size
-    bars = 200 * information.standard_deviation / size
+    twice = 200 * information.standard_deviation / size
     known, n = information.known, len(start)
     place = np.arange(n, 0, -1.0)
     curves = [
-        Curve(
+        markers(
             change[known],
             place[known],
             "determined individually, ± 2 σ",
             Style("#0072b2"),
-            points=True,
-            line=False,
-            error=bars[known],
+            error=twice[known],
             along="x",
         )
     ]
     if not known.all():
-        curves.append(
-            Curve(
-                change[~known],
-                place[~known],
-                f"{TOGETHER}: the nearest to the start",
-                Style("#9a9a9a"),
-                points=True,
-                line=False,
-            )
-        )
+        together = f"{TOGETHER}: the nearest to the start"
+        curves.append(markers(change[~known], place[~known], together, Style("#9a9a9a")))
     curves.append(Curve(np.zeros(2), np.array([0.3, n + 0.7]), "", STYLES["faint"]))
     ticks = tuple((float(p), name) for p, name in zip(place, information.names, strict=True))
-    longest = float(np.max(bars[known])) if known.any() else np.nan
+    longest = float(np.max(twice[known])) if known.any() else np.nan
     caption = (
         f"Change of each parameter from its starting value. The longest bar (2 σ) is "
         f"{words.number(longest, 2)} % of its starting value; bars shorter than a marker are hidden by it."

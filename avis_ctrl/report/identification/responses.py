@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.identification.overlays import ResponseOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_limits
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_limits, markers
 from avis_ctrl.report.pieces import Paragraph, Piece, Section
 from avis_ctrl.report.response_panels import (
     MEASURED,
@@ -100,7 +100,7 @@ def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))
     keep = thin(len(f), MOST_POINTS)
     curves = (
-        Curve(f[keep], shown["measured"][keep], "measured", MEASURED, points=True, line=False),
+        markers(f[keep], shown["measured"][keep], "measured", MEASURED),
         Curve(f, np.rad2deg(base), "identified", MODEL),
         Curve(f, shown["start"], "start", START),
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
-from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table, yes_or_no
+from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.summary import digits_apart
 
@@ -88,25 +88,22 @@ def _figure(name: str, result: DesignResult, bound_of: BoundOf, label: str, what
 
 
 def _stability(result: DesignResult) -> Table:
-    rows = []
-    for c in result.controllers:
-        b = c.stability
-        margin = words.number(1 / b.upper) if c.stable and np.isfinite(b.upper) and b.upper > 0 else "none"
-        rows.append(
-            (
-                c.title,
-                words.bound(b.upper, 4),
-                words.bound(b.lower, 4),
-                words.hertz(b.omega),
-                margin,
-                stable_for_the_set(c),
-            )
-        )
-    return table(
+    def margin(c: ControllerResult) -> str:
+        upper = c.stability.upper
+        return words.number(1 / upper) if c.stable and np.isfinite(upper) and upper > 0 else "none"
+
+    return listed(
         "Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
         "upper bound of mu reaches 1.",
-        ("controller", "mu upper", "mu lower", "peak at", "margin", "stable for the set"),
-        rows,
+        result.controllers,
+        {
+            "controller": lambda c: c.title,
+            "mu upper": lambda c: words.bound(c.stability.upper, 4),
+            "mu lower": lambda c: words.bound(c.stability.lower, 4),
+            "peak at": lambda c: words.hertz(c.stability.omega),
+            "margin": margin,
+            "stable for the set": stable_for_the_set,
+        },
         "lrrrrc",
     )
 
