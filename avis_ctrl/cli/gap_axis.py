@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import SAMPLE_RATE, factors, roles
 
 
@@ -76,9 +77,6 @@ def gap_axis(
 
     For example: avis gap-axis drive drive.mat --columns force=vir,position=qm,reference=qg,t=t --scale force=35.15
     """
-    from rich.console import Console
-
-    from avis_ctrl.cli.console import Progress
     from avis_ctrl.gap.axis import find_axis_gap_in
     from avis_ctrl.report import rendered
     from avis_ctrl.report.gap.axis import document
@@ -89,10 +87,10 @@ def gap_axis(
     options: dict[str, Any] = {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}
     options = {name: value for name, value in options.items() if value is not None}
     reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
-    console = Console(highlight=False)
+    terminal = Terminal()
     files: list[str] = []
     with output_folder(out, FILES) if out else nullcontext() as folder:
-        with Progress(console) as progress:
+        with Progress(terminal) as progress:
             found = find_axis_gap_in(
                 kind,
                 [path, *(also or ())] if also else path,
@@ -108,15 +106,13 @@ def gap_axis(
             files = write_axis_gap(
                 folder, found, path.name, {**given, **reading, **options}, lambda *told: rendered(document(*told))
             )
-    console.print(f"verdict: {found.verdict}")
-    for sentence in found.sentences:
-        console.print(sentence, soft_wrap=True, markup=False)
-    for name, one in (*found.parameters.items(), *found.ratios.items()):
-        console.print(f"{name} = {one}", markup=False)
+    terminal.print(f"verdict: {found.verdict}")
+    terminal.print(*found.sentences, soft_wrap=True, markup=False)
+    values = (*found.parameters.items(), *found.ratios.items())
+    terminal.print(*(f"{name} = {one}" for name, one in values), markup=False)
     for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
-        console.print(
-            f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True, markup=False
-        )
+        error = f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}"
+        terminal.print(error, soft_wrap=True, markup=False)
     if folder:
-        console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
+        terminal.files(files, folder, *FILES[1:3])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import (
     EXCITATION,
     PERIOD,
@@ -22,8 +22,6 @@ from avis_ctrl.cli.file_options import (
 from avis_ctrl.errors import AvisError, InputError
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
-    from rich.console import Console
-
     from avis_ctrl.study.identification import Identification
 
 
@@ -112,21 +110,19 @@ def identify(
     Writes rig.toml, uncertainty.json, design.toml, report.html, report.pdf and result.json into DIR. Then
     `avis design DIR/design.toml --out DIR2` designs controllers for the identified rig.
     """
-    from rich.console import Console
-
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.design_file import read_design
     from avis_ctrl.study.files import output_folder
-    from avis_ctrl.study.identification_files import FILES
+    from avis_ctrl.study.identification_files import FILES, REPORT_FILES
 
-    console = Console(highlight=False)
+    terminal = Terminal()
     start = load_rig(rig)
     template = None if design is None else read_design(design)  # raises at once, not after the fit
     measured = read_measured(measurement, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
-    for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
-        console.print(f"[dim]{note}[/]")
-    with output_folder(out, FILES) as folder, Progress(console) as progress:
+    notes = in_short(measured.notes) if isinstance(measured, Campaign) else ()
+    terminal.print(*(f"[dim]{note}[/]" for note in notes))
+    with output_folder(out, FILES) as folder, Progress(terminal) as progress:
         from avis_ctrl.report import rendered
         from avis_ctrl.report.identification.content import document
         from avis_ctrl.study.identification import IdentifyOptions, identify
@@ -155,8 +151,8 @@ def identify(
             more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
         progress("report")
         files = write_identification(found, folder, *rendered(document(found, made)), more)
-    _summary(console, found)
-    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}{then}")
+    _summary(terminal, found)
+    terminal.files(files, folder, *REPORT_FILES, then)
 
 
 def predict(
@@ -177,23 +173,18 @@ def predict(
     Writes /records/NN/y for an identified rig, or /records/NN/y_baseline and /records/NN/y_updated for the models of
     avis gap.
     """
-    from rich.console import Console
-    from rich.table import Table
-
     from avis_ctrl.study.files import require_output
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.prediction_file import compared, prediction_errors
 
     require_output(out, campaign)
-    console = Console(highlight=False)
+    terminal = Terminal()
     if is_axis_gap(folder):
         several = write_axis_predictions(folder, [campaign], out)
-        rows = Table("record", "baseline", "updated", title="r.m.s. error relative to what was measured")
-        for name, *both in several:
-            rows.add_row(name, *(f"{100 * one:.3g} %" for one in both))
-        console.print(rows)
-        console.print(f"{out}: {len(several)} records")
+        rows = [(name, *(f"{100 * one:.3g} %" for one in both)) for name, *both in several]
+        terminal.table(("record", "baseline", "updated"), rows, title="r.m.s. error relative to what was measured")
+        terminal.print(f"{out}: {len(several)} records")
         return
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
@@ -208,26 +199,22 @@ def predict(
 
         rig, write = read_identified(folder)[0], write_predictions
     measured = read_campaign(campaign, rig)
-    with Progress(console) as progress:
+    with Progress(terminal) as progress:
         write(folder, measured, out, progress)
         progress("prediction errors")
         errors = list(prediction_errors(out, measured))
     if errors:
         names = list(errors[0].relative)
         noisy = any(one.noise is not None for one in errors)
-        table = Table(
-            "record",
-            *names,
-            *["noise between periods"] * noisy,
-            title="r.m.s. error relative to measured y; each record is predicted from rest",
-        )
+        rows = []
         for one in errors:
             noise = "" if one.noise is None else f"{100 * one.noise:.3g} %"
-            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy)
-        console.print(table)
+            rows.append((one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy))
+        title = "r.m.s. error relative to measured y; each record is predicted from rest"
+        terminal.table(("record", *names, *["noise between periods"] * noisy), rows, title=title)
         if note := compared(errors):
-            console.print(note)
-    console.print(f"{out}: {len(measured.records)} records")
+            terminal.print(note)
+    terminal.print(f"{out}: {len(measured.records)} records")
 
 
 def _prior(text: str) -> tuple[str, tuple[float, float]]:
@@ -239,32 +226,29 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
         raise InputError("expected NAME=MEAN+-STD such as mass=500+-5", field="--prior", value=text) from None
 
 
-def _summary(console: Console, found: Identification) -> None:
-    from rich.table import Table
-
+def _summary(terminal: Terminal, found: Identification) -> None:
     from avis_ctrl.uncertain_value import rounded, text
 
     information = found.information
     loaded = " with its load" if getattr(found.rig, "load", None) else ""
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
     start |= {name: one.value for name, one in found.start.parameters().items()}
-    table = Table(
-        "parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}{loaded}, identified"
-    )
+    rows = []
     for name, value, sigma, unit in zip(
         information.names, information.values, information.standard_deviation, information.units, strict=True
     ):
         shown, std = rounded(value, sigma)
-        table.add_row(name, f"{start[name]:.6g}", shown, std if sigma < float("inf") else "only in combination", unit)
-    console.print(table)
+        rows.append((name, f"{start[name]:.6g}", shown, std if sigma < float("inf") else "only in combination", unit))
+    header = ("parameter", "start", "identified", "+- 1 sigma", "unit")
+    terminal.table(header, rows, title=f"{found.rig.name}{loaded}, identified")
     verdict, *validation = found.validation.sentences
-    console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
-    for sentence in (found.caution, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
-        console.print(f"- {sentence}")
+    terminal.print(f"{verdict[:1].upper()}{verdict[1:]}.")
+    said = [found.caution, *found.campaign_fit.notes, *validation, *found.identifiability.sentences]
     for one in found.campaign_fit.tolerances[:5]:
-        console.print(f"- {one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
+        said.append(f"{one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
     if found.advice:
-        console.print(f"- {found.advice[0]} (Other records that would help are in section 5 of the report.)")
+        said.append(f"{found.advice[0]} (Other records that would help are in section 5 of the report.)")
+    terminal.print(*(f"- {sentence}" for sentence in said))
 
 
 def single_axis(
@@ -287,16 +271,13 @@ def single_axis(
     sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, if the file has none")] = None,
 ) -> None:
     """Fit a small model of one axis: a seismometer, a free decay, a drive with friction, or an oscillator."""
-    from rich.console import Console
-
     from avis_ctrl.identification.single_axis.identify import identify_single_axis
 
     names, scales = roles(columns), factors(scale)
     found = identify_single_axis(kind, path, names, scale=scales or None, sample_rate_Hz=sample_rate_Hz)
-    console = Console(highlight=False)
-    console.print(_assumed_units(kind, names, scales), soft_wrap=True)
-    for line in found.lines():
-        console.print(line)
+    terminal = Terminal()
+    terminal.print(_assumed_units(kind, names, scales), soft_wrap=True)
+    terminal.print(*found.lines())
 
 
 # Units that the fits assume for each role, after --scale.

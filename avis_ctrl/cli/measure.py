@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
 from avis_ctrl.errors import InputError
 
@@ -50,9 +50,6 @@ def excite(
     seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
 ) -> None:
     """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
-    from rich.console import Console
-    from rich.table import Table
-
     from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
     from avis_ctrl.measurement.excitation.files import require_suffix, write_signals
     from avis_ctrl.rigs import load_rig
@@ -62,10 +59,10 @@ def excite(
 
     require_suffix(out)
     require_output(out)
-    console = Console(highlight=False)
+    terminal = Terminal()
     table = load_rig(rig)
     names, limit_V = table.equations_of_motion().actuators, float(table.drive_limits_V().min())
-    with Progress(console) as progress:
+    with Progress(terminal) as progress:
         progress(f"{kind} for {len(names)} drives, {band_Hz[0]:g} to {band_Hz[1]:g} Hz")
         if kind == "multisine":
             words: dict[str, Any] = {"lines": lines, "scheme": scheme}  # the settings refuse unknown ones
@@ -82,19 +79,13 @@ def excite(
             most = largest_level(open_loop(table, plan), signals, signals.u.shape[1] * (periods if periods < 4 else 4))
             signals = signals.scaled_to(LEVEL_SHARE * most)
         write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
-    shown = Table(
-        "record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation", title="largest value over the drives"
+    quantities = (signals.rms_V, signals.peak_V, signals.crest, signals.crest_before)
+    terminal.table(
+        ("record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation"),
+        [(str(k), *(f"{values[k].max():.3g}" for values in quantities)) for k in range(len(signals.u))],
+        title="largest value over the drives",
     )
-    for k in range(len(signals.u)):
-        shown.add_row(
-            str(k),
-            *(
-                f"{values[k].max():.3g}"
-                for values in (signals.rms_V, signals.peak_V, signals.crest, signals.crest_before)
-            ),
-        )
-    console.print(shown)
-    console.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
+    terminal.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
 
 
 def simulate_campaign(
@@ -145,8 +136,6 @@ def simulate_campaign(
     ] = 1,
 ) -> None:
     """Simulate a measurement campaign with the nonlinear model, to plan and rehearse an identification."""
-    from rich.console import Console
-
     from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
@@ -167,14 +156,14 @@ def simulate_campaign(
         from avis_ctrl.gap.effects.user_effects import load_effects
 
         load_effects(effects)
-    console = Console(highlight=False)
+    terminal = Terminal()
     table = load_rig(rig)
     chosen = (
         read_plan(plan)
         if plan
         else default_plan(table, "orthogonal" if orthogonal else "zippered", perturbed=perturbed, duration_s=duration_s)
     )
-    with Progress(console) as progress:
+    with Progress(terminal) as progress:
         try:
             rehearsal = rehearse_with_effects(
                 table, chosen, seed, lambda k, total, name: progress(f"record {name}, {k} of {total}")
@@ -187,9 +176,8 @@ def simulate_campaign(
     for path, text in ((write_plan, plan_toml(chosen)), (truth, rehearsal.truth_toml())):
         if path:
             write_whole(path, text.encode())
-    for note in rehearsal.campaign.notes:
-        console.print(note)
-    console.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
+    terminal.print(*rehearsal.campaign.notes)
+    terminal.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
 
 
 def convert(
@@ -211,8 +199,6 @@ def convert(
     unit_y: UNIT_Y = None,
 ) -> None:
     """Convert a measurement file to a campaign in HDF5, and print the assumptions made."""
-    from rich.console import Console
-
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.measurement.formats.hdf5 import write_campaign, write_frequency_response
@@ -224,7 +210,7 @@ def convert(
     if file is not None and out is not None:
         raise InputError(f"expected one file to write; {file} is named, too", field="--out", value=str(out))
     require_output(target, source)
-    console = Console(highlight=False)
+    terminal = Terminal()
     measured = read_measurements(
         source,
         parse_columns(columns) if columns else None,
@@ -233,15 +219,14 @@ def convert(
     )
     if isinstance(measured, Campaign):
         write_campaign(target, measured)
-        for note in in_short(measured.notes):
-            console.print(note)
-        console.print(
+        terminal.print(*in_short(measured.notes))
+        terminal.print(
             f"{target}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
             f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz"
         )
     else:
         write_frequency_response(target, measured)
-        console.print(
+        terminal.print(
             f"{target}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
             f"inputs, {len(measured.outputs)} outputs"
         )

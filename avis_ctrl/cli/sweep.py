@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from avis_ctrl.cli.console import Terminal
+
 
 def sweep(
     points: Annotated[
@@ -33,7 +35,6 @@ def sweep(
     If the command is interrupted, the same command continues with the missing points. The row of a failed point has the
     reason.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from avis_ctrl.errors import ComputationError, InputError, UserInterruptError
@@ -51,7 +52,8 @@ def sweep(
         backend = partial(on_cluster, address=scheduler, workers=workers or 0)
     else:
         backend = partial(on_this_machine, jobs=jobs or available())
-    console = Console(highlight=False)
+    terminal = Terminal()
+    console = terminal.console
     plan = plan_sweep(points, out)
     with output_folder(out, FILES, (POINTS,)) as folder:
         open_folder(folder / POINTS)
@@ -84,7 +86,7 @@ def sweep(
         f"{len(rows)} points: {', '.join(f'{n} {status}' for status, n in count.items() if n)}; "
         f"{found.computed} computed now; {len(front)} on the Pareto front"
     )
-    console.print(f"{len(files)} files in {folder}; open {folder / 'sweep.html'} or {folder / 'sweep.csv'}")
+    terminal.files(files, folder, "sweep.html", "sweep.csv")
     if count["lost"]:
         why = next(row.message for row in rows if row.status == "lost")
         raise ComputationError(
