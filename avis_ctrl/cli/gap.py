@@ -75,9 +75,9 @@ def gap(
     """
     from avis_ctrl.measurement.campaign import in_short
     from avis_ctrl.rigs import load_rig
+    from avis_ctrl.study.file_names import DESIGN_FOLDER, GAP_FILES, GAP_REPORTS
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.gap import GapOptions, find_gap
-    from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES, GAP_REPORTS
 
     terminal = Terminal()
     options = GapOptions(

@@ -113,8 +113,8 @@ def identify(
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.design_file import read_design
+    from avis_ctrl.study.file_names import IDENTIFICATION_FILES, REPORT_FILES
     from avis_ctrl.study.files import output_folder
-    from avis_ctrl.study.identification_files import FILES, REPORT_FILES
 
     terminal = Terminal()
     start = load_rig(rig)
@@ -122,7 +122,7 @@ def identify(
     measured = read_measured(measurement, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
     notes = in_short(measured.notes) if isinstance(measured, Campaign) else ()
     terminal.print(*(f"[dim]{note}[/]" for note in notes))
-    with output_folder(out, FILES) as folder, Progress(terminal) as progress:
+    with output_folder(out, IDENTIFICATION_FILES) as folder, Progress(terminal) as progress:
         from avis_ctrl.report import rendered
         from avis_ctrl.report.identification.content import document
         from avis_ctrl.study.identification import IdentifyOptions, identify
@@ -173,9 +173,9 @@ def predict(
     Writes /records/NN/y for an identified rig, or /records/NN/y_baseline and /records/NN/y_updated for the models of
     avis gap.
     """
+    from avis_ctrl.study.file_names import GAP_FILE
     from avis_ctrl.study.files import require_output
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
-    from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.prediction_file import compared, prediction_errors
 
     require_output(out, campaign)

@@ -30,10 +30,10 @@ from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.gap_plant import DESCRIBED_IN, delay_order, design_files, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.gap_uncertainty import FitUncertainty, fit_uncertainty
 from avis_ctrl.study.identification_design import default_design, default_keep, design_toml
-from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 

@@ -27,18 +27,19 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.study.files import as_json
-from avis_ctrl.study.gap_names import (
+from avis_ctrl.study.file_names import (
     BASELINE_FILE,
     BASELINE_RIG,
+    DESIGN_FILE,
     DESIGN_FOLDER,
     GAP_FILE,
     GAP_FILES,
     GAP_REPORTS,
+    RIG_FILE,
     UPDATED_FILE,
     UPDATED_RIG,
 )
-from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.identification_output import identified_rig
 
 # Named effects that act on the signals only and cannot be predicted from u and floor.

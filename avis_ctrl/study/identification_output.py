@@ -22,9 +22,9 @@ from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
+from avis_ctrl.study.file_names import IDENTIFICATION_FILES, REPORT_FILES, RESULT_FILE, RIG_FILE
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.identification import Identification
-from avis_ctrl.study.identification_files import FILES, RESULT_FILE, RIG_FILE
 
 PIECE = 1 << 17
 
@@ -154,14 +154,13 @@ def write_identification(
     texts = {
         RIG_FILE: identified_toml(found).encode(),
         **{name: text.encode() for name, text in (more or {}).items()},
-        "report.html": html,
-        "report.pdf": pdf,
+        **dict(zip(REPORT_FILES, (html, pdf), strict=True)),
         RESULT_FILE: as_json(result_dict(found)),
     }
     return write_together(
         folder,
         {name: content for name, content in texts.items() if content is not None},
-        [folder / name for name in FILES],
+        [folder / name for name in IDENTIFICATION_FILES],
     )
 
 

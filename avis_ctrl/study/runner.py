@@ -37,9 +37,9 @@ from avis_ctrl.study.loops import LOOPS_TITLE, tuned_loops
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.random_plants import random_perturbations
-from avis_ctrl.study.requirements import check_loop, check_requirements
 from avis_ctrl.study.simulation import bare_loop, simulate_study, six_dof_check
 from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
+from avis_ctrl.study.verdict import check_loop, check_requirements
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
