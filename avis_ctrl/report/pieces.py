@@ -146,6 +146,16 @@ def yes_or_no(good: bool) -> Mark:
     return Mark("yes" if good else "no", good)
 
 
+def prose(text: str) -> tuple[Paragraph | Formula, ...]:
+    """Paragraphs and formulas, separated by blank lines; a formula stands in dollar signs, its spoken form follows."""
+    blocks = [" ".join(block.split()) for block in text.strip().split("\n\n")]
+    found: list[Paragraph | Formula] = []
+    for block in blocks:
+        formula, dollar, words = block.removeprefix("$ ").partition(" $ ")
+        found.append(Formula(formula, words) if dollar else Paragraph(block))
+    return tuple(found)
+
+
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]], align: str = "") -> Table:
     """A `Table` from any sequences."""
     return Table(caption, tuple(header), tuple(tuple(row) for row in rows), align)

@@ -23,7 +23,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.file_names import IDENTIFICATION_FILES, REPORT_FILES, RESULT_FILE, RIG_FILE
-from avis_ctrl.study.files import as_json
+from avis_ctrl.study.files import as_json, values_of
 from avis_ctrl.study.identification import Identification
 
 PIECE = 1 << 17
@@ -124,14 +124,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "advice": list(found.advice),
         "validation": found.validation.as_dict(),
         "gates": [
-            {
-                "gate": f.gate,
-                "severity": f.severity,
-                "sentence": f.sentence,
-                "channels": list(f.channels),
-                "records": list(f.records),
-            }
-            for f in found.findings
+            values_of(finding, "gate", "severity", "sentence", "channels", "records") for finding in found.findings
         ],
         "unit_of_y": found.model.sensors.unit,
         "amplifier_corner_Hz": found.model.amplifier_corner_Hz,

@@ -32,16 +32,9 @@ def parameters(found: Identification) -> Section:
     """All parameters, changes of the values with tolerances, and what the standard deviations include."""
     fit = found.campaign_fit
     notes = [*([found.caution] if fit.tolerances else []), *fit.notes]
-    return Section(
-        "Parameters",
-        "parameters",
-        (
-            _parameters(found),
-            _changes(found),
-            *tolerances(fit.tolerances),
-            *(Paragraph(words.sentence(note), "note") for note in notes),
-        ),
-    )
+    said = (Paragraph(words.sentence(note), "note") for note in notes)
+    pieces = (_parameters(found), _changes(found), *tolerances(fit.tolerances), *said)
+    return Section("Parameters", "parameters", pieces)
 
 
 def _measured(found: Identification) -> Paragraph:

@@ -33,16 +33,8 @@ def responses(found: Identification) -> Section:
     """Large figures of the strongest input of each output, and small ones of all pairs."""
     seen = found.validation.overlay
     if seen is None:
-        return Section(
-            "Frequency responses",
-            "responses",
-            (
-                Paragraph(
-                    "No measured frequency response can be shown; the notes of the section on validation state the "
-                    "reason."
-                ),
-            ),
-        )
+        why = "No measured frequency response can be shown; the notes of the section on validation state the reason."
+        return Section("Frequency responses", "responses", (Paragraph(why),))
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
     pieces: list[Piece] = [

@@ -206,21 +206,8 @@ def _electronics(result: DesignResult) -> Table:
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
     if not error.left_out.size:
-        return [
-            Heading("Design model"),
-            Paragraph(
-                "The controller is designed on a model with all six degrees of freedom; no coordinate is locked."
-            ),
-        ]
-    rows = [
-        (
-            words.axis(out),
-            name,
-            words.quantity(error.max_dB[out, name], "dB"),
-            words.quantity(error.rms_dB[out, name], "dB"),
-        )
-        for out, name in error.max_dB
-    ]
+        told = "The controller is designed on a model with all six degrees of freedom; no coordinate is locked."
+        return [Heading("Design model"), Paragraph(told)]
     kept = words.joined(list(error.keep))
     text = (
         f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
@@ -232,11 +219,16 @@ def _reduction(result: DesignResult) -> list[Piece]:
     return [
         Heading("Error of the design model"),
         Paragraph(text),
-        table(
+        listed(
             "Difference between the design model and six degrees of freedom, relative to the largest gain, over "
             "0.1 to 100 Hz.",
-            ("output", "input", "largest", "r.m.s."),
-            rows,
+            list(error.max_dB),
+            {
+                "output": lambda channel: words.axis(channel[0]),
+                "input": lambda channel: channel[1],
+                "largest": lambda channel: words.quantity(error.max_dB[channel], "dB"),
+                "r.m.s.": lambda channel: words.quantity(error.rms_dB[channel], "dB"),
+            },
             "llrr",
         ),
         _compared(error),
@@ -255,37 +247,24 @@ def _largest(error: ReductionError) -> str:
 
 
 def _compared(error: ReductionError) -> Figure:
-    f = error.omega / (2 * np.pi)
-    curves = []
+    f, curves, apart = error.omega / (2 * np.pi), [], []
     for k, name in enumerate(error.keep):
         colour = numbered(k).colour
         curves += [
             Curve(f, in_dB(error.full[:, k, k]), f"{name}, six degrees of freedom", Style(colour, "solid", 2.2)),
             Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, design model", Style("#111111", "dot", 1.6)),
         ]
+        apart.append(Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(colour, "dash", 1.4)))
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
     curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
-    panel = Panel(
-        hertz(),
-        Axis("gain [dB]", "linear", (-80.0, 40.0)),
-        tuple(curves),
-        title="transmissibility along each kept axis",
-    )
-    apart = [
-        Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
-        for k, name in enumerate(error.keep)
-    ]
-    lower = Panel(
-        hertz(),
-        Axis("difference [dB]", "linear", (-140.0, 20.0)),
-        tuple(apart),
-        title="difference, relative to the largest gain",
-    )
+    gain, difference = Axis("gain [dB]", "linear", (-80.0, 40.0)), Axis("difference [dB]", "linear", (-140.0, 20.0))
+    upper = Panel(hertz(), gain, tuple(curves), title="transmissibility along each kept axis")
+    lower = Panel(hertz(), difference, tuple(apart), title="difference, relative to the largest gain")
     return Figure(
         "reduction",
         "Transmissibility without control, floor to payload along each kept axis: six degrees "
         "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
         "the floor's other axes. Beside it, their difference.",
-        (panel, lower),
+        (upper, lower),
         2,
     )
