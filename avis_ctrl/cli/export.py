@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from avis_ctrl.cli.console import Progress, Terminal
+from avis_ctrl.cli.options import Options
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
     from avis_ctrl.export.anti_windup import Choice
@@ -18,53 +17,28 @@ if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
 ORDERS = "orders.png"  # with --order: the orders tried and their mu
 
 
+EXPORT = Options("""
+DESIGN_DIR: folder that avis design wrote
+--out DIR: folder for the controller's files
+--controller NAME: a controller of the design; with --check, the one that DIR must have
+--order N: export a new controller with at most N states for the axes of the design, found by descent on mu (two minutes
+    or more)
+--mu-at-most MU: with --order: mu that the new controller may have, instead of the design's requirement
+--format LIST: some of c,mat,json; controller.json and certificate.json are always written
+--float32: numbers and arithmetic in single precision
+--check: write nothing: check that the files in DIR belong together and compute their certificate again
+""")
+
+
 def export(
-    design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
-    controller: Annotated[
-        str | None,
-        typer.Option(
-            "--controller",
-            metavar="NAME",
-            show_default="mu",
-            help="a controller of the design; with --check, the one that DIR must have",
-        ),
-    ] = None,
-    order: Annotated[
-        int | None,
-        typer.Option(
-            "--order",
-            metavar="N",
-            help="export a new controller with at most "
-            "N states for the axes of the design, found by descent on mu (two "
-            "minutes or more)",
-        ),
-    ] = None,
-    mu_at_most: Annotated[
-        float | None,
-        typer.Option(
-            "--mu-at-most",
-            metavar="MU",
-            help="with --order: mu that the new controller may have, instead of the design's requirement",
-        ),
-    ] = None,
-    formats: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            metavar="LIST",
-            show_default="c,mat,json",
-            help="some of c,mat,json; controller.json and certificate.json are always written",
-        ),
-    ] = None,
-    float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
-    check: Annotated[
-        bool,
-        typer.Option(
-            "--check",
-            help="write nothing: check that the files in DIR belong together and compute their certificate again",
-        ),
-    ] = False,
+    design_dir: Annotated[Path, EXPORT("DESIGN_DIR")],
+    out: Annotated[Path, EXPORT("--out")],
+    controller: Annotated[str | None, EXPORT("--controller", show_default="mu")] = None,
+    order: Annotated[int | None, EXPORT("--order")] = None,
+    mu_at_most: Annotated[float | None, EXPORT("--mu-at-most")] = None,
+    formats: Annotated[str | None, EXPORT("--format", show_default="c,mat,json")] = None,
+    float32: Annotated[bool, EXPORT("--float32")] = False,
+    check: Annotated[bool, EXPORT("--check")] = False,
 ) -> None:
     """Write a controller for the rig's processor: sensor volts to drive volts, all axes.
 

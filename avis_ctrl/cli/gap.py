@@ -6,67 +6,47 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints, read_campaign
+from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import InputError
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
     from avis_ctrl.study.gap import GapFinding
 
 
+GAP = Options("""
+CAMPAIGN: records of the rig: HDF5, .mat, UFF 58 or CSV
+--rig RIG: avis, halcyonics, halcyonics_loaded or a rig.toml
+--out DIR: folder for gap.json, report and models
+--columns ROLE=NAME,..: which variable of the file is what, as in avis identify
+--band LOW HIGH: Hz; by default the excited band
+--amplifier-corner: corner of the amplifiers' first-order lag, if it is known [Hz]
+--design: also design controllers on both models, to show the influence of the effect on mu (about a minute more)
+--design-file DESIGN.toml: as --design, with the axes, uncertainty and weights of this file instead of the default
+    design for z and phi_x
+--effects FILE.py: Python file with effects of your own, run before the search (docs/own_effect.md)
+--despite-gates: continue even if a gate has the result stop
+--seed: seed of all random draws
+""")
+
+
 def gap(
-    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="records of the rig: HDF5, .mat, UFF 58 or CSV")],
-    rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for gap.json, report and models")],
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            "--columns", metavar="ROLE=NAME,..", help="which variable of the file is what, as in avis identify"
-        ),
-    ] = None,
+    campaign: Annotated[Path, GAP("CAMPAIGN")],
+    rig: Annotated[str, GAP("--rig")],
+    out: Annotated[Path, GAP("--out")],
+    columns: Annotated[str | None, GAP("--columns")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
-    band_Hz: Annotated[
-        tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default the excited band")
-    ] = None,
-    amplifier_Hz: Annotated[
-        float | None,
-        typer.Option("--amplifier-corner", help="corner of the amplifiers' first-order lag, if it is known [Hz]"),
-    ] = None,
-    design: Annotated[
-        bool,
-        typer.Option(
-            "--design",
-            help="also design controllers on both models, to show the "
-            "influence of the effect on mu (about a minute more)",
-        ),
-    ] = False,
-    design_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--design-file",
-            metavar="DESIGN.toml",
-            help="as --design, with "
-            "the axes, uncertainty and weights of this file instead of the "
-            "default design for z and phi_x",
-        ),
-    ] = None,
-    effects: Annotated[
-        Path | None,
-        typer.Option(
-            "--effects",
-            metavar="FILE.py",
-            help="Python file with effects of your own, run before the search (docs/own_effect.md)",
-        ),
-    ] = None,
-    despite_gates: Annotated[
-        bool, typer.Option("--despite-gates", help="continue even if a gate has the result stop")
-    ] = False,
-    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
+    band_Hz: Annotated[tuple[float, float] | None, GAP("--band")] = None,
+    amplifier_Hz: Annotated[float | None, GAP("--amplifier-corner")] = None,
+    design: Annotated[bool, GAP("--design")] = False,
+    design_file: Annotated[Path | None, GAP("--design-file")] = None,
+    effects: Annotated[Path | None, GAP("--effects")] = None,
+    despite_gates: Annotated[bool, GAP("--despite-gates")] = False,
+    seed: Annotated[int, GAP("--seed")] = 1,
 ) -> None:
     """Find where model and measurement disagree, and name the physical effects that the model lacks.
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import (
     EXCITATION,
@@ -19,91 +17,53 @@ from avis_ctrl.cli.file_options import (
     read_measured,
     roles,
 )
+from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import AvisError, InputError
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
     from avis_ctrl.study.identification import Identification
 
 
+IDENTIFY = Options("""
+MEASUREMENT: HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or frequency responses
+--rig RIG: rig to start from: avis, halcyonics, halcyonics_loaded or a rig.toml
+--out DIR: folder for rig, report and uncertainty
+--columns ROLE=NAME,..: which variable of the file is what, such as u=V1+V2,y=S1,t=time; names of the channels:
+    y_names=Sy1+Sz1
+--parameter NAME: parameter to fit, such as 'isolator*.k_z' (repeatable); by default mass, inertia, stiffness, damping
+--prior NAME=MEAN+-STD: prior knowledge of a parameter (repeatable)
+--hold-out RECORD: record kept for validation (repeatable); chosen automatically by default
+--band LOW HIGH: Hz; by default the excited band
+--starts: number of starting points of the fit
+--amplifier-corner: corner of the amplifiers' first-order lag [Hz]; by default none, or 300 Hz on a rig with
+    accelerometers
+--kalman: also run the extended Kalman filter, for comparison
+--design DESIGN.toml: design file whose rig and uncertainty are replaced by the identified ones; by default a design for
+    z and phi_x with the weights of the shipped examples
+--despite-gates: continue even if a gate has the result stop
+--seed: seed of all random draws
+""")
+
+
 def identify(
-    measurement: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MEASUREMENT",
-            help="HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or frequency responses",
-        ),
-    ],
-    rig: Annotated[
-        str,
-        typer.Option(
-            "--rig", metavar="RIG", help="rig to start from: avis, halcyonics, halcyonics_loaded or a rig.toml"
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for rig, report and uncertainty")],
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="which variable of the file "
-            "is what, such as u=V1+V2,y=S1,t=time; names of the channels: "
-            "y_names=Sy1+Sz1",
-        ),
-    ] = None,
+    measurement: Annotated[Path, IDENTIFY("MEASUREMENT")],
+    rig: Annotated[str, IDENTIFY("--rig")],
+    out: Annotated[Path, IDENTIFY("--out")],
+    columns: Annotated[str | None, IDENTIFY("--columns")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--parameter",
-            metavar="NAME",
-            help="parameter to fit, such as 'isolator*.k_z' (repeatable); by default mass, inertia, stiffness, damping",
-        ),
-    ] = None,
-    priors: Annotated[
-        list[str] | None,
-        typer.Option("--prior", metavar="NAME=MEAN+-STD", help="prior knowledge of a parameter (repeatable)"),
-    ] = None,
-    hold_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--hold-out",
-            metavar="RECORD",
-            help="record kept for validation (repeatable); chosen automatically by default",
-        ),
-    ] = None,
-    band_Hz: Annotated[
-        tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default the excited band")
-    ] = None,
-    starts: Annotated[int, typer.Option("--starts", help="number of starting points of the fit")] = 3,
-    amplifier_Hz: Annotated[
-        float | None,
-        typer.Option(
-            "--amplifier-corner",
-            help="corner of the amplifiers' "
-            "first-order lag [Hz]; by default none, or 300 Hz on a rig with "
-            "accelerometers",
-        ),
-    ] = None,
-    kalman: Annotated[
-        bool, typer.Option("--kalman", help="also run the extended Kalman filter, for comparison")
-    ] = False,
-    design: Annotated[
-        Path | None,
-        typer.Option(
-            "--design",
-            metavar="DESIGN.toml",
-            help="design file whose rig and "
-            "uncertainty are replaced by the identified ones; by default a design "
-            "for z and phi_x with the weights of the shipped examples",
-        ),
-    ] = None,
-    despite_gates: Annotated[
-        bool, typer.Option("--despite-gates", help="continue even if a gate has the result stop")
-    ] = False,
-    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
+    parameters: Annotated[list[str] | None, IDENTIFY("--parameter")] = None,
+    priors: Annotated[list[str] | None, IDENTIFY("--prior")] = None,
+    hold_out: Annotated[list[str] | None, IDENTIFY("--hold-out")] = None,
+    band_Hz: Annotated[tuple[float, float] | None, IDENTIFY("--band")] = None,
+    starts: Annotated[int, IDENTIFY("--starts")] = 3,
+    amplifier_Hz: Annotated[float | None, IDENTIFY("--amplifier-corner")] = None,
+    kalman: Annotated[bool, IDENTIFY("--kalman")] = False,
+    design: Annotated[Path | None, IDENTIFY("--design")] = None,
+    despite_gates: Annotated[bool, IDENTIFY("--despite-gates")] = False,
+    seed: Annotated[int, IDENTIFY("--seed")] = 1,
 ) -> None:
     """Identify a rig and its uncertainty from measurements, and write a report.
 
@@ -155,18 +115,19 @@ def identify(
     terminal.files(files, folder, *REPORT_FILES, then)
 
 
+PREDICT = Options("""
+DIR: output folder of avis identify, avis gap or avis gap-axis
+CAMPAIGN: another campaign of the same rig
+--out PRED.h5: file to write
+--effects FILE.py: file with your own effects, if the models of avis gap contain them
+""")
+
+
 def predict(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="output folder of avis identify, avis gap or avis gap-axis")
-    ],
-    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
-    out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
-    effects: Annotated[
-        Path | None,
-        typer.Option(
-            "--effects", metavar="FILE.py", help="file with your own effects, if the models of avis gap contain them"
-        ),
-    ] = None,
+    folder: Annotated[Path, PREDICT("DIR")],
+    campaign: Annotated[Path, PREDICT("CAMPAIGN")],
+    out: Annotated[Path, PREDICT("--out")],
+    effects: Annotated[Path | None, PREDICT("--effects")] = None,
 ) -> None:
     """Predict the sensor signals of another campaign from its voltages and floor motion, and compare them with its y.
 
@@ -251,24 +212,22 @@ def _summary(terminal: Terminal, found: Identification) -> None:
     terminal.print(*(f"- {sentence}" for sentence in said))
 
 
+SINGLE_AXIS = Options("""
+KIND: seismometer, decay, drive or oscillator
+MEASUREMENT: a record; for a seismometer a folder with one CSV per frequency
+--columns ROLE=NAME,..: seismometer: drive, coil and/or displacement; decay: y; drive: force, position, reference;
+    oscillator: u, y; each also t
+--scale ROLE=FACTOR,..: factors to SI units
+--sample-rate: Hz, if the file has none
+""")
+
+
 def single_axis(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="seismometer, decay, drive or oscillator")],
-    path: Annotated[
-        Path,
-        typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one CSV per frequency"),
-    ],
-    columns: Annotated[
-        str,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="seismometer: drive, coil and/or "
-            "displacement; decay: y; drive: force, position, reference; oscillator: u, "
-            "y; each also t",
-        ),
-    ],
-    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
-    sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, if the file has none")] = None,
+    kind: Annotated[str, SINGLE_AXIS("KIND")],
+    path: Annotated[Path, SINGLE_AXIS("MEASUREMENT")],
+    columns: Annotated[str, SINGLE_AXIS("--columns")],
+    scale: Annotated[str | None, SINGLE_AXIS("--scale")] = None,
+    sample_rate_Hz: Annotated[float | None, SINGLE_AXIS("--sample-rate")] = None,
 ) -> None:
     """Fit a small model of one axis: a seismometer, a free decay, a drive with friction, or an oscillator."""
     from avis_ctrl.identification.single_axis.identify import identify_single_axis

@@ -10,6 +10,7 @@ import typer
 
 from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
+from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import InputError
 
 # Fraction of the largest level at which nothing clips: a rig may respond more strongly than its file predicts, but not
@@ -18,36 +19,32 @@ LEVEL_SHARE = 0.5
 RIG = Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")]
 
 
+EXCITE = Options("""
+--out FILE: signals.h5, .csv or .mat
+--kind: multisine or noise
+--band LOW HIGH: Hz
+--period: period of a multisine, of noise its length, s
+--periods: number of periods of a multisine; the first one contains the transient
+--rms: r.m.s. voltage of each drive [V]; by default half of the largest level at which neither the drives nor the
+    converter clip, computed for the rig file
+--lines: full, odd or odd_detection (odd lines, one in each group not excited)
+--scheme: orthogonal (one record per drive, all drives on all lines) or zippered (one record, each drive has its own
+    lines)
+--seed: seed of all random draws
+""")
+
+
 def excite(
     rig: RIG,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="signals.h5, .csv or .mat")],
-    kind: Annotated[str, typer.Option("--kind", help="multisine or noise")] = "multisine",
-    band_Hz: Annotated[tuple[float, float], typer.Option("--band", metavar="LOW HIGH", help="Hz")] = (0.5, 60.0),
-    period_s: Annotated[float, typer.Option("--period", help="period of a multisine, of noise its length, s")] = 10.0,
-    periods: Annotated[
-        int, typer.Option("--periods", help="number of periods of a multisine; the first one contains the transient")
-    ] = 6,
-    rms_V: Annotated[
-        float | None,
-        typer.Option(
-            "--rms",
-            help="r.m.s. voltage of each drive [V]; by default half of "
-            "the largest level at which neither the drives nor the converter clip, "
-            "computed for the rig file",
-        ),
-    ] = None,
-    lines: Annotated[
-        str, typer.Option("--lines", help="full, odd or odd_detection (odd lines, one in each group not excited)")
-    ] = "full",
-    scheme: Annotated[
-        str,
-        typer.Option(
-            "--scheme",
-            help="orthogonal (one record per drive, all drives on all lines) "
-            "or zippered (one record, each drive has its own lines)",
-        ),
-    ] = "orthogonal",
-    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
+    out: Annotated[Path, EXCITE("--out")],
+    kind: Annotated[str, EXCITE("--kind")] = "multisine",
+    band_Hz: Annotated[tuple[float, float], EXCITE("--band")] = (0.5, 60.0),
+    period_s: Annotated[float, EXCITE("--period")] = 10.0,
+    periods: Annotated[int, EXCITE("--periods")] = 6,
+    rms_V: Annotated[float | None, EXCITE("--rms")] = None,
+    lines: Annotated[str, EXCITE("--lines")] = "full",
+    scheme: Annotated[str, EXCITE("--scheme")] = "orthogonal",
+    seed: Annotated[int, EXCITE("--seed")] = 1,
 ) -> None:
     """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
     from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
@@ -88,52 +85,31 @@ def excite(
     terminal.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
 
 
+SIMULATE_CAMPAIGN = Options("""
+--out CAMPAIGN.h5: file to write
+--plan PLAN.toml: records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor
+--write-plan FILE: also write the plan used, as a starting point
+--truth FILE: also write the rig that was simulated, with its perturbed values
+--perturbed: default plan with stiffness, mass and inertia up to 5 % off, damping up to 20 %
+--orthogonal: default plan with orthogonal multisines
+--duration: length of each record of the default plan in seconds
+--effects FILE.py: Python file with effects of your own that the plan names (docs/own_effect.md)
+--seed: seed of excitation, floor, noise and perturbation; for another campaign of the same table, use the file written
+    by --truth as --rig
+""")
+
+
 def simulate_campaign(
     rig: RIG,
-    out: Annotated[Path, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")],
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            "--plan",
-            metavar="PLAN.toml",
-            help="records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor",
-        ),
-    ] = None,
-    write_plan: Annotated[
-        Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, as a starting point")
-    ] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            "--truth", metavar="FILE", help="also write the rig that was simulated, with its perturbed values"
-        ),
-    ] = None,
-    perturbed: Annotated[
-        bool,
-        typer.Option(
-            "--perturbed", help="default plan with stiffness, mass and inertia up to 5 % off, damping up to 20 %"
-        ),
-    ] = False,
-    orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
-    duration_s: Annotated[
-        float, typer.Option("--duration", help="length of each record of the default plan in seconds")
-    ] = 60.0,
-    effects: Annotated[
-        Path | None,
-        typer.Option(
-            "--effects",
-            metavar="FILE.py",
-            help="Python file with effects of your own that the plan names (docs/own_effect.md)",
-        ),
-    ] = None,
-    seed: Annotated[
-        int,
-        typer.Option(
-            "--seed",
-            help="seed of excitation, floor, noise and perturbation; for another "
-            "campaign of the same table, use the file written by --truth as --rig",
-        ),
-    ] = 1,
+    out: Annotated[Path, SIMULATE_CAMPAIGN("--out")],
+    plan: Annotated[Path | None, SIMULATE_CAMPAIGN("--plan")] = None,
+    write_plan: Annotated[Path | None, SIMULATE_CAMPAIGN("--write-plan")] = None,
+    truth: Annotated[Path | None, SIMULATE_CAMPAIGN("--truth")] = None,
+    perturbed: Annotated[bool, SIMULATE_CAMPAIGN("--perturbed")] = False,
+    orthogonal: Annotated[bool, SIMULATE_CAMPAIGN("--orthogonal")] = False,
+    duration_s: Annotated[float, SIMULATE_CAMPAIGN("--duration")] = 60.0,
+    effects: Annotated[Path | None, SIMULATE_CAMPAIGN("--effects")] = None,
+    seed: Annotated[int, SIMULATE_CAMPAIGN("--seed")] = 1,
 ) -> None:
     """Simulate a measurement campaign with the nonlinear model, to plan and rehearse an identification."""
     from avis_ctrl.files import write_whole
@@ -180,19 +156,21 @@ def simulate_campaign(
     terminal.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
 
 
+CONVERT = Options("""
+MEASUREMENT: HDF5, .mat, UFF 58, CSV or a folder of CSV
+CAMPAIGN.h5: file to write; the same as --out
+--out CAMPAIGN.h5: file to write
+--columns ROLE=NAME,..: which variable is what, such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1
+--rig: name of the rig, if the file has none
+""")
+
+
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5, .mat, UFF 58, CSV or a folder of CSV")],
-    file: Annotated[Path | None, typer.Argument(metavar="CAMPAIGN.h5", help="file to write; the same as --out")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")] = None,
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="which variable is what, such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1",
-        ),
-    ] = None,
-    rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, if the file has none")] = None,
+    source: Annotated[Path, CONVERT("MEASUREMENT")],
+    file: Annotated[Path | None, CONVERT("CAMPAIGN.h5")] = None,
+    out: Annotated[Path | None, CONVERT("--out")] = None,
+    columns: Annotated[str | None, CONVERT("--columns")] = None,
+    rig: Annotated[str | None, CONVERT("--rig")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,

@@ -6,28 +6,24 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from avis_ctrl.cli.console import Terminal
+from avis_ctrl.cli.options import Options
+
+SWEEP = Options("""
+POINTS.toml: a base and the keys that vary (docs/sweep.md)
+--out DIR: folder for table, picture and points
+--scheduler ADDRESS: a dask scheduler of a cluster, such as tcp://HOST:8786
+--workers N: start a dask scheduler with N workers on this machine
+--jobs N: processes without dask; by default one for each processor
+""")
 
 
 def sweep(
-    points: Annotated[
-        Path, typer.Argument(metavar="POINTS.toml", help="a base and the keys that vary (docs/sweep.md)")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for table, picture and points")],
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="a dask scheduler of a cluster, such as tcp://HOST:8786"),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option("--workers", min=1, metavar="N", help="start a dask scheduler with N workers on this machine"),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", min=1, metavar="N", help="processes without dask; by default one for each processor"),
-    ] = None,
+    points: Annotated[Path, SWEEP("POINTS.toml")],
+    out: Annotated[Path, SWEEP("--out")],
+    scheduler: Annotated[str | None, SWEEP("--scheduler")] = None,
+    workers: Annotated[int | None, SWEEP("--workers", min=1)] = None,
+    jobs: Annotated[int | None, SWEEP("--jobs", min=1)] = None,
 ) -> None:
     """Compute many designs (points), and write a table and their Pareto front.
 
