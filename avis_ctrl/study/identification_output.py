@@ -69,11 +69,9 @@ def identified_toml(found: Identification) -> str:
     comments = {}
     for name, sigma in zip(information.names, information.standard_deviation, strict=True):
         if name in known:
-            comments[name] = (
-                f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
-                if np.isfinite(sigma)
-                else f"{name.rpartition('.')[2]} known only in combination (start {start[name].value:.4g})"
-            )
+            spread = f"+- {sigma:.2g} {known[name].unit}"
+            together = f"known only in combination (start {start[name].value:.4g})"
+            comments[name] = f"{name.rpartition('.')[2]} {spread if np.isfinite(sigma) else together}"
     p = found.provenance
     header = [
         f"{found.rig.name}, identified by avis_ctrl {p['avis_ctrl']} on {p['date']}",
@@ -89,6 +87,7 @@ def identified_toml(found: Identification) -> str:
 def result_dict(found: Identification) -> dict[str, Any]:
     """Content of result.json: the numerical results."""
     fit, information = found.campaign_fit.fit, found.information
+    noise_chi2 = found.campaign_fit.first.chi2_per_dof if found.campaign_fit.measured else None
     start = found.start.parameters()
     rows = {}
     for name, value, sigma, unit in zip(
@@ -111,9 +110,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "condition": information.condition,
         "identifiability": list(found.identifiability.sentences),
         "fit": {
-            "chi2_per_dof_of_measured_noise": found.campaign_fit.first.chi2_per_dof
-            if found.campaign_fit.measured
-            else None,
+            "chi2_per_dof_of_measured_noise": noise_chi2,
             "dof": fit.dof,
             "held_at_bounds": list(fit.held),
             "band_Hz": list(found.campaign_fit.band_Hz),

@@ -151,18 +151,15 @@ def synthesise(
         def shown(row: Any) -> bool:
             """Called after each iteration; False stops it."""
             ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
+            reached = f"peak mu {row.mu_upper:.5g}, order {row.order}"
             # Numbered as in the report, where the initial controllers are rows of the same table.
             if row.kind in INITIAL:
+                progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): {reached}")
+            else:
                 progress(
-                    f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, "
-                    f"order {row.order}"
+                    f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, {reached}, "
+                    f"misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
                 )
-                return not ends
-            progress(
-                f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, "
-                f"peak mu {row.mu_upper:.5g}, order {row.order}, misfit of the D-scalings "
-                f"{100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
-            )
             return not ends
 
         with stop as enough:

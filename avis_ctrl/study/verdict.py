@@ -36,43 +36,21 @@ def check_loop(
     For each plant the sampled loop of all axes is stable, stays within its voltage limits, and moves as the linear
     model predicts. The offset of the electronics uses at most `offset_percent` of a drive's range.
     """
-    n = len(check.plants)
-
-    def row(name: str, kept: int, note: str) -> Requirement:
-        return Requirement(name, n, kept, "plants", kept == n, "at least", note)
-
-    return (
-        row(
-            "closed loop of all axes is stable",
-            sum(p.stable for p in check.plants),
-            "linear sampled loop and nonlinear simulation, with hold, delay, converters, sensors and all axes' loops",
-        ),
-        row(
-            "voltages stay within the limits of drives and converter",
-            sum(p.within_limits for p in check.plants),
-            f"nonlinear simulation of {check.duration_s:g} s",
-        ),
-        row(
-            "motion agrees with the linear prediction",
-            sum(p.agrees for p in check.plants),
-            f"in third octaves; probability {check.false_alarm:g} that noise alone makes at least one plant fail",
-        ),
-        *(
-            ()
-            if rest is None
-            else (
-                Requirement(
-                    "drive voltage for the electronics' offset, relative to its limit",
-                    offset_percent,
-                    rest.percent,
-                    "%",
-                    rest.percent <= offset_percent,
-                    "at most",
-                    rest.words(),
-                ),
-            )
-        ),
+    every = "linear sampled loop and nonlinear simulation, with hold, delay, converters, sensors and all axes' loops"
+    scatter = f"in third octaves; probability {check.false_alarm:g} that noise alone makes at least one plant fail"
+    simulated = f"nonlinear simulation of {check.duration_s:g} s"
+    counted = (
+        ("closed loop of all axes is stable", [p.stable for p in check.plants], every),
+        ("voltages stay within the limits of drives and converter", [p.within_limits for p in check.plants], simulated),
+        ("motion agrees with the linear prediction", [p.agrees for p in check.plants], scatter),
     )
+    rows = [
+        Requirement(name, len(kept), sum(kept), "plants", all(kept), "at least", note) for name, kept, note in counted
+    ]
+    if rest is not None:
+        name, met = "drive voltage for the electronics' offset, relative to its limit", rest.percent <= offset_percent
+        rows.append(Requirement(name, offset_percent, rest.percent, "%", met, "at most", rest.words()))
+    return tuple(rows)
 
 
 def check_requirements(

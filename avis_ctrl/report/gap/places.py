@@ -51,24 +51,21 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     known = known[np.isfinite(known) & (known > 0)]
     top = float(10 ** np.ceil(np.log10(max(LEAST_TOP, known.max(initial=LEAST_TOP))) - 1e-9))
     edges, n = edges_of(heat), len(heat.columns)
-    rows = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
-    sides = [("After re-identification", heat.before)] + ([("With the named effects", heat.after)] if named else [])
-    panels = tuple(
-        Panel(
-            hertz(float(edges[0]), float(edges[-1])),
-            rows,
-            (),
-            (),
-            title,
-            Heat(edges, np.asarray(values, float).T, "residual / noise power [-]", (LOWEST, top)),
-        )
-        for title, values in sides
-    )
+    x = hertz(float(edges[0]), float(edges[-1]))
+    y = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
+
+    def panel(title: str, values: np.ndarray) -> Panel:
+        z = np.asarray(values, float).T
+        return Panel(x, y, (), (), title, Heat(edges, z, "residual / noise power [-]", (LOWEST, top)))
+
+    panels = [panel("After re-identification", heat.before)]
+    if named:
+        panels.append(panel("With the named effects", heat.after))
     return Figure(
         "heat_map",
         "Power of the residual on held-out data relative to that of the measured noise, by "
         "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.",
-        panels,
+        tuple(panels),
         len(panels),
         max(0.75, min(2.4, 0.085 * n + 0.25)),
     )

@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.identification.ekf_result import EkfResult, Innovations, kinds
 from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, level
 from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
@@ -111,36 +111,28 @@ def _table(found: Identification, result: EkfResult) -> Table:
 
 def _figure(found: Identification, result: EkfResult, title: str, index: list[int], number: int) -> Figure:
     information, curves = found.information, result.history
-    t = curves.time_s
+    t, panels = curves.time_s, []
     frame = (float(t[0]), float(max(t[-1], curves.boundaries_s[-1])))
-    panels = []
+    edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
     for k in index:
         name = result.names[k]
-        likely = float(information.values[information.names.index(name)])
+        place = information.names.index(name)
+        likely = float(information.values[place])
         # The wide band of the prior at the first point would hide the estimates.
         low = float(np.min(curves.lower[1:, k], initial=likely))
         high = float(np.max(curves.upper[1:, k], initial=likely))
         pad = 0.05 * (high - low) or 1.0
         ends = (low - pad, high + pad)
-        edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
-        x = np.array([v for b in edges for v in (b, b, np.nan)])
-        y = np.array([v for _ in edges for v in (*ends, np.nan)])
-        drawn = [
+        begun = np.array([(b, b, np.nan) for b in edges]).ravel(), np.array([(*ends, np.nan) for _ in edges]).ravel()
+        drawn = (
             Curve(t, curves.theta[:, k], "estimate", ESTIMATE),
-            Curve(np.array(frame), np.array([likely, likely]), "maximum likelihood", LIKELY),
-            Curve(x, y, "a record begins", RECORDS),
-        ]
-        band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
-        known = "" if information.known[information.names.index(name)] else " *"
-        panels.append(
-            Panel(
-                Axis("time in the records [s]", "linear", frame),
-                Axis(f"[{words.unit(result.units[k])}]", "linear", ends),
-                tuple(drawn),
-                (band,),
-                f"{name}{known}",
-            )
+            level(*frame, likely, "maximum likelihood", LIKELY),
+            Curve(*begun, "a record begins", RECORDS),
         )
+        band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
+        x = Axis("time in the records [s]", "linear", frame)
+        y = Axis(f"[{words.unit(result.units[k])}]", "linear", ends)
+        panels.append(Panel(x, y, drawn, (band,), name + ("" if information.known[place] else " *")))
     return Figure(
         f"kalman_{number}",
         f"{title}: the extended Kalman filter's estimate against time, as in "

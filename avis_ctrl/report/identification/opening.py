@@ -109,31 +109,20 @@ def _changes(found: Identification) -> Figure:
     twice = 200 * information.standard_deviation / size
     known, n = information.known, len(start)
     place = np.arange(n, 0, -1.0)
-    curves = [
-        markers(
-            change[known],
-            place[known],
-            "determined individually, ± 2 σ",
-            Style("#0072b2"),
-            error=twice[known],
-            along="x",
-        )
-    ]
+    alone, together = Style("#0072b2"), Style("#9a9a9a")
+    error = {"error": twice[known], "along": "x"}
+    curves = [markers(change[known], place[known], "determined individually, ± 2 σ", alone, **error)]
     if not known.all():
-        together = f"{TOGETHER}: the nearest to the start"
-        curves.append(markers(change[~known], place[~known], together, Style("#9a9a9a")))
+        label = f"{TOGETHER}: the nearest to the start"
+        curves.append(markers(change[~known], place[~known], label, together))
     curves.append(Curve(np.zeros(2), np.array([0.3, n + 0.7]), "", STYLES["faint"]))
-    ticks = tuple((float(p), name) for p, name in zip(place, information.names, strict=True))
-    longest = float(np.max(twice[known])) if known.any() else np.nan
-    caption = (
-        f"Change of each parameter from its starting value. The longest bar (2 σ) is "
-        f"{words.number(longest, 2)} % of its starting value; bars shorter than a marker are hidden by it."
-        if known.any()
-        else "Change of each parameter from its starting value; none is determined individually."
-    )
-    return Figure(
-        "changes",
-        caption,
-        (Panel(Axis("change from the start [%]"), Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
-        height=max(0.5, 0.07 * n),
-    )
+    caption = "Change of each parameter from its starting value; none is determined individually."
+    if known.any():
+        longest = words.number(float(np.max(twice[known])), 2)
+        caption = (
+            f"Change of each parameter from its starting value. The longest bar (2 σ) is {longest} % of its starting "
+            "value; bars shorter than a marker are hidden by it."
+        )
+    names = Axis("", "linear", (0.3, n + 0.7), tuple(zip(place.tolist(), information.names, strict=True)))
+    panel = Panel(Axis("change from the start [%]"), names, tuple(curves))
+    return Figure("changes", caption, (panel,), height=max(0.5, 0.07 * n))

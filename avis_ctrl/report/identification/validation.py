@@ -23,21 +23,16 @@ def validation(found: Identification) -> Section:
     drawn = v.held_out[:MOST_DRAWN]
     for one in drawn:
         # The errors of the first record are in the summary.
-        pieces += [
-            _chi_square(one, v.outputs),
-            *([errors(one, v.outputs)] if one is not drawn[0] else []),
-            _nrms(one, v.outputs),
-        ]
+        bars_of_errors = [] if one is drawn[0] else [errors(one, v.outputs)]
+        pieces += [_chi_square(one, v.outputs), *bars_of_errors, _nrms(one, v.outputs)]
         if one.whiteness is not None:
-            pieces += [_whiteness(one.name, one.whiteness)]
+            pieces.append(_whiteness(one.name, one.whiteness))
     if len(v.held_out) > len(drawn):
-        pieces.append(
-            Paragraph(
-                f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records "
-                "and pieces; the table lists all.",
-                "note",
-            )
+        left_out = (
+            f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records and pieces; the table "
+            "lists all."
         )
+        pieces.append(Paragraph(left_out, "note"))
     if v.modes:
         pieces += _measured_modes(found)
     pieces.append(Bullets(tuple(dict.fromkeys(map(words.sentence, (*v.sentences[1:], *v.notes))))))
@@ -134,20 +129,14 @@ def _whiteness(name: str, white: Whiteness) -> Figure:
 
 
 def _correlation(one: Correlation) -> Panel:
-    outputs = list(dict.fromkeys(row.partition(" with ")[0] for row in one.rows))
-    of = np.array([outputs.index(row.partition(" with ")[0]) for row in one.rows])
-    curves = [
-        Curve(one.lags, one.value[of == k].max(axis=0), name, Style(numbered(k).colour, "solid", 1.0))
-        for k, name in enumerate(outputs)
-    ]
+    of = [row.partition(" with ")[0] for row in one.rows]
+    curves = []
+    for k, name in enumerate(dict.fromkeys(of)):
+        rows = [value for value, output in zip(one.value, of, strict=True) if output == name]
+        curves.append(Curve(one.lags, np.max(rows, axis=0), name, Style(numbered(k).colour, "solid", 1.0)))
     curves.append(Curve(one.lags, one.limit.max(axis=0), "limit", Style("#b3261e", "dash", 1.4)))
-    return Panel(
-        Axis(f"lag [{one.lag_unit}]"),
-        Axis("correlation [-]", "linear", (0.0, 1.15 * float(max(one.value.max(), one.limit.max())))),
-        tuple(curves),
-        (),
-        f"{one.what[:1].upper()}{one.what[1:]}",
-    )
+    y = Axis("correlation [-]", "linear", (0.0, 1.15 * float(max(one.value.max(), one.limit.max()))))
+    return Panel(Axis(f"lag [{one.lag_unit}]"), y, tuple(curves), (), f"{one.what[:1].upper()}{one.what[1:]}")
 
 
 def modes(found: Identification) -> Table:

@@ -38,15 +38,8 @@ def rig(result: DesignResult) -> Section:
         rig_drawing(one),
         f"Top view and side view of the rig {one.name}",
     )
-    pieces: list[Piece] = [
-        drawing,
-        *_parameters(one),
-        _modes(one),
-        _drives(one),
-        _sensors(one),
-        _electronics(result),
-        *_reduction(result),
-    ]
+    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _drives(one), _sensors(one)]
+    pieces += [_electronics(result), *_reduction(result)]
     return Section("The rig", "rig", tuple(pieces))
 
 
