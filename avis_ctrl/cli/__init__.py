@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import typer
 
 import avis_ctrl
-from avis_ctrl.cli.compare import compare
-from avis_ctrl.cli.design import design
+from avis_ctrl.cli.console import Terminal
+from avis_ctrl.cli.design import compare, design
 from avis_ctrl.cli.export import export
 from avis_ctrl.cli.gap import gap
 from avis_ctrl.cli.gap_axis import gap_axis
@@ -59,17 +59,11 @@ def _commands(
 @app.command()
 def doctor() -> None:
     """Check the installation: versions, solvers, threads."""
-    from rich.console import Console
-    from rich.table import Table
-
     from avis_ctrl.study.doctor import examine
 
-    console = Console(highlight=False)
-    table = Table("check", "found", "")
     checks = examine()
-    for check in checks:
-        table.add_row(check.name, check.found, "[green]ok[/]" if check.works else "[red]does not work[/]")
-    console.print(table)
+    rows = [(one.name, one.found, "[green]ok[/]" if one.works else "[red]does not work[/]") for one in checks]
+    Terminal().table(("check", "found", ""), rows)
     if not all(check.works for check in checks):
         raise typer.Exit(3)
 

@@ -1,23 +1,48 @@
-"""Progress output of the commands, and Ctrl-C as a stop request."""
+"""Output of the commands on the terminal, and Ctrl-C as a stop request."""
 
 from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
-if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
-    from rich.console import Console
+
+class Terminal:
+    """The terminal: lines and tables. The library is imported late so that `avis --help` responds at once."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+
+        self.console = Console(highlight=False)
+
+    def print(self, *lines: str, **how: Any) -> None:
+        """Print lines; how : options of rich."""
+        for line in lines:
+            self.console.print(line, **how)
+
+    def table(self, header: Sequence[str], rows: Iterable[Sequence[str]], **how: Any) -> None:
+        """Print a table; how : title, caption."""
+        from rich.table import Table
+
+        made = Table(*header, **how)
+        for row in rows:
+            made.add_row(*row)
+        self.console.print(made)
+
+    def files(self, files: Sequence[object], folder: Path, html: str, other: str, then: str = "") -> None:
+        """State what a command has written, and which files to open first."""
+        self.console.print(f"{len(files)} files in {folder}; open {folder / html} or {folder / other}{then}")
 
 
 class Progress:
     """Print a line with the elapsed time at each step; on a terminal also show a spinner."""
 
-    def __init__(self, console: Console) -> None:
-        self.console, self.began = console, time.monotonic()
-        self.status = console.status("working") if console.is_terminal else None
+    def __init__(self, terminal: Terminal) -> None:
+        self.console, self.began = terminal.console, time.monotonic()
+        self.status = self.console.status("working") if self.console.is_terminal else None
 
     def __enter__(self) -> Self:
         if self.status:

@@ -7,74 +7,44 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.console import Progress, Terminal
+from avis_ctrl.cli.options import Options
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
-    from rich.console import Console
-
     from avis_ctrl.export.anti_windup import Choice
     from avis_ctrl.export.package import Package
 
 ORDERS = "orders.png"  # with --order: the orders tried and their mu
 
 
+EXPORT = Options("""
+DESIGN_DIR: folder that avis design wrote
+--out DIR: folder for the controller's files
+--controller NAME: a controller of the design; with --check, the one that DIR must have
+--order N: export a new controller with at most N states for the axes of the design, found by descent on mu (two minutes
+    or more)
+--mu-at-most MU: with --order: mu that the new controller may have, instead of the design's requirement
+--format LIST: some of c,mat,json; controller.json and certificate.json are always written
+--float32: numbers and arithmetic in single precision
+--check: write nothing: check that the files in DIR belong together and compute their certificate again
+""")
+
+
 def export(
-    design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that avis design wrote")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for the controller's files")],
-    controller: Annotated[
-        str | None,
-        typer.Option(
-            "--controller",
-            metavar="NAME",
-            show_default="mu",
-            help="a controller of the design; with --check, the one that DIR must have",
-        ),
-    ] = None,
-    order: Annotated[
-        int | None,
-        typer.Option(
-            "--order",
-            metavar="N",
-            help="export a new controller with at most "
-            "N states for the axes of the design, found by descent on mu (two "
-            "minutes or more)",
-        ),
-    ] = None,
-    mu_at_most: Annotated[
-        float | None,
-        typer.Option(
-            "--mu-at-most",
-            metavar="MU",
-            help="with --order: mu that the new controller may have, instead of the design's requirement",
-        ),
-    ] = None,
-    formats: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            metavar="LIST",
-            show_default="c,mat,json",
-            help="some of c,mat,json; controller.json and certificate.json are always written",
-        ),
-    ] = None,
-    float32: Annotated[bool, typer.Option("--float32", help="numbers and arithmetic in single precision")] = False,
-    check: Annotated[
-        bool,
-        typer.Option(
-            "--check",
-            help="write nothing: check that the files in DIR belong together and compute their certificate again",
-        ),
-    ] = False,
+    design_dir: Annotated[Path, EXPORT("DESIGN_DIR")],
+    out: Annotated[Path, EXPORT("--out")],
+    controller: Annotated[str | None, EXPORT("--controller", show_default="mu")] = None,
+    order: Annotated[int | None, EXPORT("--order")] = None,
+    mu_at_most: Annotated[float | None, EXPORT("--mu-at-most")] = None,
+    formats: Annotated[str | None, EXPORT("--format", show_default="c,mat,json")] = None,
+    float32: Annotated[bool, EXPORT("--float32")] = False,
+    check: Annotated[bool, EXPORT("--check")] = False,
 ) -> None:
     """Write a controller for the rig's processor: sensor volts to drive volts, all axes.
 
     Writes controller.json, avis_controller.h and .c (C99), controller.mat, test_vectors.csv, restart_vectors.csv and
     certificate.json into DIR. The certificate is computed from the numbers in controller.json (docs/export.md).
     """
-    from rich.console import Console
-
     from avis_ctrl.errors import InputError
     from avis_ctrl.export.design_folder import open_design
     from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
@@ -83,7 +53,7 @@ def export(
     from avis_ctrl.lti.norms import decibels
     from avis_ctrl.study.files import output_folder
 
-    console, asked = Console(highlight=False), FORMATS if formats is None else formats_of(formats)
+    terminal, asked = Terminal(), FORMATS if formats is None else formats_of(formats)
     for option, value in (("--order", order), ("--format", formats), ("--float32", float32 or None)):
         if check and value is not None:
             raise InputError(f"--check writes no files; expected either --check or {option}", field=option, value=value)
@@ -95,7 +65,7 @@ def export(
         )
     folder = open_design(design_dir)
     if check:
-        with Progress(console) as progress:
+        with Progress(terminal) as progress:
             wrong = check_package(folder, out, progress, controller)
         if wrong:
             raise InputError(
@@ -104,11 +74,11 @@ def export(
                 "the controller again",
                 file=out,
             )
-        console.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
+        terminal.print(f"{out}: the files belong together, and the certificate is that of controller.json.")
         return
     controller = controller or "mu"
     K = folder.controller(controller)  # a wrong name is reported before anything is created
-    with output_folder(out, (*FILES, ORDERS)) as path, Progress(console) as progress:
+    with output_folder(out, (*FILES, ORDERS)) as path, Progress(terminal) as progress:
         pictures, most = dict[str, bytes](), float("inf")
         if order is not None:
             most = mu_asked(folder.design) if mu_at_most is None else mu_at_most
@@ -118,18 +88,18 @@ def export(
         made = make_package(folder, controller, "float32" if float32 else "float64", asked, progress, most)
         files = write_together(path, pictures | made.contents, [path / name for name in (*FILES, ORDERS)])
     if order is not None:
-        _orders(console, folder.added[controller].orders)
-    _summary(console, made)
+        _orders(terminal, folder.added[controller].orders)
+    _summary(terminal, made)
     if (mu := made.certificate.content["mu_upper"]) > (allowed := mu_asked(folder.design)):
-        console.print(f"mu of the code is at most {mu:.4g}; the design requires at most {allowed:g}.")
+        terminal.print(f"mu of the code is at most {mu:.4g}; the design requires at most {allowed:g}.")
     peak_dB = min(folder.design.upper_limits("worst_case_peak_transmissibility_dB"), default=math.inf)
     if made.replay and (simulated := decibels(made.replay.gain)) > peak_dB:
-        console.print(
+        terminal.print(
             f"With all six axes, the gain of the worst plant simulated with the compiled code is {simulated:.2f} dB. "
             f"The design requires at most {peak_dB:g} dB for its axes, with the others locked; to include these, "
             "add them to keep in the design file."
         )
-    console.print(f"{len(files)} files in {path}")
+    terminal.print(f"{len(files)} files in {path}")
 
 
 def _picture(orders: Sequence[tuple[int, float]]) -> bytes:
@@ -146,14 +116,10 @@ def _picture(orders: Sequence[tuple[int, float]]) -> bytes:
     return file.getvalue()
 
 
-def _orders(console: Console, orders: Sequence[tuple[int, float]]) -> None:
-    from rich.table import Table
-
-    table = Table("states", "mu at most, design's model", "", title="order against mu")
-    for k, (states, mu) in enumerate(orders):
-        which = "of the folder" if not k else "exported" if k + 1 == len(orders) else ""
-        table.add_row(str(states), f"{mu:.4g}", which)
-    console.print(table)
+def _orders(terminal: Terminal, orders: Sequence[tuple[int, float]]) -> None:
+    ends = {0: "of the folder", len(orders) - 1: "exported"}
+    rows = [(str(states), f"{mu:.4g}", ends.get(k, "")) for k, (states, mu) in enumerate(orders)]
+    terminal.table(("states", "mu at most, design's model", ""), rows, title="order against mu")
 
 
 def _anti_windup(choice: Choice) -> str:
@@ -171,25 +137,15 @@ def _anti_windup(choice: Choice) -> str:
     )
 
 
-def _summary(console: Console, made: Package) -> None:
-    from math import log10
-
-    from rich.table import Table
-
+def _summary(terminal: Terminal, made: Package) -> None:
     found = made.certificate.content
-    table = Table(
-        "computed from the exported numbers",
-        "",
-        title="certificate",
-        caption="Bounds: the axes of the design, with the others locked. Simulation: all six axes.",
-    )
     rows = (
         ("mu, upper bound", found["mu_upper"], ""),
         ("mu, lower bound", found["mu_lower"], ""),
         ("worst-case transmissibility, peak", found["worst_case_peak_transmissibility_dB"], " dB"),
         ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
         ("worst-case gain, between samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
-        ("worst plant simulated with the compiled code", made.replay and 20 * log10(made.replay.gain), " dB"),
+        ("worst plant simulated with the compiled code", made.replay and 20 * math.log10(made.replay.gain), " dB"),
         ("gain at rest, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
         (
             f"drive {found['at_rest']['drive']}: voltage for offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV",
@@ -200,9 +156,10 @@ def _summary(console: Console, made: Package) -> None:
         ("payload velocity by rounding, bound", found["rounding_noise_m_per_s"], " m/s"),
         ("time of one step on this machine", found["step_time_us"], " us"),
     )
-    for name, value, unit in rows:
-        table.add_row(name, "not measured" if value is None else f"{value:.4g}{unit}")
-    console.print(table)
-    console.print(_anti_windup(made.anti_windup))
-    for reason in made.certificate.reasons:
-        console.print(f"Not proved: {reason}")
+    terminal.table(
+        ("computed from the exported numbers", ""),
+        [(name, "not measured" if value is None else f"{value:.4g}{unit}") for name, value, unit in rows],
+        title="certificate",
+        caption="Bounds: the axes of the design, with the others locked. Simulation: all six axes.",
+    )
+    terminal.print(_anti_windup(made.anti_windup), *(f"Not proved: {reason}" for reason in made.certificate.reasons))

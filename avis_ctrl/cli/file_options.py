@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import InputError
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
@@ -15,25 +14,16 @@ if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
     from avis_ctrl.rigs.rig import Rig
 
 # Options of `convert`, `identify` and `gap` for information that a file may lack.
-PERIOD = Annotated[
-    float | None,
-    typer.Option("--period", metavar="SECONDS", help="period of a multisine, if the file does not state it"),
-]
-EXCITATION = Annotated[
-    str | None,
-    typer.Option(
-        "--excitation", metavar="KIND", help="multisine, noise, rest, floor or sine, if the file does not state it"
-    ),
-]
-SAMPLE_RATE = Annotated[
-    float | None, typer.Option("--sample-rate", metavar="HZ", help="sample rate, if the file has no time column")
-]
-UNIT_Y = Annotated[
-    str | None,
-    typer.Option(
-        "--unit-y", metavar="UNIT", help="unit of y in the file: V, mV, m/s, mm/s, m/s^2, g, m, ...; V by default"
-    ),
-]
+FILE = Options("""
+--period SECONDS: period of a multisine, if the file does not state it
+--excitation KIND: multisine, noise, rest, floor or sine, if the file does not state it
+--sample-rate HZ: sample rate, if the file has no time column
+--unit-y UNIT: unit of y in the file: V, mV, m/s, mm/s, m/s^2, g, m, ...; V by default
+""")
+PERIOD = Annotated[float | None, FILE("--period")]
+EXCITATION = Annotated[str | None, FILE("--excitation")]
+SAMPLE_RATE = Annotated[float | None, FILE("--sample-rate")]
+UNIT_Y = Annotated[str | None, FILE("--unit-y")]
 
 
 def known_hints(

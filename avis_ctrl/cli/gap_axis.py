@@ -6,79 +6,48 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
+from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import SAMPLE_RATE, factors, roles
+from avis_ctrl.cli.options import Options
+
+GAP_AXIS = Options("""
+KIND: drive, oscillator, seismometer or levels
+MEASUREMENT: a record; for a seismometer a folder with one CSV per frequency; for levels a folder of `u_*mV*.npy` and
+    `y_*mV*.npy`
+--columns ROLE=NAME,..: drive: force, position, reference; oscillator: u, y; seismometer: drive, coil and/or
+    displacement; each also t; by name, or in CSV by number from 1; levels: none
+--scale ROLE=FACTOR,..: factors to SI units
+--band LOW HIGH: Hz, of what is fitted; around one mode of a structure
+--cutoff HZ: low-pass of the motion of which a drive's friction is formed; the fit itself runs as far up as force and
+    motion are coherent
+--output KIND: what the column of y or position holds: position, velocity or acceleration
+--range START END: s, part of each record
+--resample HZ: new sample rate
+--also RECORD: another record of the same axis; of several, whole ones are held out
+--out DIR: folder for gap.json, reports and the model that avis predict reads
+--seed: has no influence any more
+""")
 
 
 def gap_axis(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="drive, oscillator, seismometer or levels")],
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MEASUREMENT",
-            help="a record; for a seismometer a folder with one "
-            "CSV per frequency; for levels a folder of `u_*mV*.npy` and `y_*mV*.npy`",
-        ),
-    ],
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="drive: force, position, "
-            "reference; oscillator: u, y; seismometer: drive, coil and/or "
-            "displacement; each also t; by name, or in CSV by number from 1; "
-            "levels: none",
-        ),
-    ] = None,
-    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
+    kind: Annotated[str, GAP_AXIS("KIND")],
+    path: Annotated[Path, GAP_AXIS("MEASUREMENT")],
+    columns: Annotated[str | None, GAP_AXIS("--columns")] = None,
+    scale: Annotated[str | None, GAP_AXIS("--scale")] = None,
     sample_rate_Hz: SAMPLE_RATE = None,
-    band_Hz: Annotated[
-        tuple[float, float] | None,
-        typer.Option("--band", metavar="LOW HIGH", help="Hz, of what is fitted; around one mode of a structure"),
-    ] = None,
-    cutoff_Hz: Annotated[
-        float | None,
-        typer.Option(
-            "--cutoff",
-            metavar="HZ",
-            help="low-pass of the motion of which "
-            "a drive's friction is formed; the fit itself runs as far up as "
-            "force and motion are coherent",
-        ),
-    ] = None,
-    output: Annotated[
-        str,
-        typer.Option(
-            "--output",
-            metavar="KIND",
-            help="what the column of y or position holds: position, velocity or acceleration",
-        ),
-    ] = "position",
-    range_s: Annotated[
-        tuple[float, float] | None, typer.Option("--range", metavar="START END", help="s, part of each record")
-    ] = None,
-    resample_Hz: Annotated[float | None, typer.Option("--resample", metavar="HZ", help="new sample rate")] = None,
-    also: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--also", metavar="RECORD", help="another record of the same axis; of several, whole ones are held out"
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="folder for gap.json, reports and the model that avis predict reads"),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", hidden=True, help="has no influence any more")] = 1,
+    band_Hz: Annotated[tuple[float, float] | None, GAP_AXIS("--band")] = None,
+    cutoff_Hz: Annotated[float | None, GAP_AXIS("--cutoff")] = None,
+    output: Annotated[str, GAP_AXIS("--output")] = "position",
+    range_s: Annotated[tuple[float, float] | None, GAP_AXIS("--range")] = None,
+    resample_Hz: Annotated[float | None, GAP_AXIS("--resample")] = None,
+    also: Annotated[list[Path] | None, GAP_AXIS("--also")] = None,
+    out: Annotated[Path | None, GAP_AXIS("--out")] = None,
+    seed: Annotated[int, GAP_AXIS("--seed", hidden=True)] = 1,
 ) -> None:
     """Find the effects that a model of one axis lacks: their size and probability, and the gap before and after.
 
     For example: avis gap-axis drive drive.mat --columns force=vir,position=qm,reference=qg,t=t --scale force=35.15
     """
-    from rich.console import Console
-
-    from avis_ctrl.cli.console import Progress
     from avis_ctrl.gap.axis import find_axis_gap_in
     from avis_ctrl.report import rendered
     from avis_ctrl.report.gap.axis import document
@@ -89,10 +58,10 @@ def gap_axis(
     options: dict[str, Any] = {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}
     options = {name: value for name, value in options.items() if value is not None}
     reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
-    console = Console(highlight=False)
+    terminal = Terminal()
     files: list[str] = []
     with output_folder(out, FILES) if out else nullcontext() as folder:
-        with Progress(console) as progress:
+        with Progress(terminal) as progress:
             found = find_axis_gap_in(
                 kind,
                 [path, *(also or ())] if also else path,
@@ -108,15 +77,13 @@ def gap_axis(
             files = write_axis_gap(
                 folder, found, path.name, {**given, **reading, **options}, lambda *told: rendered(document(*told))
             )
-    console.print(f"verdict: {found.verdict}")
-    for sentence in found.sentences:
-        console.print(sentence, soft_wrap=True, markup=False)
-    for name, one in (*found.parameters.items(), *found.ratios.items()):
-        console.print(f"{name} = {one}", markup=False)
+    terminal.print(f"verdict: {found.verdict}")
+    terminal.print(*found.sentences, soft_wrap=True, markup=False)
+    values = (*found.parameters.items(), *found.ratios.items())
+    terminal.print(*(f"{name} = {one}" for name, one in values), markup=False)
     for stage in found.stages:
         noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
-        console.print(
-            f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}", soft_wrap=True, markup=False
-        )
+        error = f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}"
+        terminal.print(error, soft_wrap=True, markup=False)
     if folder:
-        console.print(f"{len(files)} files in {folder}; open {folder / 'gap.html'} or {folder / 'gap.pdf'}")
+        terminal.files(files, folder, *FILES[1:3])

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import (
     EXCITATION,
     PERIOD,
@@ -19,114 +17,72 @@ from avis_ctrl.cli.file_options import (
     read_measured,
     roles,
 )
+from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import AvisError, InputError
 
 if TYPE_CHECKING:  # imports are deferred so that `avis --help` responds at once
-    from rich.console import Console
-
     from avis_ctrl.study.identification import Identification
 
 
+IDENTIFY = Options("""
+MEASUREMENT: HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or frequency responses
+--rig RIG: rig to start from: avis, halcyonics, halcyonics_loaded or a rig.toml
+--out DIR: folder for rig, report and uncertainty
+--columns ROLE=NAME,..: which variable of the file is what, such as u=V1+V2,y=S1,t=time; names of the channels:
+    y_names=Sy1+Sz1
+--parameter NAME: parameter to fit, such as 'isolator*.k_z' (repeatable); by default mass, inertia, stiffness, damping
+--prior NAME=MEAN+-STD: prior knowledge of a parameter (repeatable)
+--hold-out RECORD: record kept for validation (repeatable); chosen automatically by default
+--band LOW HIGH: Hz; by default the excited band
+--starts: number of starting points of the fit
+--amplifier-corner: corner of the amplifiers' first-order lag [Hz]; by default none, or 300 Hz on a rig with
+    accelerometers
+--kalman: also run the extended Kalman filter, for comparison
+--design DESIGN.toml: design file whose rig and uncertainty are replaced by the identified ones; by default a design for
+    z and phi_x with the weights of the shipped examples
+--despite-gates: continue even if a gate has the result stop
+--seed: seed of all random draws
+""")
+
+
 def identify(
-    measurement: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MEASUREMENT",
-            help="HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or frequency responses",
-        ),
-    ],
-    rig: Annotated[
-        str,
-        typer.Option(
-            "--rig", metavar="RIG", help="rig to start from: avis, halcyonics, halcyonics_loaded or a rig.toml"
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for rig, report and uncertainty")],
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="which variable of the file "
-            "is what, such as u=V1+V2,y=S1,t=time; names of the channels: "
-            "y_names=Sy1+Sz1",
-        ),
-    ] = None,
+    measurement: Annotated[Path, IDENTIFY("MEASUREMENT")],
+    rig: Annotated[str, IDENTIFY("--rig")],
+    out: Annotated[Path, IDENTIFY("--out")],
+    columns: Annotated[str | None, IDENTIFY("--columns")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--parameter",
-            metavar="NAME",
-            help="parameter to fit, such as 'isolator*.k_z' (repeatable); by default mass, inertia, stiffness, damping",
-        ),
-    ] = None,
-    priors: Annotated[
-        list[str] | None,
-        typer.Option("--prior", metavar="NAME=MEAN+-STD", help="prior knowledge of a parameter (repeatable)"),
-    ] = None,
-    hold_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--hold-out",
-            metavar="RECORD",
-            help="record kept for validation (repeatable); chosen automatically by default",
-        ),
-    ] = None,
-    band_Hz: Annotated[
-        tuple[float, float] | None, typer.Option("--band", metavar="LOW HIGH", help="Hz; by default the excited band")
-    ] = None,
-    starts: Annotated[int, typer.Option("--starts", help="number of starting points of the fit")] = 3,
-    amplifier_Hz: Annotated[
-        float | None,
-        typer.Option(
-            "--amplifier-corner",
-            help="corner of the amplifiers' "
-            "first-order lag [Hz]; by default none, or 300 Hz on a rig with "
-            "accelerometers",
-        ),
-    ] = None,
-    kalman: Annotated[
-        bool, typer.Option("--kalman", help="also run the extended Kalman filter, for comparison")
-    ] = False,
-    design: Annotated[
-        Path | None,
-        typer.Option(
-            "--design",
-            metavar="DESIGN.toml",
-            help="design file whose rig and "
-            "uncertainty are replaced by the identified ones; by default a design "
-            "for z and phi_x with the weights of the shipped examples",
-        ),
-    ] = None,
-    despite_gates: Annotated[
-        bool, typer.Option("--despite-gates", help="continue even if a gate has the result stop")
-    ] = False,
-    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
+    parameters: Annotated[list[str] | None, IDENTIFY("--parameter")] = None,
+    priors: Annotated[list[str] | None, IDENTIFY("--prior")] = None,
+    hold_out: Annotated[list[str] | None, IDENTIFY("--hold-out")] = None,
+    band_Hz: Annotated[tuple[float, float] | None, IDENTIFY("--band")] = None,
+    starts: Annotated[int, IDENTIFY("--starts")] = 3,
+    amplifier_Hz: Annotated[float | None, IDENTIFY("--amplifier-corner")] = None,
+    kalman: Annotated[bool, IDENTIFY("--kalman")] = False,
+    design: Annotated[Path | None, IDENTIFY("--design")] = None,
+    despite_gates: Annotated[bool, IDENTIFY("--despite-gates")] = False,
+    seed: Annotated[int, IDENTIFY("--seed")] = 1,
 ) -> None:
     """Identify a rig and its uncertainty from measurements, and write a report.
 
     Writes rig.toml, uncertainty.json, design.toml, report.html, report.pdf and result.json into DIR. Then
     `avis design DIR/design.toml --out DIR2` designs controllers for the identified rig.
     """
-    from rich.console import Console
-
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.design_file import read_design
+    from avis_ctrl.study.file_names import IDENTIFICATION_FILES, REPORT_FILES
     from avis_ctrl.study.files import output_folder
-    from avis_ctrl.study.identification_files import FILES
 
-    console = Console(highlight=False)
+    terminal = Terminal()
     start = load_rig(rig)
     template = None if design is None else read_design(design)  # raises at once, not after the fit
     measured = read_measured(measurement, start, columns, **known_hints(period_s, excitation, sample_rate_Hz, unit_y))
-    for note in in_short(measured.notes) if isinstance(measured, Campaign) else ():
-        console.print(f"[dim]{note}[/]")
-    with output_folder(out, FILES) as folder, Progress(console) as progress:
+    notes = in_short(measured.notes) if isinstance(measured, Campaign) else ()
+    terminal.print(*(f"[dim]{note}[/]" for note in notes))
+    with output_folder(out, IDENTIFICATION_FILES) as folder, Progress(terminal) as progress:
         from avis_ctrl.report import rendered
         from avis_ctrl.report.identification.content import document
         from avis_ctrl.study.identification import IdentifyOptions, identify
@@ -155,45 +111,41 @@ def identify(
             more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
         progress("report")
         files = write_identification(found, folder, *rendered(document(found, made)), more)
-    _summary(console, found)
-    console.print(f"{len(files)} files in {folder}; open {folder / 'report.html'} or {folder / 'report.pdf'}{then}")
+    _summary(terminal, found)
+    terminal.files(files, folder, *REPORT_FILES, then)
+
+
+PREDICT = Options("""
+DIR: output folder of avis identify, avis gap or avis gap-axis
+CAMPAIGN: another campaign of the same rig
+--out PRED.h5: file to write
+--effects FILE.py: file with your own effects, if the models of avis gap contain them
+""")
 
 
 def predict(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="output folder of avis identify, avis gap or avis gap-axis")
-    ],
-    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="another campaign of the same rig")],
-    out: Annotated[Path, typer.Option("--out", metavar="PRED.h5", help="file to write")],
-    effects: Annotated[
-        Path | None,
-        typer.Option(
-            "--effects", metavar="FILE.py", help="file with your own effects, if the models of avis gap contain them"
-        ),
-    ] = None,
+    folder: Annotated[Path, PREDICT("DIR")],
+    campaign: Annotated[Path, PREDICT("CAMPAIGN")],
+    out: Annotated[Path, PREDICT("--out")],
+    effects: Annotated[Path | None, PREDICT("--effects")] = None,
 ) -> None:
     """Predict the sensor signals of another campaign from its voltages and floor motion, and compare them with its y.
 
     Writes /records/NN/y for an identified rig, or /records/NN/y_baseline and /records/NN/y_updated for the models of
     avis gap.
     """
-    from rich.console import Console
-    from rich.table import Table
-
+    from avis_ctrl.study.file_names import GAP_FILE
     from avis_ctrl.study.files import require_output
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
-    from avis_ctrl.study.gap_names import GAP_FILE
     from avis_ctrl.study.prediction_file import compared, prediction_errors
 
     require_output(out, campaign)
-    console = Console(highlight=False)
+    terminal = Terminal()
     if is_axis_gap(folder):
         several = write_axis_predictions(folder, [campaign], out)
-        rows = Table("record", "baseline", "updated", title="r.m.s. error relative to what was measured")
-        for name, *both in several:
-            rows.add_row(name, *(f"{100 * one:.3g} %" for one in both))
-        console.print(rows)
-        console.print(f"{out}: {len(several)} records")
+        rows = [(name, *(f"{100 * one:.3g} %" for one in both)) for name, *both in several]
+        terminal.table(("record", "baseline", "updated"), rows, title="r.m.s. error relative to what was measured")
+        terminal.print(f"{out}: {len(several)} records")
         return
     if effects is not None:
         from avis_ctrl.gap.effects.user_effects import load_effects
@@ -208,26 +160,22 @@ def predict(
 
         rig, write = read_identified(folder)[0], write_predictions
     measured = read_campaign(campaign, rig)
-    with Progress(console) as progress:
+    with Progress(terminal) as progress:
         write(folder, measured, out, progress)
         progress("prediction errors")
         errors = list(prediction_errors(out, measured))
     if errors:
         names = list(errors[0].relative)
         noisy = any(one.noise is not None for one in errors)
-        table = Table(
-            "record",
-            *names,
-            *["noise between periods"] * noisy,
-            title="r.m.s. error relative to measured y; each record is predicted from rest",
-        )
+        rows = []
         for one in errors:
             noise = "" if one.noise is None else f"{100 * one.noise:.3g} %"
-            table.add_row(one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy)
-        console.print(table)
+            rows.append((one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy))
+        title = "r.m.s. error relative to measured y; each record is predicted from rest"
+        terminal.table(("record", *names, *["noise between periods"] * noisy), rows, title=title)
         if note := compared(errors):
-            console.print(note)
-    console.print(f"{out}: {len(measured.records)} records")
+            terminal.print(note)
+    terminal.print(f"{out}: {len(measured.records)} records")
 
 
 def _prior(text: str) -> tuple[str, tuple[float, float]]:
@@ -239,64 +187,56 @@ def _prior(text: str) -> tuple[str, tuple[float, float]]:
         raise InputError("expected NAME=MEAN+-STD such as mass=500+-5", field="--prior", value=text) from None
 
 
-def _summary(console: Console, found: Identification) -> None:
-    from rich.table import Table
-
+def _summary(terminal: Terminal, found: Identification) -> None:
     from avis_ctrl.uncertain_value import rounded, text
 
     information = found.information
     loaded = " with its load" if getattr(found.rig, "load", None) else ""
     start = {name: one.value for name, one in found.campaign_fit.first.model.all_parameters().items()}
     start |= {name: one.value for name, one in found.start.parameters().items()}
-    table = Table(
-        "parameter", "start", "identified", "+- 1 sigma", "unit", title=f"{found.rig.name}{loaded}, identified"
-    )
+    rows = []
     for name, value, sigma, unit in zip(
         information.names, information.values, information.standard_deviation, information.units, strict=True
     ):
         shown, std = rounded(value, sigma)
-        table.add_row(name, f"{start[name]:.6g}", shown, std if sigma < float("inf") else "only in combination", unit)
-    console.print(table)
+        rows.append((name, f"{start[name]:.6g}", shown, std if sigma < float("inf") else "only in combination", unit))
+    header = ("parameter", "start", "identified", "+- 1 sigma", "unit")
+    terminal.table(header, rows, title=f"{found.rig.name}{loaded}, identified")
     verdict, *validation = found.validation.sentences
-    console.print(f"{verdict[:1].upper()}{verdict[1:]}.")
-    for sentence in (found.caution, *found.campaign_fit.notes, *validation, *found.identifiability.sentences):
-        console.print(f"- {sentence}")
+    terminal.print(f"{verdict[:1].upper()}{verdict[1:]}.")
+    said = [found.caution, *found.campaign_fit.notes, *validation, *found.identifiability.sentences]
     for one in found.campaign_fit.tolerances[:5]:
-        console.print(f"- {one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
+        said.append(f"{one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
     if found.advice:
-        console.print(f"- {found.advice[0]} (Other records that would help are in section 5 of the report.)")
+        said.append(f"{found.advice[0]} (Other records that would help are in section 5 of the report.)")
+    terminal.print(*(f"- {sentence}" for sentence in said))
+
+
+SINGLE_AXIS = Options("""
+KIND: seismometer, decay, drive or oscillator
+MEASUREMENT: a record; for a seismometer a folder with one CSV per frequency
+--columns ROLE=NAME,..: seismometer: drive, coil and/or displacement; decay: y; drive: force, position, reference;
+    oscillator: u, y; each also t
+--scale ROLE=FACTOR,..: factors to SI units
+--sample-rate: Hz, if the file has none
+""")
 
 
 def single_axis(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="seismometer, decay, drive or oscillator")],
-    path: Annotated[
-        Path,
-        typer.Argument(metavar="MEASUREMENT", help="a record; for a seismometer a folder with one CSV per frequency"),
-    ],
-    columns: Annotated[
-        str,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="seismometer: drive, coil and/or "
-            "displacement; decay: y; drive: force, position, reference; oscillator: u, "
-            "y; each also t",
-        ),
-    ],
-    scale: Annotated[str | None, typer.Option("--scale", metavar="ROLE=FACTOR,..", help="factors to SI units")] = None,
-    sample_rate_Hz: Annotated[float | None, typer.Option("--sample-rate", help="Hz, if the file has none")] = None,
+    kind: Annotated[str, SINGLE_AXIS("KIND")],
+    path: Annotated[Path, SINGLE_AXIS("MEASUREMENT")],
+    columns: Annotated[str, SINGLE_AXIS("--columns")],
+    scale: Annotated[str | None, SINGLE_AXIS("--scale")] = None,
+    sample_rate_Hz: Annotated[float | None, SINGLE_AXIS("--sample-rate")] = None,
 ) -> None:
     """Fit a small model of one axis: a seismometer, a free decay, a drive with friction, or an oscillator."""
-    from rich.console import Console
-
     from avis_ctrl.identification.single_axis.identify import identify_single_axis
 
     names, scales = roles(columns), factors(scale)
     found = identify_single_axis(kind, path, names, scale=scales or None, sample_rate_Hz=sample_rate_Hz)
-    console = Console(highlight=False)
-    console.print(_assumed_units(kind, names, scales), soft_wrap=True)
-    for line in found.lines():
-        console.print(line)
+    terminal = Terminal()
+    terminal.print(_assumed_units(kind, names, scales), soft_wrap=True)
+    terminal.print(*found.lines())
 
 
 # Units that the fits assume for each role, after --scale.

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from avis_ctrl.cli.console import Progress
+from avis_ctrl.cli.console import Progress, Terminal
 from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, known_hints
+from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import InputError
 
 # Fraction of the largest level at which nothing clips: a rig may respond more strongly than its file predicts, but not
@@ -18,41 +19,34 @@ LEVEL_SHARE = 0.5
 RIG = Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")]
 
 
+EXCITE = Options("""
+--out FILE: signals.h5, .csv or .mat
+--kind: multisine or noise
+--band LOW HIGH: Hz
+--period: period of a multisine, of noise its length, s
+--periods: number of periods of a multisine; the first one contains the transient
+--rms: r.m.s. voltage of each drive [V]; by default half of the largest level at which neither the drives nor the
+    converter clip, computed for the rig file
+--lines: full, odd or odd_detection (odd lines, one in each group not excited)
+--scheme: orthogonal (one record per drive, all drives on all lines) or zippered (one record, each drive has its own
+    lines)
+--seed: seed of all random draws
+""")
+
+
 def excite(
     rig: RIG,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="signals.h5, .csv or .mat")],
-    kind: Annotated[str, typer.Option("--kind", help="multisine or noise")] = "multisine",
-    band_Hz: Annotated[tuple[float, float], typer.Option("--band", metavar="LOW HIGH", help="Hz")] = (0.5, 60.0),
-    period_s: Annotated[float, typer.Option("--period", help="period of a multisine, of noise its length, s")] = 10.0,
-    periods: Annotated[
-        int, typer.Option("--periods", help="number of periods of a multisine; the first one contains the transient")
-    ] = 6,
-    rms_V: Annotated[
-        float | None,
-        typer.Option(
-            "--rms",
-            help="r.m.s. voltage of each drive [V]; by default half of "
-            "the largest level at which neither the drives nor the converter clip, "
-            "computed for the rig file",
-        ),
-    ] = None,
-    lines: Annotated[
-        str, typer.Option("--lines", help="full, odd or odd_detection (odd lines, one in each group not excited)")
-    ] = "full",
-    scheme: Annotated[
-        str,
-        typer.Option(
-            "--scheme",
-            help="orthogonal (one record per drive, all drives on all lines) "
-            "or zippered (one record, each drive has its own lines)",
-        ),
-    ] = "orthogonal",
-    seed: Annotated[int, typer.Option("--seed", help="seed of all random draws")] = 1,
+    out: Annotated[Path, EXCITE("--out")],
+    kind: Annotated[str, EXCITE("--kind")] = "multisine",
+    band_Hz: Annotated[tuple[float, float], EXCITE("--band")] = (0.5, 60.0),
+    period_s: Annotated[float, EXCITE("--period")] = 10.0,
+    periods: Annotated[int, EXCITE("--periods")] = 6,
+    rms_V: Annotated[float | None, EXCITE("--rms")] = None,
+    lines: Annotated[str, EXCITE("--lines")] = "full",
+    scheme: Annotated[str, EXCITE("--scheme")] = "orthogonal",
+    seed: Annotated[int, EXCITE("--seed")] = 1,
 ) -> None:
     """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
-    from rich.console import Console
-    from rich.table import Table
-
     from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
     from avis_ctrl.measurement.excitation.files import require_suffix, write_signals
     from avis_ctrl.rigs import load_rig
@@ -62,10 +56,10 @@ def excite(
 
     require_suffix(out)
     require_output(out)
-    console = Console(highlight=False)
+    terminal = Terminal()
     table = load_rig(rig)
     names, limit_V = table.equations_of_motion().actuators, float(table.drive_limits_V().min())
-    with Progress(console) as progress:
+    with Progress(terminal) as progress:
         progress(f"{kind} for {len(names)} drives, {band_Hz[0]:g} to {band_Hz[1]:g} Hz")
         if kind == "multisine":
             words: dict[str, Any] = {"lines": lines, "scheme": scheme}  # the settings refuse unknown ones
@@ -82,71 +76,42 @@ def excite(
             most = largest_level(open_loop(table, plan), signals, signals.u.shape[1] * (periods if periods < 4 else 4))
             signals = signals.scaled_to(LEVEL_SHARE * most)
         write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
-    shown = Table(
-        "record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation", title="largest value over the drives"
+    quantities = (signals.rms_V, signals.peak_V, signals.crest, signals.crest_before)
+    terminal.table(
+        ("record", "r.m.s. [V]", "peak [V]", "crest factor", "before optimisation"),
+        [(str(k), *(f"{values[k].max():.3g}" for values in quantities)) for k in range(len(signals.u))],
+        title="largest value over the drives",
     )
-    for k in range(len(signals.u)):
-        shown.add_row(
-            str(k),
-            *(
-                f"{values[k].max():.3g}"
-                for values in (signals.rms_V, signals.peak_V, signals.crest, signals.crest_before)
-            ),
-        )
-    console.print(shown)
-    console.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
+    terminal.print(f"{out}: {len(signals.u)} records to play; limit {limit_V:g} V")
+
+
+SIMULATE_CAMPAIGN = Options("""
+--out CAMPAIGN.h5: file to write
+--plan PLAN.toml: records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor
+--write-plan FILE: also write the plan used, as a starting point
+--truth FILE: also write the rig that was simulated, with its perturbed values
+--perturbed: default plan with stiffness, mass and inertia up to 5 % off, damping up to 20 %
+--orthogonal: default plan with orthogonal multisines
+--duration: length of each record of the default plan in seconds
+--effects FILE.py: Python file with effects of your own that the plan names (docs/own_effect.md)
+--seed: seed of excitation, floor, noise and perturbation; for another campaign of the same table, use the file written
+    by --truth as --rig
+""")
 
 
 def simulate_campaign(
     rig: RIG,
-    out: Annotated[Path, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")],
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            "--plan",
-            metavar="PLAN.toml",
-            help="records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor",
-        ),
-    ] = None,
-    write_plan: Annotated[
-        Path | None, typer.Option("--write-plan", metavar="FILE", help="also write the plan used, as a starting point")
-    ] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            "--truth", metavar="FILE", help="also write the rig that was simulated, with its perturbed values"
-        ),
-    ] = None,
-    perturbed: Annotated[
-        bool,
-        typer.Option(
-            "--perturbed", help="default plan with stiffness, mass and inertia up to 5 % off, damping up to 20 %"
-        ),
-    ] = False,
-    orthogonal: Annotated[bool, typer.Option("--orthogonal", help="default plan with orthogonal multisines")] = False,
-    duration_s: Annotated[
-        float, typer.Option("--duration", help="length of each record of the default plan in seconds")
-    ] = 60.0,
-    effects: Annotated[
-        Path | None,
-        typer.Option(
-            "--effects",
-            metavar="FILE.py",
-            help="Python file with effects of your own that the plan names (docs/own_effect.md)",
-        ),
-    ] = None,
-    seed: Annotated[
-        int,
-        typer.Option(
-            "--seed",
-            help="seed of excitation, floor, noise and perturbation; for another "
-            "campaign of the same table, use the file written by --truth as --rig",
-        ),
-    ] = 1,
+    out: Annotated[Path, SIMULATE_CAMPAIGN("--out")],
+    plan: Annotated[Path | None, SIMULATE_CAMPAIGN("--plan")] = None,
+    write_plan: Annotated[Path | None, SIMULATE_CAMPAIGN("--write-plan")] = None,
+    truth: Annotated[Path | None, SIMULATE_CAMPAIGN("--truth")] = None,
+    perturbed: Annotated[bool, SIMULATE_CAMPAIGN("--perturbed")] = False,
+    orthogonal: Annotated[bool, SIMULATE_CAMPAIGN("--orthogonal")] = False,
+    duration_s: Annotated[float, SIMULATE_CAMPAIGN("--duration")] = 60.0,
+    effects: Annotated[Path | None, SIMULATE_CAMPAIGN("--effects")] = None,
+    seed: Annotated[int, SIMULATE_CAMPAIGN("--seed")] = 1,
 ) -> None:
     """Simulate a measurement campaign with the nonlinear model, to plan and rehearse an identification."""
-    from rich.console import Console
-
     from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
@@ -167,14 +132,14 @@ def simulate_campaign(
         from avis_ctrl.gap.effects.user_effects import load_effects
 
         load_effects(effects)
-    console = Console(highlight=False)
+    terminal = Terminal()
     table = load_rig(rig)
     chosen = (
         read_plan(plan)
         if plan
         else default_plan(table, "orthogonal" if orthogonal else "zippered", perturbed=perturbed, duration_s=duration_s)
     )
-    with Progress(console) as progress:
+    with Progress(terminal) as progress:
         try:
             rehearsal = rehearse_with_effects(
                 table, chosen, seed, lambda k, total, name: progress(f"record {name}, {k} of {total}")
@@ -187,32 +152,31 @@ def simulate_campaign(
     for path, text in ((write_plan, plan_toml(chosen)), (truth, rehearsal.truth_toml())):
         if path:
             write_whole(path, text.encode())
-    for note in rehearsal.campaign.notes:
-        console.print(note)
-    console.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
+    terminal.print(*rehearsal.campaign.notes)
+    terminal.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
+
+
+CONVERT = Options("""
+MEASUREMENT: HDF5, .mat, UFF 58, CSV or a folder of CSV
+CAMPAIGN.h5: file to write; the same as --out
+--out CAMPAIGN.h5: file to write
+--columns ROLE=NAME,..: which variable is what, such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1
+--rig: name of the rig, if the file has none
+""")
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="MEASUREMENT", help="HDF5, .mat, UFF 58, CSV or a folder of CSV")],
-    file: Annotated[Path | None, typer.Argument(metavar="CAMPAIGN.h5", help="file to write; the same as --out")] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="CAMPAIGN.h5", help="file to write")] = None,
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            "--columns",
-            metavar="ROLE=NAME,..",
-            help="which variable is what, such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1",
-        ),
-    ] = None,
-    rig: Annotated[str | None, typer.Option("--rig", help="name of the rig, if the file has none")] = None,
+    source: Annotated[Path, CONVERT("MEASUREMENT")],
+    file: Annotated[Path | None, CONVERT("CAMPAIGN.h5")] = None,
+    out: Annotated[Path | None, CONVERT("--out")] = None,
+    columns: Annotated[str | None, CONVERT("--columns")] = None,
+    rig: Annotated[str | None, CONVERT("--rig")] = None,
     period_s: PERIOD = None,
     excitation: EXCITATION = None,
     sample_rate_Hz: SAMPLE_RATE = None,
     unit_y: UNIT_Y = None,
 ) -> None:
     """Convert a measurement file to a campaign in HDF5, and print the assumptions made."""
-    from rich.console import Console
-
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.measurement.formats.hdf5 import write_campaign, write_frequency_response
@@ -224,7 +188,7 @@ def convert(
     if file is not None and out is not None:
         raise InputError(f"expected one file to write; {file} is named, too", field="--out", value=str(out))
     require_output(target, source)
-    console = Console(highlight=False)
+    terminal = Terminal()
     measured = read_measurements(
         source,
         parse_columns(columns) if columns else None,
@@ -233,15 +197,14 @@ def convert(
     )
     if isinstance(measured, Campaign):
         write_campaign(target, measured)
-        for note in in_short(measured.notes):
-            console.print(note)
-        console.print(
+        terminal.print(*in_short(measured.notes))
+        terminal.print(
             f"{target}: {len(measured.records)} records of {len(measured.u_names)} inputs and "
             f"{len(measured.y_names)} outputs at {measured.sample_rate_Hz:g} Hz"
         )
     else:
         write_frequency_response(target, measured)
-        console.print(
+        terminal.print(
             f"{target}: frequency responses at {len(measured.frequency_Hz)} frequencies, {len(measured.inputs)} "
             f"inputs, {len(measured.outputs)} outputs"
         )

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +27,7 @@ def _absent(out: Path) -> Path:
     return out
 
 
-def _asked(flag: str, question: str, check: Callable[[typer.Context, str, Any], None]) -> Any:
+def _asked(check: Callable[[typer.Context, str, Any], None], flag: str, question: str) -> Any:
     """An option that is prompted for if it is not given; an invalid answer is prompted for again."""
 
     def checked(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
@@ -70,26 +71,27 @@ def _rig_fields(given: dict[str, Any]) -> dict[str, Any]:
     return fields
 
 
+_of_rig = partial(_asked, _check_rig)
+
+
 @app.command()
 def rig(
     ctx: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="RIG.toml", help="file to write", callback=_absent)],
-    name: Annotated[str, _asked("--name", "Name of the table", _check_rig)] = "my_table",
-    mass_kg: Annotated[float, _asked("--mass", "Mass of the payload [kg]", _check_rig)] = 500.0,
-    size_m: Annotated[str, _asked("--size", "Length, width, height of the payload [m]", _check_rig)] = "1.2, 0.9, 0.4",
-    mounts: Annotated[int, _asked("--mounts", "Number of mounts, 3 or 4", _check_rig)] = 4,
-    vertical_Hz: Annotated[float, _asked("--vertical", "Vertical natural frequency [Hz]", _check_rig)] = 3.0,
+    name: Annotated[str, _of_rig("--name", "Name of the table")] = "my_table",
+    mass_kg: Annotated[float, _of_rig("--mass", "Mass of the payload [kg]")] = 500.0,
+    size_m: Annotated[str, _of_rig("--size", "Length, width, height of the payload [m]")] = "1.2, 0.9, 0.4",
+    mounts: Annotated[int, _of_rig("--mounts", "Number of mounts, 3 or 4")] = 4,
+    vertical_Hz: Annotated[float, _of_rig("--vertical", "Vertical natural frequency [Hz]")] = 3.0,
     horizontal_Hz: Annotated[
-        float, _asked("--horizontal", "Horizontal natural frequency, without rocking [Hz]", _check_rig)
+        float, _of_rig("--horizontal", "Horizontal natural frequency, without rocking [Hz]")
     ] = 2.0,
-    damping: Annotated[float, _asked("--damping", "Damping ratio, 0.03 for 3 %", _check_rig)] = 0.03,
-    constant_N_per_V: Annotated[float, _asked("--force-constant", "Force of a drive [N/V]", _check_rig)] = 2.0,
-    limit_V: Annotated[float, _asked("--limit", "Largest drive voltage [V]", _check_rig)] = 10.0,
-    sensors: Annotated[str, _asked("--sensors", "Sensors: geophone or accelerometer", _check_rig)] = "geophone",
-    geophone: Annotated[str, _asked("--geophone", "RESP file of the geophones (empty: a common one)", _check_rig)] = "",
-    sample_rate_Hz: Annotated[
-        float, _asked("--sample-rate", "Sample rate of the controller [Hz]", _check_rig)
-    ] = 1000.0,
+    damping: Annotated[float, _of_rig("--damping", "Damping ratio, 0.03 for 3 %")] = 0.03,
+    constant_N_per_V: Annotated[float, _of_rig("--force-constant", "Force of a drive [N/V]")] = 2.0,
+    limit_V: Annotated[float, _of_rig("--limit", "Largest drive voltage [V]")] = 10.0,
+    sensors: Annotated[str, _of_rig("--sensors", "Sensors: geophone or accelerometer")] = "geophone",
+    geophone: Annotated[str, _of_rig("--geophone", "RESP file of the geophones (empty: a common one)")] = "",
+    sample_rate_Hz: Annotated[float, _of_rig("--sample-rate", "Sample rate of the controller [Hz]")] = 1000.0,
 ) -> None:
     """Write a rig file for a table of given mass, size and natural frequencies."""
     from avis_ctrl.files import write_whole
@@ -161,28 +163,24 @@ def _design_fields(given: dict[str, Any]) -> dict[str, Any]:
     return fields
 
 
+_of_design = partial(_asked, _check_design)
+
+
 @app.command()
 def design(
     ctx: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="DESIGN.toml", help="file to write", callback=_absent)],
-    rig: Annotated[str, _asked("--rig", "Rig file, or avis, halcyonics, halcyonics_loaded", _check_design)] = "avis",
-    title: Annotated[str, _asked("--title", "Title of the report", _check_design)] = "My design",
+    rig: Annotated[str, _of_design("--rig", "Rig file, or avis, halcyonics, halcyonics_loaded")] = "avis",
+    title: Annotated[str, _of_design("--title", "Title of the report")] = "My design",
     keep: Annotated[
-        str,
-        _asked(
-            "--keep", "Coordinates under one controller, such as z, phi_x (empty: chosen for the rig)", _check_design
-        ),
+        str, _of_design("--keep", "Coordinates under one controller, such as z, phi_x (empty: chosen for the rig)")
     ] = "",
-    band_Hz: Annotated[str, _asked("--band", "Band in which the table must isolate [Hz]", _check_design)] = "1, 10",
-    peak_dB: Annotated[
-        float, _asked("--peak-limit", "Transmissibility at any frequency, at most [dB]", _check_design)
-    ] = 3.5,
-    band_dB: Annotated[
-        float, _asked("--band-limit", "Transmissibility in the band, at most [dB]", _check_design)
-    ] = -7.0,
-    mass_percent: Annotated[float, _asked("--mass", "Mass known to within [%]", _check_design)] = 10.0,
-    stiffness_percent: Annotated[float, _asked("--stiffness", "Stiffness known to within [%]", _check_design)] = 15.0,
-    damping_percent: Annotated[float, _asked("--damping", "Damping known to within [%]", _check_design)] = 30.0,
+    band_Hz: Annotated[str, _of_design("--band", "Band in which the table must isolate [Hz]")] = "1, 10",
+    peak_dB: Annotated[float, _of_design("--peak-limit", "Transmissibility at any frequency, at most [dB]")] = 3.5,
+    band_dB: Annotated[float, _of_design("--band-limit", "Transmissibility in the band, at most [dB]")] = -7.0,
+    mass_percent: Annotated[float, _of_design("--mass", "Mass known to within [%]")] = 10.0,
+    stiffness_percent: Annotated[float, _of_design("--stiffness", "Stiffness known to within [%]")] = 15.0,
+    damping_percent: Annotated[float, _of_design("--damping", "Damping known to within [%]")] = 30.0,
 ) -> None:
     """Write a design file for a rig from bounds on its transmissibility and parameter uncertainty."""
     from avis_ctrl.files import write_whole

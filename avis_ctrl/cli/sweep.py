@@ -6,26 +6,24 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from avis_ctrl.cli.console import Terminal
+from avis_ctrl.cli.options import Options
+
+SWEEP = Options("""
+POINTS.toml: a base and the keys that vary (docs/sweep.md)
+--out DIR: folder for table, picture and points
+--scheduler ADDRESS: a dask scheduler of a cluster, such as tcp://HOST:8786
+--workers N: start a dask scheduler with N workers on this machine
+--jobs N: processes without dask; by default one for each processor
+""")
 
 
 def sweep(
-    points: Annotated[
-        Path, typer.Argument(metavar="POINTS.toml", help="a base and the keys that vary (docs/sweep.md)")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="folder for table, picture and points")],
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="a dask scheduler of a cluster, such as tcp://HOST:8786"),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option("--workers", min=1, metavar="N", help="start a dask scheduler with N workers on this machine"),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", min=1, metavar="N", help="processes without dask; by default one for each processor"),
-    ] = None,
+    points: Annotated[Path, SWEEP("POINTS.toml")],
+    out: Annotated[Path, SWEEP("--out")],
+    scheduler: Annotated[str | None, SWEEP("--scheduler")] = None,
+    workers: Annotated[int | None, SWEEP("--workers", min=1)] = None,
+    jobs: Annotated[int | None, SWEEP("--jobs", min=1)] = None,
 ) -> None:
     """Compute many designs (points), and write a table and their Pareto front.
 
@@ -33,7 +31,6 @@ def sweep(
     If the command is interrupted, the same command continues with the missing points. The row of a failed point has the
     reason.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from avis_ctrl.errors import ComputationError, InputError, UserInterruptError
@@ -51,7 +48,8 @@ def sweep(
         backend = partial(on_cluster, address=scheduler, workers=workers or 0)
     else:
         backend = partial(on_this_machine, jobs=jobs or available())
-    console = Console(highlight=False)
+    terminal = Terminal()
+    console = terminal.console
     plan = plan_sweep(points, out)
     with output_folder(out, FILES, (POINTS,)) as folder:
         open_folder(folder / POINTS)
@@ -84,7 +82,7 @@ def sweep(
         f"{len(rows)} points: {', '.join(f'{n} {status}' for status, n in count.items() if n)}; "
         f"{found.computed} computed now; {len(front)} on the Pareto front"
     )
-    console.print(f"{len(files)} files in {folder}; open {folder / 'sweep.html'} or {folder / 'sweep.csv'}")
+    terminal.files(files, folder, "sweep.html", "sweep.csv")
     if count["lost"]:
         why = next(row.message for row in rows if row.status == "lost")
         raise ComputationError(

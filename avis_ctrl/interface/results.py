@@ -19,14 +19,12 @@ from avis_ctrl.report.identification import content as identification
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.design_result import DesignResult, Requirement
+from avis_ctrl.study.file_names import DESIGN_FOLDER, GAP_FILES, IDENTIFICATION_FILES, RIG_FILE
 from avis_ctrl.study.files import open_folder
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_files import write_gap
-from avis_ctrl.study.gap_names import DESIGN_FOLDER, GAP_FILES
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identification_design import default_design, default_keep, design_start
-from avis_ctrl.study.identification_files import FILES as IDENTIFICATION_FILES
-from avis_ctrl.study.identification_files import RIG_FILE
 from avis_ctrl.study.identification_output import identified_toml, require_readable, write_identification
 from avis_ctrl.study.output import FILES, FOLDERS, write_study
 from avis_ctrl.study.verdict import all_axes, first_sentence, requirement_rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -84,6 +84,16 @@ class Curve:
     along: Literal["x", "y"] = "y"
     bars: float = 0.0
     hollow: bool = False
+
+
+def markers(x: np.ndarray, y: np.ndarray, label: str, style: Style, **more: Any) -> Curve:
+    """A curve of markers without a line; more : further fields."""
+    return Curve(x, y, label, style, points=True, line=False, **more)
+
+
+def bars(x: np.ndarray, y: np.ndarray, label: str, style: Style, width: float) -> Curve:
+    """Bars drawn from the axis; a value that is not finite has none."""
+    return Curve(x, np.where(np.isfinite(y), y, np.nan), label, style, line=False, bars=width)
 
 
 @dataclass(frozen=True, eq=False)

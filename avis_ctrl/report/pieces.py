@@ -5,9 +5,9 @@ All texts are plain; the renderer escapes them. Only `Formula.typst` is markup, 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from avis_ctrl.report.figures import Figure
 
@@ -21,6 +21,7 @@ class Mark:
 
 
 Cell = str | Mark
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,21 @@ def yes_or_no(good: bool) -> Mark:
     return Mark("yes" if good else "no", good)
 
 
+def prose(text: str) -> tuple[Paragraph | Formula, ...]:
+    """Paragraphs and formulas, separated by blank lines; a formula stands in dollar signs, its spoken form follows."""
+    blocks = [" ".join(block.split()) for block in text.strip().split("\n\n")]
+    found: list[Paragraph | Formula] = []
+    for block in blocks:
+        formula, dollar, words = block.removeprefix("$ ").partition(" $ ")
+        found.append(Formula(formula, words) if dollar else Paragraph(block))
+    return tuple(found)
+
+
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]], align: str = "") -> Table:
     """A `Table` from any sequences."""
     return Table(caption, tuple(header), tuple(tuple(row) for row in rows), align)
+
+
+def listed(caption: str, items: Iterable[T], columns: Mapping[str, Callable[[T], Cell]], align: str = "") -> Table:
+    """A `Table` with a row for each item. columns : the cell of an item by the header of its column."""
+    return table(caption, tuple(columns), [[cell(one) for cell in columns.values()] for one in items], align)

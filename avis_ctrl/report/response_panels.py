@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.identification.overlays import MeasuredOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz, log_limits
+from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz, log_limits, markers
 
 FLOOR = ("vx", "vy", "vz")
 MEASURED, SCATTER, TWO_SIGMA = Style("#222222"), Style("#7a7a7a"), Style("#222222", "dot", 1.4)
@@ -53,7 +53,7 @@ def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) ->
     low = 0.5 * float(min(np.quantile(size, 0.02), *(line.min() for _, line, _ in lines)))
     high = 2.0 * float(max(size.max(), *(line.max() for _, line, _ in lines)))
     curves = (
-        Curve(f[keep], size[keep], "measured", MEASURED, points=True, line=False),
+        markers(f[keep], size[keep], "measured", MEASURED),
         *(Curve(f, line, label, style) for label, line, style in lines),
     )
     band = Band(f, np.maximum(size - two, low), np.maximum(size + two, low), "measured, ± 2 σ", SCATTER)

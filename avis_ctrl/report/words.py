@@ -78,11 +78,6 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     return f"{bound(value, digits)} {unit}".strip()
 
 
-def micro(value: float, unit: str) -> str:
-    """A small number in millionths of its unit."""
-    return f"{number(1e6 * value)} µ{unit}"
-
-
 def hertz(omega: float) -> str:
     """A frequency [rad/s] in Hz."""
     return f"{number(omega / (2 * np.pi))} Hz" if np.isfinite(omega) else "none"

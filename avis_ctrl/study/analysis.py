@@ -21,6 +21,7 @@ from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
+from avis_ctrl.study.files import values_of
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -94,19 +95,9 @@ def analyse(
         performance.select(slice(n_z), slice(n_w)), blocks, slack=SETTINGS.passive_stability_slack if loose else SLACK
     )
     slack = SETTINGS.passive_slack if loose else SLACK
-    worst_peak = bound(plant, blocks, worst_case_gain(motion, blocks, slack=slack, robust=robust))
-    worst_band = bound(
-        plant,
-        blocks,
-        worst_case_gain(
-            motion,
-            blocks,
-            band=(2 * np.pi * low, 2 * np.pi * high),
-            slack=slack,
-            robust=robust,
-            points=SETTINGS.few_points,
-        ),
-    )
+    band, few = (2 * np.pi * low, 2 * np.pi * high), SETTINGS.few_points
+    worst_peak = worst_case_gain(motion, blocks, slack=slack, robust=robust)
+    worst_band = worst_case_gain(motion, blocks, band=band, slack=slack, robust=robust, points=few)
     omega = 2 * np.pi * PLOT_HZ
     return ControllerResult(
         name,
@@ -117,8 +108,8 @@ def analyse(
         hinf_norm(nominal).gain,
         bound(plant, blocks, mu_peak(performance, all_blocks, slack=SLACK)),
         bound(plant, blocks, robust),
-        worst_peak,
-        worst_band,
+        bound(plant, blocks, worst_peak),
+        bound(plant, blocks, worst_band),
         transmissibility(motion, blocks, samples, omega),
         _compliance(plant, full, omega),
         site_response(plant, full, K is not None, design.floor.band_Hz),
@@ -161,17 +152,8 @@ def _by_slicot(system: StateSpace) -> float | None:
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
     """A mu or worst-case result, with its perturbation in words."""
     words = describe(plant, blocks, found.delta) if found.delta is not None else ()
-    return Bound(
-        found.upper,
-        found.lower,
-        found.omega,
-        found.guaranteed,
-        found.delta,
-        words,
-        found.frequencies,
-        found.upper_curve,
-        found.lower_curve,
-    )
+    curves = values_of(found, "frequencies", "upper_curve", "lower_curve")
+    return Bound(**values_of(found, "upper", "lower", "omega", "guaranteed", "delta"), words=words, **curves)
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,25 +54,12 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
     folders = Path(first), Path(second)
     studies = [read_json(folder / STUDY, "avis-study") for folder in folders]
     results = [read_json(folder / RESULT, "avis-design") for folder in folders]
-    asked = [dict(_leaves(study.get("design"), "")) for study in studies]
-    keys = list(dict.fromkeys([*asked[0], *asked[1]]))
-    requested = [
-        (key, _as_text(asked[0].get(key)), _as_text(asked[1].get(key)))
-        for key in keys
-        if key != "title" and asked[0].get(key) != asked[1].get(key)
-    ]
     rigs = [dict(_rig_values(study.get("rig"))) for study in studies]
-    different = [
-        (f"rig file: {key}", _as_text(rigs[0].get(key)), _as_text(rigs[1].get(key)))
-        for key in dict.fromkeys([*rigs[0], *rigs[1]])
-        if rigs[0].get(key) != rigs[1].get(key)
-    ]
-    requested = [*different, *requested]
-    rows = [_figures(result, folder) for result, folder in zip(results, folders, strict=True)]
-    found = [
-        (name, _as_text(rows[0].get(name)), _as_text(rows[1].get(name))) for name in dict.fromkeys([*rows[0], *rows[1]])
-    ]
-    other = sorted({key.partition(".")[0].partition(":")[0] for key, _, _ in requested} & {*WEIGHTS, "rig file"})
+    asked = [dict(_leaves(study.get("design"), "")) for study in studies]
+    requested = [(f"rig file: {key}", one, other) for key, one, other in _side_by_side(rigs, differing=True)]
+    requested += [row for row in _side_by_side(asked, differing=True) if row[0] != "title"]
+    found = list(_side_by_side([_figures(result, folder) for result, folder in zip(results, folders, strict=True)]))
+    other = sorted({key.partition(".")[0].partition(":")[0] for key, *_ in requested} & {*WEIGHTS, "rig file"})
     note = (
         "mu of the two cannot be compared, because it depends on what was requested differently "
         f"({', '.join(other)}); transmissibilities can be compared"
@@ -85,6 +72,15 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
     if titles[0] == titles[1]:
         titles = str(folders[0]), str(folders[1])
     return DesignComparison((titles[0], titles[1]), tuple(requested), tuple(found), note)
+
+
+def _side_by_side(tables: Sequence[dict[str, Any]], differing: bool = False) -> Iterator[tuple[str, str, str]]:
+    """(key, first, second) as text for two tables: of all keys, or of those whose values differ."""
+    first, second = tables
+    for key in dict.fromkeys([*first, *second]):
+        one, other = first.get(key), second.get(key)
+        if not differing or one != other:
+            yield key, _as_text(one), _as_text(other)
 
 
 def _leaves(table: Any, before: str) -> Iterator[tuple[str, Any]]:

@@ -83,3 +83,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if np.isfinite(value) else None
     return int(value) if isinstance(value, np.integer) else value
+
+
+def values_of(one: object, *names: str) -> dict[str, Any]:
+    """Some attributes of an object by name."""
+    return {name: getattr(one, name) for name in names}

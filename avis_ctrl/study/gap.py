@@ -215,12 +215,9 @@ def gap_provenance(
     measured: Campaign, rig: Rig, options: GapOptions, seconds: float, design_sha256: str | None = None
 ) -> dict[str, Any]:
     """Provenance of a gap search; design_sha256 : of the design file, None if none was used."""
-    data, own = digest(measured), options.own_effects
-    further = (
-        {}
-        if own is None
-        else {"own_effects": f"{own.path.name}: {', '.join(own.names)}", "own_effects_sha256": own.sha256}
-    )
+    data, own, further = digest(measured), options.own_effects, dict[str, str]()
+    if own is not None:
+        further |= {"own_effects": f"{own.path.name}: {', '.join(own.names)}", "own_effects_sha256": own.sha256}
     if design_sha256 is not None:
         further["design_sha256"] = design_sha256
     return provenance(

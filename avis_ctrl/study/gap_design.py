@@ -30,10 +30,10 @@ from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.analysis import SLACK
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
+from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.gap_plant import DESCRIBED_IN, delay_order, design_files, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.gap_uncertainty import FitUncertainty, fit_uncertainty
 from avis_ctrl.study.identification_design import default_design, default_keep, design_toml
-from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
@@ -146,11 +146,8 @@ def design_effect(
 
 def without_ranges(design: Design) -> Design:
     """A copy of the design without parameter ranges."""
-    return design.model_copy(
-        update={
-            "uncertainty": design.uncertainty.model_copy(update={"parameters_percent": {}, "parameters_absolute": {}})
-        }
-    )
+    bare = design.uncertainty.model_copy(update={"parameters_percent": {}, "parameters_absolute": {}})
+    return design.model_copy(update={"uncertainty": bare})
 
 
 def compare_designs(
@@ -320,15 +317,12 @@ def _outcome(
             f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
             "changes the model, so nothing else was computed."
         ]
-    said = "Yesterday's controller"
-    start = f"mu {before.mu_upper:.3g} on the baseline"
-    if not after.stable:
-        first = f"{said} has {start} and makes the updated model unstable."
+    first = f"Yesterday's controller has mu {before.mu_upper:.3g} on the baseline and "
+    if after.stable:
+        verdict = f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}"
+        first += f"{after.mu_upper:.3g} on the updated model: {verdict}."
     else:
-        first = (
-            f"{said} has {start} and {after.mu_upper:.3g} on the updated model: "
-            f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}."
-        )
+        first += "makes the updated model unstable."
     if after.stable and before.stable_in_six and not after.stable_in_six:
         first += " On all six coordinates it makes the updated model unstable, which the locked ones hide."
     if new is None:
@@ -336,20 +330,13 @@ def _outcome(
     if not new.stable:
         return [first, "The controller designed on the updated model does not stabilise it."]
     reach = "meets the specification" if new.mu_upper < 1 else "misses the specification too"
-    hidden = "" if new.stable_in_six else " On all six coordinates it is unstable."
     bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
     if not np.isfinite(new.worst_peak_dB):
         bounds = "stability is not proved for every table within the design's uncertainty"
-    stop = (
-        f" Synthesis stops near its target of {target:g}: it does not look for the lowest mu."
-        if target and after.mu_upper < new.mu_upper < 1
-        else ""
-    )
-    return [
-        first,
-        f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} "
-        f"({bounds}).{stop}{hidden}",
-    ]
+    second = f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} ({bounds})."
+    if target and after.mu_upper < new.mu_upper < 1:
+        second += f" Synthesis stops near its target of {target:g}: it does not look for the lowest mu."
+    return [first, second if new.stable_in_six else f"{second} On all six coordinates it is unstable."]
 
 
 def _worst_case(before: LoopFigures, after: LoopFigures) -> str:

@@ -27,18 +27,19 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.study.files import as_json
-from avis_ctrl.study.gap_names import (
+from avis_ctrl.study.file_names import (
     BASELINE_FILE,
     BASELINE_RIG,
+    DESIGN_FILE,
     DESIGN_FOLDER,
     GAP_FILE,
     GAP_FILES,
     GAP_REPORTS,
+    RIG_FILE,
     UPDATED_FILE,
     UPDATED_RIG,
 )
-from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
+from avis_ctrl.study.files import as_json
 from avis_ctrl.study.identification_output import identified_rig
 
 # Named effects that act on the signals only and cannot be predicted from u and floor.
@@ -101,18 +102,12 @@ def _toml(model: TableModel, what: str, covariance: np.ndarray | None) -> str:
             elif name in known:
                 sigma = float(np.sqrt(max(covariance[k, k], 0.0)))
                 comments[name] = f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
-    header = [
-        f"{rig.name}, {what} by avis gap",
-        *(
-            [
-                "standard deviations (1 sigma) beside the values: of the fit, "
-                "with all values that are not fitted taken as "
-                "exact"
-            ]
-            if comments
-            else []
-        ),
-    ]
+    header = [f"{rig.name}, {what} by avis gap"]
+    if comments:
+        header.append(
+            "standard deviations (1 sigma) beside the values: of the fit, with all values that are not fitted taken as "
+            "exact"
+        )
     header += [
         f"not in this file, because a rig file cannot describe it: {one.effect.title} ({one.effect.name}, "
         f"{one.place}: " + ", ".join(_as_reported(model, one)) + ")"
@@ -214,14 +209,8 @@ def write_gap_predictions(
     for model, _ in models.values():
         _require_fit(model, campaign)
     with replacing(out) as file:
-        file.attrs.update(
-            {
-                "format": "avis-prediction",
-                "version": 1,
-                "rig": models["y_baseline"][0].rig.name,
-                "not_predicted": "; ".join(_not_predicted(effects, campaign)),
-            }
-        )
+        file.attrs.update({"format": "avis-prediction", "version": 1, "rig": models["y_baseline"][0].rig.name})
+        file.attrs["not_predicted"] = "; ".join(_not_predicted(effects, campaign))
         # Model by model: records of equal length use the same response of the model.
         for name, (model, clock) in models.items():
             low, high = converter_limits(model, campaign, effects if name == "y_updated" else [])

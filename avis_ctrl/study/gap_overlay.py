@@ -19,7 +19,7 @@ from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import SAME_LEVEL, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import HALF_WIDTHS
 from avis_ctrl.identification.overlays import POINTS, MeasuredOverlay, thinned
-from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
@@ -66,24 +66,17 @@ def gap_overlay(campaign: Campaign, baseline: TableModel, updated: TableModel) -
 
 def selections(campaign: Campaign) -> list[Campaign]:
     """The driven records of the most common level and excitation (highest level in a tie), then all driven records."""
-    driven = sorted((r for r in campaign.records if driven_inputs(r)), key=lambda r: -r.header.level_V)
+    driven = sorted((r.header for r in campaign.records if driven_inputs(r)), key=lambda h: -h.level_V)
     if not driven:
         return []
-    groups = [
-        [
-            r
-            for r in driven
-            if top.header.level_V / SAME_LEVEL <= r.header.level_V <= top.header.level_V
-            and r.header.excitation == top.header.excitation
-        ]
-        for top in driven
-    ]
-    most = max(groups, key=len)
-    names = [
-        tuple(sorted(r.header.name for r in group))
-        for group in ([most, driven] if len(most) < len(driven) else [driven])
-    ]
-    return [campaign.only(one) for one in names]
+
+    def alike(top: RecordHeader) -> list[RecordHeader]:
+        low, high = top.level_V / SAME_LEVEL, top.level_V
+        return [h for h in driven if low <= h.level_V <= high and h.excitation == top.excitation]
+
+    most = max(map(alike, driven), key=len)
+    groups = [most, driven] if len(most) < len(driven) else [driven]
+    return [campaign.only(tuple(sorted(h.name for h in group))) for group in groups]
 
 
 def _overlay(records: Campaign, baseline: TableModel, updated: TableModel, clock: tuple[float, float]) -> GapOverlay:

@@ -23,11 +23,10 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
-from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
+from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
 from avis_ctrl.study.identified_uncertainty import InDesign, in_design
 from avis_ctrl.study.toml_text import toml_text, toml_value
-from avis_ctrl.study.uncertainty_file import UncertaintyFile
-from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json
+from avis_ctrl.study.uncertainty_file import UncertaintyFile, uncertainty_content, uncertainty_json
 
 if TYPE_CHECKING:
     from avis_ctrl.study.identification import Identification

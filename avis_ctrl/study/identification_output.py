@@ -22,9 +22,9 @@ from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.study.files import as_json
+from avis_ctrl.study.file_names import IDENTIFICATION_FILES, REPORT_FILES, RESULT_FILE, RIG_FILE
+from avis_ctrl.study.files import as_json, values_of
 from avis_ctrl.study.identification import Identification
-from avis_ctrl.study.identification_files import FILES, RESULT_FILE, RIG_FILE
 
 PIECE = 1 << 17
 
@@ -69,11 +69,9 @@ def identified_toml(found: Identification) -> str:
     comments = {}
     for name, sigma in zip(information.names, information.standard_deviation, strict=True):
         if name in known:
-            comments[name] = (
-                f"{name.rpartition('.')[2]} +- {sigma:.2g} {known[name].unit}"
-                if np.isfinite(sigma)
-                else f"{name.rpartition('.')[2]} known only in combination (start {start[name].value:.4g})"
-            )
+            spread = f"+- {sigma:.2g} {known[name].unit}"
+            together = f"known only in combination (start {start[name].value:.4g})"
+            comments[name] = f"{name.rpartition('.')[2]} {spread if np.isfinite(sigma) else together}"
     p = found.provenance
     header = [
         f"{found.rig.name}, identified by avis_ctrl {p['avis_ctrl']} on {p['date']}",
@@ -89,6 +87,7 @@ def identified_toml(found: Identification) -> str:
 def result_dict(found: Identification) -> dict[str, Any]:
     """Content of result.json: the numerical results."""
     fit, information = found.campaign_fit.fit, found.information
+    noise_chi2 = found.campaign_fit.first.chi2_per_dof if found.campaign_fit.measured else None
     start = found.start.parameters()
     rows = {}
     for name, value, sigma, unit in zip(
@@ -111,9 +110,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "condition": information.condition,
         "identifiability": list(found.identifiability.sentences),
         "fit": {
-            "chi2_per_dof_of_measured_noise": found.campaign_fit.first.chi2_per_dof
-            if found.campaign_fit.measured
-            else None,
+            "chi2_per_dof_of_measured_noise": noise_chi2,
             "dof": fit.dof,
             "held_at_bounds": list(fit.held),
             "band_Hz": list(found.campaign_fit.band_Hz),
@@ -124,14 +121,7 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "advice": list(found.advice),
         "validation": found.validation.as_dict(),
         "gates": [
-            {
-                "gate": f.gate,
-                "severity": f.severity,
-                "sentence": f.sentence,
-                "channels": list(f.channels),
-                "records": list(f.records),
-            }
-            for f in found.findings
+            values_of(finding, "gate", "severity", "sentence", "channels", "records") for finding in found.findings
         ],
         "unit_of_y": found.model.sensors.unit,
         "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
@@ -154,14 +144,13 @@ def write_identification(
     texts = {
         RIG_FILE: identified_toml(found).encode(),
         **{name: text.encode() for name, text in (more or {}).items()},
-        "report.html": html,
-        "report.pdf": pdf,
+        **dict(zip(REPORT_FILES, (html, pdf), strict=True)),
         RESULT_FILE: as_json(result_dict(found)),
     }
     return write_together(
         folder,
         {name: content for name, content in texts.items() if content is not None},
-        [folder / name for name in FILES],
+        [folder / name for name in IDENTIFICATION_FILES],
     )
 
 

@@ -14,7 +14,7 @@ from avis_ctrl.files import write_together
 from avis_ctrl.lti.norms import decibels
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
-from avis_ctrl.study.files import as_json
+from avis_ctrl.study.files import as_json, values_of
 from avis_ctrl.study.saved import STUDY, study_dict
 from avis_ctrl.study.verdict import first_sentence
 
@@ -36,13 +36,7 @@ def controller_form(name: str, K: StateSpace) -> dict[str, Any]:
         "format": "avis-controller",
         "version": 1,
         "name": name,
-        "A": K.A,
-        "B": K.B,
-        "C": K.C,
-        "D": K.D,
-        "dt": K.dt,
-        "inputs": K.inputs,
-        "outputs": K.outputs,
+        **values_of(K, "A", "B", "C", "D", "dt", "inputs", "outputs"),
         "input_units": ["m/s"] * K.ninputs,
         "output_units": ["N"] * K.noutputs,
     }
@@ -62,20 +56,10 @@ def result_dict(result: DesignResult) -> dict[str, Any]:
         ],
         "gamma_slicot": {c.name: c.gamma_slicot for c in result.controllers},
         "dk_history": [
-            {
-                "iteration": row.iteration,
-                "gamma": row.gamma,
-                "mu_upper": row.mu_upper,
-                "order": row.order,
-                "d_fit_error": row.d_fit_error,
-                "seconds": row.seconds,
-            }
+            values_of(row, "iteration", "gamma", "mu_upper", "order", "d_fit_error", "seconds")
             for row in result.dk_history
         ],
-        "requirements": [
-            {"name": r.name, "limit": r.limit, "value": r.value, "unit": r.unit, "met": r.met}
-            for r in result.requirements
-        ],
+        "requirements": [values_of(one, "name", "limit", "value", "unit", "met") for one in result.requirements],
         "by_axis": [
             {"axis": one.axis, "worst_case_band_dB": decibels(one.mu), "skyhook_dB": decibels(one.skyhook)}
             for one in result.by_axis or ()
@@ -132,24 +116,10 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """Row of a controller that could not be analysed; the note has the reason."""
-    figures = (
-        "gamma",
-        "mu_upper",
-        "mu_lower",
-        "mu_peak_Hz",
-        "peak_transmissibility_dB",
-        "worst_case_peak_transmissibility_dB",
-        "at_rest",
-    )
-    return {
-        "name": c.name,
-        "kind": c.kind,
-        "file": None,
-        "order": None,
-        "stable": False,
-        **dict.fromkeys(figures),
-        "note": c.reason,
-    }
+    figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz")
+    in_dB = ("peak_transmissibility_dB", "worst_case_peak_transmissibility_dB")
+    known = {**values_of(c, "name", "kind"), "file": None, "order": None, "stable": False}
+    return {**known, **dict.fromkeys((*figures, *in_dB, "at_rest")), "note": c.reason}
 
 
 def _all_axes(loop: Simulated | None) -> dict[str, Any]:
@@ -177,10 +147,7 @@ def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, 
         "name": "mu",
         "sample_rate_Hz": rig.sample_rate_Hz,
         "arithmetic": "float64",
-        "A": K.A,
-        "B": K.B,
-        "C": K.C,
-        "D": K.D,
+        **values_of(K, "A", "B", "C", "D"),
         "inputs": sensors,
         "outputs": drives,
         "input_units": ["V"] * len(sensors),

@@ -158,31 +158,26 @@ def build_plant(
     kept = [COORDINATES.index(name) for name in design.keep]
     rows, tilt = decoder.matrix[:, kept] / lever, rig.tilt_rows()[:, kept] / lever * gravity
 
-    diagram = Diagram()
-    weights: dict[str, Weight] = {}
-    _rig_part(diagram, uncertain, actuators)
-    _actuator_side(diagram, design, rig, axes, actuators, matrix[used], weights, identified)
     floor = floor_spectrum(design, rig)
     low, high = design.floor.band_Hz
     reference = floor.rms(low, high) / np.sqrt(high - low)
-    errors = design.uncertainty.sensor_chains
-    flicker = [FlickerNoise(one.flicker, design.floor.band_Hz[0]) for one in seen.noise]
-    noises = _sensor_side(diagram, axes, seen, decoding, (rows, tilt), flicker, reference, errors is not None)
-    weights |= {f"{NOISE}{one.tag}": one.weight for one in noises if one.weight.flicker}
-    if errors is not None:
-        _sensor_errors(diagram, errors, axes, decoder.sensors, rows, decoding, weights)
+    connection = _Connection(design, rig, axes, actuators, matrix[used])
+    connection.rig_part(uncertain)
+    connection.actuator_side(identified)
+    flicker = [FlickerNoise(one.flicker, low) for one in seen.noise]
+    noises = connection.sensor_side(seen, decoding, (rows, tilt), flicker, reference)
     offset = max(
         _offset(design.control_effort, one, weight, len(axes), reference)
         for one, weight in zip(seen.noise, flicker, strict=True)
     )
-    _performance(diagram, design, axes, matrix[used], rig.limits_of(actuators), offset, weights)
+    connection.performance(offset)
     inputs = {name: one.weight for one in noises for name in one.inputs}
     w = [*(f"floor_{a}_dot" for a in axes), *inputs, *(f"force_{a}" for a in axes)]
     weighted = [*(f"e_{a}" for a in axes), *(f"effort_{a}" for a in axes)]
     compliance = [f"compliance_{a}" for a in axes] if design.compliance else []
     physical = [*(f"{a}_dot" for a in axes), *(f"{a}_rel" for a in axes), *(f"{n}_command" for n in actuators)]
     u, y = [f"command_{a}" for a in axes], [f"seen_{a}_dot" for a in axes]
-    full = diagram.plant(w, [*weighted, *compliance, *physical], u, y)
+    full = connection.diagram.plant(w, [*weighted, *compliance, *physical], u, y)
     asked = w if design.compliance else w[: len(axes) + len(inputs)]
     return DesignPlant(
         full,
@@ -197,7 +192,7 @@ def build_plant(
         seen.noise[0].shape,
         reference,
         floor,
-        weights,
+        connection.weights,
         identified,
         inputs,
         tuple(axis for axis, name in zip(axes, design.keep, strict=True) if name in seen.relative),
@@ -242,96 +237,34 @@ def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
     return shipped_spectrum(design.floor.spectrum).scaled_to_rms(rms, design.floor.band_Hz[0], design.floor.band_Hz[1])
 
 
-def _rig_part(diagram: Diagram, uncertain: UncertainRig, actuators: tuple[str, ...]) -> None:
-    system, axes = uncertain.system, uncertain.coordinates
-    deltas = [name for name in system.inputs if name.startswith("w:")]
-    diagram.add(
-        "rig",
-        system.select(
-            [
-                *(name for name in system.outputs if name.startswith("z:")),
-                *(f"{a}_dot" for a in axes),
-                *(f"{a}_rel" for a in axes),
-            ],
-            [*deltas, *actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)],
-        ),
-        "rig",
-    )
-    place = 0
-    for block in uncertain.blocks.blocks:
-        names = deltas[place : place + block.rows]
-        place += block.rows
-        diagram.uncertain(block, names, [f"z:{name[2:]}" for name in names])
-    for axis in axes:
-        diagram.means(f"floor_{axis}_dot", "velocity of the floor", "m/s")
-        diagram.means(f"{axis}_dot", "velocity of the payload", "m/s")
-        diagram.means(f"{axis}_rel", "displacement of the payload against the floor", "m")
-        diagram.means(f"force_{axis}", "force on the payload", "N")
-    for name in actuators:
-        diagram.means(name, "voltage that acts at the motor", "V")
-
-
-def _actuator_side(
-    diagram: Diagram,
-    design: Design,
-    rig: Rig,
-    axes: tuple[str, ...],
-    actuators: tuple[str, ...],
-    allocation: np.ndarray,
-    weights: dict[str, Weight],
-    identified: InDesign | None,
-) -> None:
-    """Delay including the converter's hold, amplifier, allocation, neglected dynamics."""
-    corner = 2 * np.pi * design.loop.amplifier_corner_Hz
-    # A zero-order hold delays by half a sample on average.
-    delay_s = rig.loop_delay_s + 0.5 / rig.sample_rate_Hz
-    for axis in axes:
-        lag = cascade([], [-corner], corner) @ pade_delay(delay_s, design.loop.pade_order)
-        diagram.add(f"delay and amplifier {axis}", lag.renamed([f"command_{axis}"], [f"drive_{axis}"]), "actuator")
-        diagram.means(f"command_{axis}", "force commanded by the controller", "N")
-        diagram.means(f"drive_{axis}", "commanded force after delay and amplifier", "N")
-    # Voltages at the amplifiers, to which the limits apply, after delay and lag (both of unit gain).
-    diagram.add(
-        "allocation", gain(allocation, [f"drive_{a}" for a in axes], [f"{n}_command" for n in actuators]), "allocation"
-    )
-    for name in actuators:
-        diagram.means(f"{name}_command", "voltage of the channel", "V")
-    if identified is not None:
-        _response_error(diagram, identified, axes, actuators, allocation, weights)
-    else:
-        _chains(
-            diagram, design.uncertainty.actuator_chains, actuators, "{}_command", "{}", "actuator chain {}", weights
-        )
-
-
-def _response_error(
-    diagram: Diagram,
-    identified: InDesign,
-    axes: tuple[str, ...],
-    actuators: tuple[str, ...],
-    allocation: np.ndarray,
-    weights: dict[str, Weight],
-) -> None:
-    """(I + W Delta) on the axes' forces, Delta full: difference of the measured from the identified response.
-
-    Errors per channel do not suffice: an error on one axis by the force of another need not be a channel error.
-    """
-    weights[RESPONSE] = identified.weight
-    tags = [f"{RESPONSE}[{k}]" if len(axes) > 1 else RESPONSE for k in range(len(axes))]
-    for axis, tag in zip(axes, tags, strict=True):
-        diagram.add(f"W {RESPONSE} {axis}", identified.weight.system(f"drive_{axis}", f"z:{tag}"), "weight")
-        diagram.means(f"w:{tag}", "force by which the response differs from the identified one", "N")
-    diagram.add(
-        "identified response error",
-        gain(allocation, [f"w:{tag}" for tag in tags], [f"{name}_error" for name in actuators]),
-        "allocation",
-    )
-    for name in actuators:
-        diagram.add(f"actuator chain {name}", summing_junction(name, [f"{name}_command", f"{name}_error"]), "actuator")
-        diagram.means(f"{name}_error", "voltage equivalent to the response error", "V")
-    diagram.uncertain(
-        ComplexFull(len(axes), len(axes), RESPONSE), [f"w:{tag}" for tag in tags], [f"z:{tag}" for tag in tags]
-    )
+# Meaning and unit of the signals of each axis, of each noise ("axis", or "axis_2" for a second kind of sensor), and of
+# each actuator channel.
+OF_AXES = {
+    "floor_{}_dot": ("velocity of the floor", "m/s"),
+    "{}_dot": ("velocity of the payload", "m/s"),
+    "{}_rel": ("displacement of the payload against the floor", "m"),
+    "force_{}": ("force on the payload", "N"),
+    "command_{}": ("force commanded by the controller", "N"),
+    "drive_{}": ("commanded force after delay and amplifier", "N"),
+    "clean_{}_dot": ("velocity as the sensors' band shows it", "m/s"),
+    "{}_in_space": ("velocity as the sensors' band shows it", "m/s"),
+    "{}_against_chassis": ("velocity as the sensors' band shows it", "m/s"),
+    "seen_{}_dot": ("measured velocity", "m/s"),
+    "chain_error_{}": ("what neglected sensor dynamics add to the velocity", "m/s"),
+    "e_{}": ("payload velocity over its bound", "1"),
+    "effort_{}": ("drive over its limit", "1"),
+    "compliance_{}": ("displacement over its bound", "1"),
+}
+OF_NOISES = {
+    "mixed_noise_{}": ("noise of the sensors used for this axis, before its filter", "1"),
+    "noise_{}": ("sensor noise that accompanies 1 m/s of floor velocity", "1"),
+    "sensor_noise_{}": ("sensor noise as velocity", "m/s"),
+}
+OF_CHANNELS = {
+    "{}": ("voltage that acts at the motor", "V"),
+    "{}_command": ("voltage of the channel", "V"),
+    "{}_error": ("voltage equivalent to the response error", "V"),
+}
 
 
 def neglected_dynamics(chains: ChainUncertainty) -> NeglectedDynamics:
@@ -339,32 +272,10 @@ def neglected_dynamics(chains: ChainUncertainty) -> NeglectedDynamics:
     return NeglectedDynamics(chains.low_percent / 100, chains.crossover_Hz, chains.high_percent / 100)
 
 
-def _chains(
-    diagram: Diagram,
-    uncertainty: ChainUncertainty | None,
-    names: tuple[str, ...],
-    before: str,
-    after: str,
-    title: str,
-    weights: dict[str, Weight],
-) -> None:
-    """(1 + W delta) in each channel: neglected dynamics as multiplicative input uncertainty."""
-    for name in names:
-        read, made, label = before.format(name), after.format(name), title.format(name)
-        if uncertainty is None:
-            diagram.add(label, gain([[1.0]], [read], [made]), "actuator")
-            continue
-        weight = neglected_dynamics(uncertainty)
-        weights.setdefault(title.format("*"), weight)
-        diagram.add(f"W {label}", weight.system(read, f"z:{label}"), "weight")
-        diagram.add(label, gain([[1.0, 1.0]], [read, f"w:{label}"], [made]), "actuator")
-        diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
-
-
 def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes: int, reference: float) -> float:
     """Factor of the control effort's weight at zero frequency with which mu below 1 bounds the voltage for the offset.
 
-    One unit of noise accompanies 1 m/s of floor velocity (`_sensor_side`) and may use as much of the drive as a floor
+    One unit of noise accompanies 1 m/s of floor velocity (`sensor_side`) and may use as much of the drive as a floor
     velocity of floor_velocity_m_per_s; the offset may use offset_percent of this. Offsets of n sensors, each of either
     sign, lie within sqrt(n) times the ellipsoid of independent offsets. The voltages of m axes add up to at most
     sqrt(m) times their norm.
@@ -374,89 +285,208 @@ def _offset(effort: EffortSection, group: NoiseGroup, noise: FlickerNoise, axes:
     return float(spread * group.offset_rtHz * reference / allowed / noise.magnitude(np.zeros(1))[0])
 
 
-def _sensor_side(
-    diagram: Diagram,
-    axes: tuple[str, ...],
-    seen: Sensing,
-    decoding: np.ndarray,
-    rows: tuple[np.ndarray, np.ndarray],
-    flicker: Sequence[FlickerNoise],
-    reference: float,
-    uncertain: bool,
-) -> list[_Noise]:
-    """Sensor chains of the logical axes and their noise. The chains are equal, so decoding and chain commute.
+class _Connection:
+    """The diagram of a plant and its weights, part by part.
 
-    rows : (n_s, n_axes) each, from the axes' motion to the motion along each sensor, and to its apparent acceleration
-        by gravity.
-
-    One unit of noise accompanies 1 m/s of floor velocity: sensor density over floor density.
+    allocation : (n_actuators, n_axes) volts per newton on each axis.
     """
-    groups = [
-        _Noise.of(axes, group, weight, decoding, reference, k)
-        for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))
-    ]
-    inertial = seen.decoder.inertial
-    # Decoded motion in space, and decoded motion relative to the chassis.
-    by_velocity, by_relative = (decoding[:, one] @ rows[0][one] for one in (inertial, ~inertial))
-    by_tilt = decoding @ rows[1]
-    for k, axis in enumerate(axes):
-        both = (
-            (by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
-            (by_relative[k], "rel", seen.relative_chain, f"position chain {axis}", f"{axis}_against_chassis"),
-        )
-        ways = [one for one in both if np.any(np.abs(one[0]) > 1e-9)]
-        clean = f"clean_{axis}_dot"
-        for row, of, chain, label, made in ways:
-            assert chain is not None
-            tilt = by_tilt[k] if of == "dot" else np.zeros(len(axes))
-            _chain_of(diagram, axes, k, (row, tilt), of, chain, label, clean if len(ways) == 1 else made)
-        if len(ways) > 1:
-            diagram.add(f"motion sum {axis}", summing_junction(clean, [made for *_, made in ways]), "sum")
-        own = [one for one in groups if axis in one.axes]
-        for one in own:
-            one.add(diagram, axis)
-        terms = [
-            clean,
-            *(f"sensor_noise_{axis}{one.tag}" for one in own),
-            *([f"chain_error_{axis}"] if uncertain else []),
+
+    def __init__(
+        self, design: Design, rig: Rig, axes: tuple[str, ...], actuators: tuple[str, ...], allocation: np.ndarray
+    ) -> None:
+        self.design, self.rig, self.axes, self.actuators, self.allocation = design, rig, axes, actuators, allocation
+        self.diagram, self.weights = Diagram(), dict[str, Weight]()
+        self._mean(OF_AXES, axes)
+        self._mean(OF_CHANNELS, actuators)
+
+    def _mean(self, meanings: Mapping[str, tuple[str, str]], names: Sequence[str]) -> None:
+        for pattern, (meaning, unit) in meanings.items():
+            for name in names:
+                self.diagram.means(pattern.format(name), meaning, unit)
+
+    def _each(self, pattern: str) -> list[str]:
+        """A signal of each axis."""
+        return [pattern.format(axis) for axis in self.axes]
+
+    def rig_part(self, uncertain: UncertainRig) -> None:
+        """The rig with its uncertain parameters."""
+        system = uncertain.system
+        w, z = ([n for n in names if n.startswith(p)] for names, p in ((system.inputs, "w:"), (system.outputs, "z:")))
+        outputs = [*z, *self._each("{}_dot"), *self._each("{}_rel")]
+        inputs = [*w, *self.actuators, *self._each("floor_{}_dot"), *self._each("force_{}")]
+        self.diagram.add("rig", system.select(outputs, inputs), "rig")
+        place = 0
+        for block in uncertain.blocks.blocks:
+            names = w[place : place + block.rows]
+            place += block.rows
+            self.diagram.uncertain(block, names, [f"z:{name[2:]}" for name in names])
+
+    def actuator_side(self, identified: InDesign | None) -> None:
+        """Delay including the converter's hold, amplifier, allocation, neglected dynamics."""
+        loop = self.design.loop
+        corner = 2 * np.pi * loop.amplifier_corner_Hz
+        # A zero-order hold delays by half a sample on average.
+        delay_s = self.rig.loop_delay_s + 0.5 / self.rig.sample_rate_Hz
+        for axis in self.axes:
+            lag = cascade([], [-corner], corner) @ pade_delay(delay_s, loop.pade_order)
+            lag = lag.renamed([f"command_{axis}"], [f"drive_{axis}"])
+            self.diagram.add(f"delay and amplifier {axis}", lag, "actuator")
+        # Voltages at the amplifiers, to which the limits apply, after delay and lag (both of unit gain).
+        commands = [f"{name}_command" for name in self.actuators]
+        self.diagram.add("allocation", gain(self.allocation, self._each("drive_{}"), commands), "allocation")
+        if identified is not None:
+            self._response_error(identified)
+        else:
+            self._neglected_dynamics(self.design.uncertainty.actuator_chains)
+
+    def _response_error(self, identified: InDesign) -> None:
+        """(I + W Delta) on the axes' forces, Delta full: difference of the measured from the identified response.
+
+        Errors per channel do not suffice: an error on one axis by the force of another need not be a channel error.
+        """
+        diagram, n = self.diagram, len(self.axes)
+        self.weights[RESPONSE] = identified.weight
+        tags = [f"{RESPONSE}[{k}]" if n > 1 else RESPONSE for k in range(n)]
+        w, z = [f"w:{tag}" for tag in tags], [f"z:{tag}" for tag in tags]
+        for axis, force, filtered in zip(self.axes, w, z, strict=True):
+            diagram.add(f"W {RESPONSE} {axis}", identified.weight.system(f"drive_{axis}", filtered), "weight")
+            diagram.means(force, "force by which the response differs from the identified one", "N")
+        errors = gain(self.allocation, w, [f"{name}_error" for name in self.actuators])
+        diagram.add("identified response error", errors, "allocation")
+        for name in self.actuators:
+            total = summing_junction(name, [f"{name}_command", f"{name}_error"])
+            diagram.add(f"actuator chain {name}", total, "actuator")
+        diagram.uncertain(ComplexFull(n, n, RESPONSE), w, z)
+
+    def _neglected_dynamics(self, uncertainty: ChainUncertainty | None) -> None:
+        """(1 + W delta) in each actuator channel: neglected dynamics as multiplicative input uncertainty."""
+        for name in self.actuators:
+            label, command = f"actuator chain {name}", f"{name}_command"
+            if uncertainty is None:
+                self.diagram.add(label, gain([[1.0]], [command], [name]), "actuator")
+                continue
+            weight = self.weights.setdefault("actuator chain *", neglected_dynamics(uncertainty))
+            self.diagram.add(f"W {label}", weight.system(command, f"z:{label}"), "weight")
+            self.diagram.add(label, gain([[1.0, 1.0]], [command, f"w:{label}"], [name]), "actuator")
+            self.diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
+
+    def sensor_side(
+        self,
+        seen: Sensing,
+        decoding: np.ndarray,
+        rows: tuple[np.ndarray, np.ndarray],
+        flicker: Sequence[FlickerNoise],
+        reference: float,
+    ) -> list[_Noise]:
+        """Sensor chains of the logical axes and their noise. The chains are equal, so decoding and chain commute.
+
+        rows : (n_s, n_axes) each, from the axes' motion to the motion along each sensor, and to its apparent
+            acceleration by gravity.
+
+        One unit of noise accompanies 1 m/s of floor velocity: sensor density over floor density.
+        """
+        uncertainty = self.design.uncertainty.sensor_chains
+        groups = [
+            _Noise.of(self.axes, group, weight, decoding, reference, k)
+            for k, (group, weight) in enumerate(zip(seen.noise, flicker, strict=True))
         ]
-        diagram.add(f"sum {axis}", summing_junction(f"seen_{axis}_dot", terms), "sum")
-        diagram.means(clean, "velocity as the sensors' band shows it", "m/s")
-        diagram.means(f"seen_{axis}_dot", "measured velocity", "m/s")
-    for one in groups:
-        diagram.add(
-            f"noise mixing{one.tag}", gain(one.mix, one.inputs, [f"mixed_{name}" for name in one.inputs]), "allocation"
-        )
-    return groups
+        inertial = seen.decoder.inertial
+        # Decoded motion in space, and decoded motion relative to the chassis.
+        by_velocity, by_relative = (decoding[:, one] @ rows[0][one] for one in (inertial, ~inertial))
+        by_tilt = decoding @ rows[1]
+        for k, axis in enumerate(self.axes):
+            both = (
+                (by_velocity[k], "dot", seen.chain, f"sensor chain {axis}", f"{axis}_in_space"),
+                (by_relative[k], "rel", seen.relative_chain, f"position chain {axis}", f"{axis}_against_chassis"),
+            )
+            ways = [one for one in both if np.any(np.abs(one[0]) > 1e-9)]
+            clean = f"clean_{axis}_dot"
+            for row, of, chain, label, made in ways:
+                assert chain is not None
+                tilt = by_tilt[k] if of == "dot" else np.zeros(len(self.axes))
+                self._sensor_chain(k, (row, tilt), of, chain, label, clean if len(ways) == 1 else made)
+            if len(ways) > 1:
+                self.diagram.add(f"motion sum {axis}", summing_junction(clean, [made for *_, made in ways]), "sum")
+            own = [f"{axis}{one.tag}" for one in groups if axis in one.axes]
+            for one in groups:
+                if axis in one.axes:
+                    one.add(self.diagram, axis)
+            errors = [f"chain_error_{axis}"] if uncertainty is not None else []
+            terms = [clean, *(f"sensor_noise_{name}" for name in own), *errors]
+            self.diagram.add(f"sum {axis}", summing_junction(f"seen_{axis}_dot", terms), "sum")
+            self._mean(OF_NOISES, own)
+        for one in groups:
+            mixing = gain(one.mix, one.inputs, [f"mixed_{name}" for name in one.inputs])
+            self.diagram.add(f"noise mixing{one.tag}", mixing, "allocation")
+        self.weights |= {f"{NOISE}{one.tag}": one.weight for one in groups if one.weight.flicker}
+        if uncertainty is not None:
+            self._sensor_errors(uncertainty, seen.decoder.sensors, rows[0], decoding)
+        return groups
 
+    def _sensor_chain(
+        self, k: int, rows: tuple[np.ndarray, np.ndarray], of: str, chain: StateSpace, label: str, made: str
+    ) -> None:
+        """The common sensor chain of axis k, applied to its decoded motion and to gravity; rows (n_axes,) each."""
+        axes, diagram = self.axes, self.diagram
+        read, (row, tilt) = f"{axes[k]}_{of}", rows
+        if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
+            felt = [a for a in range(len(axes)) if abs(row[a]) > 1e-9]
+            read = f"{made}_motion"
+            diagram.add(f"motion of {label}", gain(row[None, felt], [f"{axes[a]}_{of}" for a in felt], [read]), "sum")
+            diagram.means(read, "motion decoded for this axis, before the sensor chain", "m/s" if of == "dot" else "m")
+        system = chain.renamed([read], [made])
+        if felt := [a for a in range(len(axes)) if abs(tilt[a]) > 1e-9 * GRAVITY]:
+            # The input of the chain is velocity: the rate of the apparent acceleration is integrated twice.
+            gravity = gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"])
+            diagram.add(f"gravity in {label}", gravity, "sum")
+            diagram.means(f"{made}_tilt", "rate of what gravity adds to the measured acceleration", "m/s^3")
+            system = with_rate_input(system, f"{made}_tilt", 2)
+        diagram.add(label, system, "sensor")
 
-def _chain_of(
-    diagram: Diagram,
-    axes: tuple[str, ...],
-    k: int,
-    rows: tuple[np.ndarray, np.ndarray],
-    of: str,
-    chain: StateSpace,
-    label: str,
-    made: str,
-) -> None:
-    """The common sensor chain of an axis, applied to its decoded motion and to gravity; rows (n_axes,) each."""
-    read, (row, tilt) = f"{axes[k]}_{of}", rows
-    if np.max(np.abs(row - np.eye(len(axes))[k])) > 1e-9:
-        felt = [a for a in range(len(axes)) if abs(row[a]) > 1e-9]
-        read = f"{made}_motion"
-        diagram.add(f"motion of {label}", gain(row[None, felt], [f"{axes[a]}_{of}" for a in felt], [read]), "sum")
-        diagram.means(read, "motion decoded for this axis, before the sensor chain", "m/s" if of == "dot" else "m")
-    system = chain.renamed([read], [made])
-    if felt := [a for a in range(len(axes)) if abs(tilt[a]) > 1e-9 * GRAVITY]:
-        # The input of the chain is velocity: the rate of the apparent acceleration is integrated twice.
-        diagram.add(
-            f"gravity in {label}", gain(tilt[None, felt], [f"{axes[a]}_dot" for a in felt], [f"{made}_tilt"]), "sum"
-        )
-        diagram.means(f"{made}_tilt", "rate of what gravity adds to the measured acceleration", "m/s^3")
-        system = with_rate_input(system, f"{made}_tilt", 2)
-    diagram.add(label, system, "sensor")
-    diagram.means(made, "velocity as the sensors' band shows it", "m/s")
+    def _sensor_errors(
+        self, uncertainty: ChainUncertainty, sensors: tuple[str, ...], rows: np.ndarray, decoding: np.ndarray
+    ) -> None:
+        """Errors of the decoded velocities by the neglected dynamics of each sensor chain: decoding (W Delta) rows."""
+        weight = self.weights["sensor chain *"] = neglected_dynamics(uncertainty)
+        used = [k for k, row in enumerate(rows) if np.any(np.abs(row) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
+        labels = [f"sensor chain {sensors[k]}" for k in used]
+        for k, label in zip(used, labels, strict=True):
+            motion = gain([rows[k]], self._each("clean_{}_dot"), [f"{sensors[k]}_dot"])
+            self.diagram.add(f"at {sensors[k]}", motion, "sum")
+            self.diagram.add(f"W {label}", weight.system(f"{sensors[k]}_dot", f"z:{label}"), "weight")
+            self.diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
+        errors = gain(decoding[:, used], [f"w:{label}" for label in labels], self._each("chain_error_{}"))
+        self.diagram.add("decoding of errors", errors, "allocation")
+
+    def performance(self, offset: float) -> None:
+        """Weighted outputs, per m/s of floor velocity (compliance: per newton)."""
+        asked, effort = self.design.transmissibility, self.design.control_effort
+        limits_V = self.rig.limits_of(self.actuators)
+        band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
+        bound = TransmissibilityBound(asked.peak_dB, (band,), asked.transition_octaves, asked.tolerance_dB)
+        self.weights["transmissibility"] = bound
+        load = np.abs(self.allocation) * (limits_V.max() / limits_V)[:, None]
+        for k, axis in enumerate(self.axes):
+            self.diagram.add(f"W_T {axis}", bound.system(f"{axis}_dot", f"e_{axis}"), "weight")
+            # Voltage of the channel that reaches its limit first for a force on this axis.
+            first = int(np.argmax(load[:, k]))
+            weight = ControlEffort(
+                float(limits_V[first]),
+                effort.floor_velocity_m_per_s,
+                effort.bandwidth_Hz,
+                effort.reduction,
+                1,
+                offset,
+                effort.offset_corner_Hz,
+            )
+            self.weights[f"{EFFORT} {axis}" if np.ptp(limits_V) else EFFORT] = weight
+            volts = float(np.abs(self.allocation[first, k]))
+            system = weight.system(f"command_{axis}", f"effort_{axis}").scaled(right=volts)
+            self.diagram.add(f"W_u {axis}", system, "weight")
+        if self.design.compliance:
+            allowed = self.weights["compliance"] = ComplianceBound(self.design.compliance.limit_m_per_N)
+            for axis in self.axes:
+                self.diagram.add(f"W_c {axis}", allowed.system(f"{axis}_rel", f"compliance_{axis}"), "weight")
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,74 +524,3 @@ class _Noise:
         """The noise of one axis."""
         name = f"{axis}{self.tag}"
         diagram.add(f"noise {name}", self.shape.renamed([f"mixed_noise_{name}"], [f"sensor_noise_{name}"]), "weight")
-        diagram.means(f"mixed_noise_{name}", "noise of the sensors used for this axis, before its filter", "1")
-        diagram.means(f"noise_{name}", "sensor noise that accompanies 1 m/s of floor velocity", "1")
-        diagram.means(f"sensor_noise_{name}", "sensor noise as velocity", "m/s")
-
-
-def _sensor_errors(
-    diagram: Diagram,
-    uncertainty: ChainUncertainty,
-    axes: tuple[str, ...],
-    sensors: tuple[str, ...],
-    rows: np.ndarray,
-    decoding: np.ndarray,
-    weights: dict[str, Weight],
-) -> None:
-    """Errors of the decoded velocities by the neglected dynamics of each sensor chain: decoding (W Delta) rows."""
-    used = [k for k in range(len(sensors)) if np.any(np.abs(rows[k]) > 1e-9) and np.any(np.abs(decoding[:, k]) > 1e-9)]
-    weight = neglected_dynamics(uncertainty)
-    weights["sensor chain *"] = weight
-    labels = [f"sensor chain {sensors[k]}" for k in used]
-    for k, label in zip(used, labels, strict=True):
-        diagram.add(f"at {sensors[k]}", gain([rows[k]], [f"clean_{a}_dot" for a in axes], [f"{sensors[k]}_dot"]), "sum")
-        diagram.add(f"W {label}", weight.system(f"{sensors[k]}_dot", f"z:{label}"), "weight")
-        diagram.uncertain(ComplexFull(1, 1, label), [f"w:{label}"], [f"z:{label}"])
-    diagram.add(
-        "decoding of errors",
-        gain(decoding[:, used], [f"w:{label}" for label in labels], [f"chain_error_{a}" for a in axes]),
-        "allocation",
-    )
-    for axis in axes:
-        diagram.means(f"chain_error_{axis}", "what neglected sensor dynamics add to the velocity", "m/s")
-
-
-def _performance(
-    diagram: Diagram,
-    design: Design,
-    axes: tuple[str, ...],
-    allocation: np.ndarray,
-    limits_V: np.ndarray,
-    offset: float,
-    weights: dict[str, Weight],
-) -> None:
-    """Weighted outputs, per m/s of floor velocity (compliance: per newton); limits_V (n_actuators,)."""
-    asked, effort = design.transmissibility, design.control_effort
-    band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
-    weights["transmissibility"] = TransmissibilityBound(
-        asked.peak_dB, (band,), asked.transition_octaves, asked.tolerance_dB
-    )
-    load = np.abs(allocation) * (limits_V.max() / limits_V)[:, None]
-    for k, axis in enumerate(axes):
-        diagram.add(f"W_T {axis}", weights["transmissibility"].system(f"{axis}_dot", f"e_{axis}"), "weight")
-        # Voltage of the channel that reaches its limit first for a force on this axis.
-        first = int(np.argmax(load[:, k]))
-        weight = ControlEffort(
-            float(limits_V[first]),
-            effort.floor_velocity_m_per_s,
-            effort.bandwidth_Hz,
-            effort.reduction,
-            1,
-            offset,
-            effort.offset_corner_Hz,
-        )
-        weights[f"{EFFORT} {axis}" if np.ptp(limits_V) else EFFORT] = weight
-        volts = weight.system(f"command_{axis}", f"effort_{axis}").scaled(right=float(np.abs(allocation[first, k])))
-        diagram.add(f"W_u {axis}", volts, "weight")
-        diagram.means(f"e_{axis}", "payload velocity over its bound", "1")
-        diagram.means(f"effort_{axis}", "drive over its limit", "1")
-    if design.compliance:
-        weights["compliance"] = ComplianceBound(design.compliance.limit_m_per_N)
-        for axis in axes:
-            diagram.add(f"W_c {axis}", weights["compliance"].system(f"{axis}_rel", f"compliance_{axis}"), "weight")
-            diagram.means(f"compliance_{axis}", "displacement over its bound", "1")

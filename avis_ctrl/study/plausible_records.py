@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -60,7 +62,9 @@ class RecordPlausibility:
 
 
 SETTINGS = RecordPlausibility()
-Response = Callable[[np.ndarray], np.ndarray]
+# Likely wrong field, its present value, what was probably meant; a candidate has the remaining distance in front.
+Question = tuple[str, object, str]
+Candidate = tuple[float, str, object, str]
 # Fields of rig files by parameter name; other parameters are named by themselves.
 FIELDS = {
     "mass": "payload.mass_kg",
@@ -118,9 +122,9 @@ class RecordSpectra:
         return found
 
 
-def distance(decades: np.ndarray, cap: float = SETTINGS.cap) -> float:
+def distance(decades: np.ndarray) -> float:
     """Mean over sensors of the mean over bands of |decades|; nan where there is no response."""
-    size = np.minimum(np.abs(decades), cap)
+    size = np.minimum(np.abs(decades), SETTINGS.cap)
     there = np.isfinite(size)
     columns = there.any(axis=0)
     if not columns.any():
@@ -143,9 +147,7 @@ def records_fit(
         return ()
 
 
-def check_records(
-    measured: Campaign, model: ResponseModel, settings: RecordPlausibility = SETTINGS
-) -> tuple[Finding, ...]:
+def check_records(measured: Campaign, model: ResponseModel) -> tuple[Finding, ...]:
     """Refuse records that a single unit error explains, or that no table similar to the rig could have produced.
 
     Returns warnings on sensors that are off by one factor in all bands; these do not stop the analysis.
@@ -154,83 +156,27 @@ def check_records(
     ------
     InputError : one line that names the field and the likely error.
     """
-    seen = record_spectra(measured, settings)
+    seen = record_spectra(measured)
     if seen is None:
         return ()
-
-    def response(of: ResponseModel) -> np.ndarray:
-        G = of.response(seen.omega)
-        return G[:, :, [of.inputs.index(name) for name in measured.u_names]]
-
-    G = response(model)
-    now = seen.decades(G)
-    before = distance(now)
-    worst = _worst_channel(now, settings)
-    doubts = _doubts(now, measured, model, settings)
-    if not (before > settings.far or worst > settings.far):
+    errors = UnitErrors(measured, model, seen)
+    before, worst = distance(errors.decades), _worst_channel(errors.decades)
+    doubts = errors.doubts()
+    if not (before > SETTINGS.far or worst > SETTINGS.far):
         return doubts
-    found = sorted(_candidates(seen, G, now, measured, model, response, settings), key=lambda one: one[0])
-    left = [one for one in found if one[0] <= settings.fits and one[0] <= settings.share * max(before, worst)]
-    if left:
-        _, field, value, said = left[0]
+    said = f"the recorded y is {_as_text(errors.decades)} the y that the rig's model predicts for these voltages"
+    enough = min(SETTINGS.fits, SETTINGS.share * max(before, worst))
+    found = [one for one in sorted(errors.corrected(), key=lambda one: one[0]) if one[0] <= enough]
+    if found:
+        _, field, value, question = found[0]
+        raise InputError(f"{said}; {question}", field=field, value=value)
+    if before > SETTINGS.hopeless:
         raise InputError(
-            f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages; {said}",
-            field=field,
-            value=value,
-        )
-    if before > settings.hopeless:
-        raise InputError(
-            f"the recorded y is {_as_text(now)} the y that the rig's model predicts for these voltages, "
-            "and no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
+            f"{said}, and no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
             "force constants",
             field="records",
         )
     return doubts
-
-
-def _doubts(
-    decades: np.ndarray, measured: Campaign, model: ResponseModel, settings: RecordPlausibility
-) -> tuple[Finding, ...]:
-    """Warnings on sensors of one kind that measure the same multiple of the prediction in all bands."""
-    off: list[tuple[str, float, str]] = []
-    kinds = {one.name: one.quantity for one in model.rig.sensors()}
-    for name, column in zip(measured.y_names, decades.T, strict=True):
-        there = column[np.isfinite(column)]
-        if (
-            there.size >= 3
-            and abs(middle := float(np.median(there))) > settings.far
-            and (np.median(np.abs(there - middle)) < settings.fits)
-        ):
-            off.append((kinds.get(name, ""), middle, name))
-    alike: list[list[tuple[str, float, str]]] = []
-    for one in sorted(off):
-        if alike and alike[-1][0][0] == one[0] and one[1] - alike[-1][0][1] < settings.fits:
-            alike[-1].append(one)
-        else:
-            alike.append([one])
-    found = []
-    for sensors in alike:
-        kind = sensors[0][0]
-        factor = 10.0 ** float(np.median([one[1] for one in sensors]))
-        names = tuple(name for name in measured.y_names if name in [one[2] for one in sensors])
-        likely = (
-            " (9.81 is g: is a sensitivity given in V/g instead of V s^2/m, or the reverse?)"
-            if (kind == "acceleration" and settings.like_g > abs(abs(np.log10(factor)) - np.log10(9.80665)))
-            else ""
-        )
-        found.append(
-            Finding(
-                "units",
-                "warning",
-                f"The signal of {listed(names)} is {factor:.3g} times the one that "
-                f"the rig's model predicts for these voltages, in all frequency bands{likely}. Check "
-                "sensitivity, gain and unit before you trust the fit.",
-                names,
-                value=factor,
-                limit=10.0**settings.far,
-            )
-        )
-    return tuple(found)
 
 
 def _as_text(decades: np.ndarray) -> str:
@@ -239,23 +185,19 @@ def _as_text(decades: np.ndarray) -> str:
     return f"{low:.3g} times" if high < 1.5 * low else f"{low:.3g} to {high:.3g} times"
 
 
-def _worst_channel(decades: np.ndarray, settings: RecordPlausibility) -> float:
+def _worst_channel(decades: np.ndarray) -> float:
     """A value just above `far` if any channel is off by more than 1.5 decades (unit errors are three), else 0."""
     each = [np.nanmedian(np.abs(column)) for column in decades.T if np.isfinite(column).any()]
-    return settings.far * 1.01 if max(each, default=0.0) > 1.5 else 0.0
+    return SETTINGS.far * 1.01 if max(each, default=0.0) > 1.5 else 0.0
 
 
-def record_spectra(measured: Campaign, settings: RecordPlausibility = SETTINGS) -> RecordSpectra | None:
+def record_spectra(measured: Campaign) -> RecordSpectra | None:
     """Spectra of the first records with drive voltages; None if there are none, or too few samples."""
-    driven = [
-        one
-        for one in measured.records
-        if one.header.level_V > 0 or one.header.excitation in ("multisine", "noise", "sine")
-    ]
-    parts, peak_u, peak_y = [], np.zeros(len(measured.u_names)), 0.0
-    length = 0
-    for record in driven[: settings.records]:
-        seen = excerpt(record, settings.samples)
+    kinds = ("multisine", "noise", "sine")
+    driven = [one for one in measured.records if one.header.level_V > 0 or one.header.excitation in kinds]
+    parts, peak_u, peak_y, length = [], np.zeros(len(measured.u_names)), 0.0, 0
+    for record in driven[: SETTINGS.records]:
+        seen = excerpt(record, SETTINGS.samples)
         if not seen.driven:
             continue
         u, y, wrap = usable(seen)
@@ -268,103 +210,194 @@ def record_spectra(measured: Campaign, settings: RecordPlausibility = SETTINGS) 
         return None
     first = parts[0]
     lines = np.flatnonzero(np.isin(first.f, estimate.f))
-    place = np.unique(np.geomspace(1, len(lines), min(settings.lines, len(lines))).astype(int) - 1)
+    place = np.unique(np.geomspace(1, len(lines), min(SETTINGS.lines, len(lines))).astype(int) - 1)
     f = first.f[lines[place]]
     U = np.concatenate([one.U for one in parts])[:, lines[place]]
     Y = np.concatenate([one.Y for one in parts])[:, lines[place]]
-    number = np.floor(np.log2(f / f[0]) / settings.octaves).astype(int)
+    number = np.floor(np.log2(f / f[0]) / SETTINGS.octaves).astype(int)
     bands = np.array([number == k for k in np.unique(number)], float)
     coherence = bands @ estimate.coherence[place] / bands.sum(axis=1)[:, None]
     power = bands @ np.sum(np.abs(Y) ** 2, axis=0)
-    answered = np.where((coherence > settings.coherent) & (power > 0), power, np.nan)
+    answered = np.where((coherence > SETTINGS.coherent) & (power > 0), power, np.nan)
     return RecordSpectra(peak_u, peak_y, 2 * np.pi * f, U, answered, bands)
 
 
-Candidate = tuple[float, str, object, str]
+@dataclass(frozen=True, eq=False)
+class UnitErrors:
+    """Search for the unit error that explains a difference between records and the rig's model.
 
+    A question is (field, value, text): the likely wrong field, its present value, and what was probably meant.
+    """
 
-def _candidates(
-    seen: RecordSpectra,
-    G: np.ndarray,
-    now: np.ndarray,
-    measured: Campaign,
-    model: ResponseModel,
-    response: Callable[[ResponseModel], np.ndarray],
-    settings: RecordPlausibility,
-) -> Iterator[Candidate]:
-    """(remaining distance, field, value, question) for each corrected error, the simplest first."""
-    for c in settings.gain_decades:
-        yield distance(now - c) + _rare(c, settings), *_common_gain(10.0**c, seen, measured, model)
-    for k, name in enumerate(measured.y_names):
-        for c in settings.gain_decades:
-            one = now.copy()
-            one[:, k] -= c
-            yield distance(one) + settings.scope / 2, *_sensor_gain(name, 10.0**c, model)
-    for k, name in enumerate(measured.u_names):
-        for c in settings.gain_decades[:2]:
-            volts = np.ones(len(measured.u_names))
-            volts[k] = 10.0**c
-            yield (
-                distance(seen.decades(G, volts)) + settings.scope / 2,
-                f"force constant of {name}",
-                None,
-                f"did you mean {10.0**c:g} times that constant, or is u of {name} given in "
-                f"{'kV' if c > 0 else 'mV'} instead of V?",
-            )
-    for unit in ("V", "m", "m/s", "m/s^2"):
-        if unit != measured.y_unit:
-            try:
-                other = response(
-                    ResponseModel.of(
-                        model.rig,
-                        (),
-                        unit,
-                        measured.y_names,
-                        measured.u_names,
-                        model.period_s > 0,
-                        model.amplifier_corner_Hz,
-                    )
+    measured: Campaign
+    model: ResponseModel
+    seen: RecordSpectra
+
+    def response(self, model: ResponseModel) -> np.ndarray:
+        """(n, n_y, n_u) response of a model to the recorded voltages, at the lines of the records."""
+        return model.response(self.seen.omega)[:, :, [model.inputs.index(name) for name in self.measured.u_names]]
+
+    @cached_property
+    def G(self) -> np.ndarray:
+        """Response of the rig's model."""
+        return self.response(self.model)
+
+    @cached_property
+    def decades(self) -> np.ndarray:
+        """(bands, n_y) recorded over predicted r.m.s., in decades."""
+        return self.seen.decades(self.G)
+
+    def doubts(self) -> tuple[Finding, ...]:
+        """Warnings on sensors of one kind that measure the same multiple of the prediction in all bands."""
+        kinds = {one.name: one.quantity for one in self.model.rig.sensors()}
+        off: list[tuple[str, float, str]] = []
+        for name, column in zip(self.measured.y_names, self.decades.T, strict=True):
+            there = column[np.isfinite(column)]
+            middle = float(np.median(there)) if there.size >= 3 else 0.0
+            if abs(middle) > SETTINGS.far and np.median(np.abs(there - middle)) < SETTINGS.fits:
+                off.append((kinds.get(name, ""), middle, name))
+        alike: list[list[tuple[str, float, str]]] = []
+        for one in sorted(off):
+            if alike and alike[-1][0][0] == one[0] and one[1] - alike[-1][0][1] < SETTINGS.fits:
+                alike[-1].append(one)
+            else:
+                alike.append([one])
+        return tuple(map(self._doubt, alike))
+
+    def _doubt(self, alike: list[tuple[str, float, str]]) -> Finding:
+        """The warning on sensors (kind, decades, name) that are off by about the same factor."""
+        decades = float(np.median([one[1] for one in alike]))
+        names = tuple(name for name in self.measured.y_names if name in [one[2] for one in alike])
+        gravity = alike[0][0] == "acceleration" and abs(abs(decades) - np.log10(9.80665)) < SETTINGS.like_g
+        likely = " (9.81 is g: is a sensitivity given in V/g instead of V s^2/m, or the reverse?)" if gravity else ""
+        return Finding(
+            "units",
+            "warning",
+            f"The signal of {listed(names)} is {10.0**decades:.3g} times the one that the rig's model predicts for "
+            f"these voltages, in all frequency bands{likely}. Check sensitivity, gain and unit before you trust the "
+            "fit.",
+            names,
+            value=10.0**decades,
+            limit=10.0**SETTINGS.far,
+        )
+
+    def corrected(self) -> Iterator[Candidate]:
+        """(remaining distance, *question) for each error, as if it were corrected; the simplest first."""
+        for c in SETTINGS.gain_decades:
+            yield distance(self.decades - c) + _rare(c), *self._common_gain(10.0**c)
+        for k, name in enumerate(self.measured.y_names):
+            for c in SETTINGS.gain_decades:
+                one = self.decades.copy()
+                one[:, k] -= c
+                yield distance(one) + SETTINGS.scope / 2, *self._sensor_gain(name, 10.0**c)
+        for k, name in enumerate(self.measured.u_names):
+            for c in SETTINGS.gain_decades[:2]:
+                volts = np.ones(len(self.measured.u_names))
+                volts[k] = 10.0**c
+                question = (
+                    f"did you mean {10.0**c:g} times that constant, or is u of {name} given in "
+                    f"{'kV' if c > 0 else 'mV'} instead of V?"
                 )
-            except InputError:
+                left = distance(self.seen.decades(self.G, volts)) + SETTINGS.scope / 2
+                yield left, f"force constant of {name}", None, question
+        yield from self._other_units()
+        yield from self._of_rig()
+
+    def _other_units(self) -> Iterator[Candidate]:
+        """Signals y in another unit, possibly with a prefix."""
+        unit, model, channels = self.measured.y_unit, self.model, (self.measured.y_names, self.measured.u_names)
+        for other in ("V", "m", "m/s", "m/s^2"):
+            if other == unit:
                 continue
-            for c in (0.0, 3.0, -3.0):
-                much = f" times {10.0**c:g}" if c else ""
-                yield (
-                    distance(seen.decades(other) - c) + settings.scope,
-                    "unit of y",
-                    measured.y_unit,
-                    f"did you mean {unit}{much}?",
+            with suppress(InputError):  # a unit that these sensors do not have
+                changed = ResponseModel.of(
+                    model.rig, (), other, *channels, model.period_s > 0, model.amplifier_corner_Hz
                 )
-    yield from _of_rig(seen, model, response, settings)
+                decades = self.seen.decades(self.response(changed))
+                for c in (0.0, 3.0, -3.0):
+                    much = f" times {10.0**c:g}" if c else ""
+                    yield distance(decades - c) + SETTINGS.scope, "unit of y", unit, f"did you mean {other}{much}?"
+
+    def _of_rig(self) -> Iterator[Candidate]:
+        """Errors of each kind of rig parameter; all parameters of a kind have the same factor."""
+        known = self.model.rig.parameters()
+        kinds: dict[str, list[str]] = {}
+        for name, parameter in known.items():
+            if parameter.unit in UNITS and parameter.value:
+                kinds.setdefault(_kind(name), []).append(name)
+        for kind, names in kinds.items():
+            for factor in SETTINGS.rig_factors:
+                try:
+                    rig = self.model.rig.with_parameters({name: factor * known[name].value for name in names})
+                    moved = self.response(replace(self.model, rig=rig))
+                except (InputError, ArithmeticError, np.linalg.LinAlgError):
+                    continue
+                value, decades = known[names[0]].value, float(np.log10(factor))
+                much = f"{'a thousand' if abs(decades) == 3 else 'a million'} times {'more' if factor > 1 else 'less'}"
+                left = distance(self.seen.decades(moved)) + SETTINGS.scope + _rare(decades)
+                yield left, FIELDS.get(kind, kind), value, f"did you mean {value * factor:g} ({much})?"
+
+    def _sensor_gain(self, name: str, factor: float) -> Question:
+        sensors = self.model.sensors
+        k = sensors.names.index(name)
+        value = float(sensors.sensitivity[k])
+        return (
+            f"sensitivity of {name}",
+            value,
+            f"only {name} differs: did you mean {value * factor:g} {sensors.sensitivity_units[k]} (with "
+            "preamplifier), or is it recorded in a different unit from the others?",
+        )
+
+    def _common_gain(self, factor: float) -> Question:
+        """Question on a factor common to all channels: force constants, sensitivities, units of u and y.
+
+        A value beyond a limit is named first, then a value that the factor would bring into the usual range.
+        """
+        rig, unit, seen, drives = self.model.rig, self.measured.y_unit, self.seen, self.measured.u_names
+        limits, full = rig.limits_of(drives), rig.acquisition.adc_range_V if rig.acquisition else np.inf
+        k = int(np.argmax(seen.peak_u / limits))
+        meant = "did you mean {:.4g} V (given in mV)?"
+        if factor == 1e-3 and seen.peak_u[k] > 3 * limits[k]:
+            question = f"the limit of drive {drives[k]} is {limits[k]:g} V: {meant.format(seen.peak_u[k] / 1e3)}"
+            return "u of the records", float(f"{seen.peak_u[k]:.4g}"), question
+        if factor == 1e3 and unit == "V" and seen.peak_y > 3 * full:
+            question = f"the converter's range is {full:g} V: {meant.format(seen.peak_y / 1e3)}"
+            return "y of the records", float(f"{seen.peak_y:.4g}"), question
+        # (change of the distance from the usual range by the factor, field, value); negative if it gets closer.
+        options = [
+            (within.off_centre(usual * factor) - within.off_centre(usual), field, value)
+            for field, value, usual, within in self._gains()
+        ]
+        options.sort(key=lambda one: one[0])
+        prefix = {1e3: ("m", "k"), 1e-3: ("k", "m")}.get(factor)
+        records = f"are the records' y in {prefix[0]}{unit} or u in {prefix[1]}V?" if prefix else ""
+        if options and options[0][0] < -0.2:
+            _, field, value = options[0]
+            return field, value, f"did you mean {value * factor:g}{', or ' if records else '?'}{records}"
+        others = "; ".join(f"{field} = {value:g} ({value * factor:g} would fit)" for _, field, value in options)
+        return "unit of y or u", None, f"all channels differ by the same factor: {records} Otherwise check {others}"
+
+    def _gains(self) -> Iterator[tuple[str, float, float, Range]]:
+        """(field, value, quantity that it scales, usual range of that quantity) of each gain of all channels."""
+        rig, equations = self.model.rig, self.model.rig.equations_of_motion()
+        push = float(np.max(np.abs(equations.T[:3]) @ rig.drive_limits_V())) / float(equations.M[0, 0])
+        if constants := [p.value for p in rig.parameters().values() if p.unit == "N/V"]:
+            yield "actuators.constant_N_per_V", constants[0], push, RANGES.acceleration
+        if self.measured.y_unit != "V":
+            return
+        for section, part, keys in (
+            ("geophones", rig.geophones, ("sensitivity_Vs_per_m", "preamplifier_gain")),
+            ("accelerometers", rig.accelerometers, ("sensitivity_Vs2_per_m",)),
+        ):
+            for key in keys:
+                value = getattr(part, key, None)
+                value = value[0] if isinstance(value, tuple) and value else value
+                if isinstance(value, float) and value > 0:
+                    yield f"{section}.{key}", value, value, RANGES.keys[key]
 
 
-def _of_rig(
-    seen: RecordSpectra,
-    model: ResponseModel,
-    response: Callable[[ResponseModel], np.ndarray],
-    settings: RecordPlausibility,
-) -> Iterator[Candidate]:
-    """Errors of each kind of rig parameter; all parameters of a kind have the same factor."""
-    known = model.rig.parameters()
-    kinds: dict[str, list[str]] = {}
-    for name, parameter in known.items():
-        if parameter.unit in UNITS and parameter.value:
-            kinds.setdefault(_kind(name), []).append(name)
-    for kind, names in kinds.items():
-        for factor in settings.rig_factors:
-            try:
-                rig = model.rig.with_parameters({name: factor * known[name].value for name in names})
-                moved = response(replace(model, rig=rig))
-            except (InputError, ArithmeticError, np.linalg.LinAlgError):
-                continue
-            value, decades = known[names[0]].value, float(np.log10(factor))
-            much = f"{'a thousand' if abs(decades) == 3 else 'a million'} times {'more' if factor > 1 else 'less'}"
-            left = distance(seen.decades(moved)) + settings.scope + _rare(decades, settings)
-            yield left, FIELDS.get(kind, kind), value, f"did you mean {value * factor:g} ({much})?"
-
-
-def _rare(decades: float, settings: RecordPlausibility) -> float:
-    return settings.rare * (abs(decades) != 3)
+def _rare(decades: float) -> float:
+    return SETTINGS.rare * (abs(decades) != 3)
 
 
 def _kind(name: str) -> str:
@@ -376,78 +409,3 @@ def _kind(name: str) -> str:
     if name.startswith("actuator."):
         return "actuator"
     return re.sub(r"_[xyz]$", "", re.sub(r"\d+", "", name))
-
-
-def _common_gain(
-    factor: float, seen: RecordSpectra, measured: Campaign, model: ResponseModel
-) -> tuple[str, object, str]:
-    """Question on a factor common to all channels: force constants, sensitivities, units of u and y.
-
-    A value beyond a limit is named first, then a value that the factor would bring into the usual range.
-    """
-    rig, unit = model.rig, measured.y_unit
-    limits, full = rig.limits_of(measured.u_names), rig.acquisition.adc_range_V if rig.acquisition else np.inf
-    k = int(np.argmax(seen.peak_u / limits))
-    if factor == 1e-3 and seen.peak_u[k] > 3 * limits[k]:
-        return (
-            "u of the records",
-            float(f"{seen.peak_u[k]:.4g}"),
-            f"the limit of drive {measured.u_names[k]} is "
-            f"{limits[k]:g} V: did you mean {seen.peak_u[k] / 1e3:.4g} V (given in mV)?",
-        )
-    if factor == 1e3 and unit == "V" and seen.peak_y > 3 * full:
-        return (
-            "y of the records",
-            float(f"{seen.peak_y:.4g}"),
-            f"the converter's range is {full:g} V: did you mean {seen.peak_y / 1e3:.4g} V (given in mV)?",
-        )
-    options: list[tuple[float, str, object, str]] = []
-    mass = float(rig.equations_of_motion().M[0, 0])
-    push = float(np.max(np.abs(rig.equations_of_motion().T[:3]) @ rig.drive_limits_V())) / mass
-    constants = [p.value for p in rig.parameters().values() if p.unit == "N/V"]
-    if constants:
-        options.append(
-            (
-                _gained(RANGES.acceleration, push, factor),
-                "actuators.constant_N_per_V",
-                constants[0],
-                f"{constants[0] * factor:g}",
-            )
-        )
-    if unit == "V":
-        for part, keys in (
-            (rig.geophones, ("sensitivity_Vs_per_m", "preamplifier_gain")),
-            (rig.accelerometers, ("sensitivity_Vs2_per_m",)),
-        ):
-            for key in keys if part is not None else ():
-                value = getattr(part, key, None)
-                value = value[0] if isinstance(value, tuple) and value else value
-                if isinstance(value, float) and value > 0:
-                    section = "geophones" if part is rig.geophones else "accelerometers"
-                    options.append(
-                        (_gained(RANGES.keys[key], value, factor), f"{section}.{key}", value, f"{value * factor:g}")
-                    )
-    options.sort(key=lambda one: one[0])
-    prefix = {1e3: ("m", "k"), 1e-3: ("k", "m")}.get(factor)
-    records = f"are the records' y in {prefix[0]}{unit} or u in {prefix[1]}V?" if prefix else ""
-    if options and options[0][0] < -0.2:
-        _, field, value, meant = options[0]
-        return field, value, f"did you mean {meant}{', or ' if records else '?'}{records}"
-    others = "; ".join(f"{field} = {value:g} ({meant} would fit)" for _, field, value, meant in options)
-    return "unit of y or u", None, f"all channels differ by the same factor: {records} Otherwise check {others}"
-
-
-def _gained(within: Range, value: float, factor: float) -> float:
-    """Change of a value's distance from the middle of the usual range by a factor; negative if it decreases."""
-    return within.off_centre(value * factor) - within.off_centre(value)
-
-
-def _sensor_gain(name: str, factor: float, model: ResponseModel) -> tuple[str, object, str]:
-    k = model.sensors.names.index(name)
-    value = float(model.sensors.sensitivity[k])
-    return (
-        f"sensitivity of {name}",
-        value,
-        f"only {name} differs: did you mean {value * factor:g} {model.sensors.sensitivity_units[k]} (with "
-        "preamplifier), or is it recorded in a different unit from the others?",
-    )

@@ -60,23 +60,16 @@ def _noise(record: Record, size: np.ndarray) -> float | None:
 
 def compared(errors: Sequence[PredictionErrors]) -> str:
     """A remark on the errors of two models; empty for one model, or if the updated model is better."""
-    pairs = np.array(
-        [
-            (one.relative["y_baseline"], one.relative["y_updated"])
-            for one in errors
-            if {"y_baseline", "y_updated"} <= set(one.relative)
-        ]
-    )
+    names = ("y_baseline", "y_updated")
+    pairs = np.array([[one.relative[name] for name in names] for one in errors if set(names) <= set(one.relative)])
     if not len(pairs):
         return ""
     if np.array_equal(pairs[:, 0], pairs[:, 1]):
         return "both models give the same predictions: no named effect influences them"
     before, after = np.sqrt(np.mean(pairs**2, axis=0))
+    if after <= before:
+        return ""
     return (
-        (
-            f"the updated model has a larger error than the baseline ({100 * after:.3g} % instead of "
-            f"{100 * before:.3g} %): this campaign is from a different table, or from one without the named effects"
-        )
-        if after > before
-        else ""
+        f"the updated model has a larger error than the baseline ({100 * after:.3g} % instead of "
+        f"{100 * before:.3g} %): this campaign is from a different table, or from one without the named effects"
     )

@@ -37,9 +37,9 @@ from avis_ctrl.study.loops import LOOPS_TITLE, tuned_loops
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.random_plants import random_perturbations
-from avis_ctrl.study.requirements import check_loop, check_requirements
 from avis_ctrl.study.simulation import bare_loop, simulate_study, six_dof_check
 from avis_ctrl.study.skyhooks import classical_skyhook, tuned_skyhook
+from avis_ctrl.study.verdict import check_loop, check_requirements
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
@@ -151,18 +151,15 @@ def synthesise(
         def shown(row: Any) -> bool:
             """Called after each iteration; False stops it."""
             ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
+            reached = f"peak mu {row.mu_upper:.5g}, order {row.order}"
             # Numbered as in the report, where the initial controllers are rows of the same table.
             if row.kind in INITIAL:
+                progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): {reached}")
+            else:
                 progress(
-                    f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): peak mu {row.mu_upper:.5g}, "
-                    f"order {row.order}"
+                    f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, {reached}, "
+                    f"misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
                 )
-                return not ends
-            progress(
-                f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, "
-                f"peak mu {row.mu_upper:.5g}, order {row.order}, misfit of the D-scalings "
-                f"{100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
-            )
             return not ends
 
         with stop as enough:

@@ -19,7 +19,7 @@ from avis_ctrl.robust.mu_scan import refine_maxima
 from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.design_check import check_designs
 from avis_ctrl.simulation.discrete import digital_controller
-from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, lever_arms, rig_bank
+from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms, rig_bank
 from avis_ctrl.simulation.sampled_response import predict_transmissibility_6dof
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.companions import Companions, design_companions, until_stable
@@ -74,7 +74,7 @@ def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None
         K,
         tuple(design.keep),
         {},
-        sensor_bank(design, rig),
+        rig_bank(rig, design.loop.integrator_corner_Hz),
         floor_by_coordinate(design, rig, plant.floor),
         name="nominal",
         gravity=True,
@@ -149,24 +149,15 @@ def six_dof_check(
     )
 
 
-def sensor_bank(design: Design, rig: Rig) -> SensorBank:
-    """The rig's sensors, conditioned with the design's integrator."""
-    return rig_bank(rig, design.loop.integrator_corner_Hz)
-
-
 def floor_by_coordinate(design: Design, rig: Rig, spectrum: SpectrumModel) -> dict[str, SpectrumModel]:
     """Floor spectra: the site's level for each translation, and for each kept rotation at the edge."""
-    rms, (low, high) = spectrum.rms(*_band(design)), _band(design)
-    turning = spectrum.scaled_to_rms(rms / rig.edge_m, low, high)
+    low, high = design.floor.band_Hz
+    turning = spectrum.scaled_to_rms(spectrum.rms(low, high) / rig.edge_m, low, high)
     return {
         name: turning if name.startswith("phi") else spectrum
         for name in COORDINATES
         if name in design.keep or not name.startswith("phi")
     }
-
-
-def _band(design: Design) -> tuple[float, float]:
-    return design.floor.band_Hz[0], design.floor.band_Hz[1]
 
 
 def perturbed_loops(

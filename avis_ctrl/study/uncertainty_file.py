@@ -7,6 +7,7 @@ spread, follow from the design's coordinates, confidence and declared uncertaint
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,9 +15,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
 
 # An isolation table has a few dozen parameters; a file with many more does not describe a rig.
 MOST_PARAMETERS, MOST_POINTS = 500, 20_000
@@ -173,3 +176,62 @@ def read_uncertainty(path: str | Path) -> UncertaintyFile:
         # An inconsistent value is a whole section, too long for one line.
         value = None if isinstance(error.value, (dict, list)) else error.value
         raise InputError(error.expected, file=path, field=error.field or None, value=value) from None
+
+
+def uncertainty_content(
+    rig: Rig, information: Information, spreads: Sequence[FrfSpread], provenance: Mapping[str, Any] | None = None
+) -> UncertaintyFile:
+    """The content of the file.
+
+    Parameters
+    ----------
+    rig : identified. information : of the fit; the covariance also keeps parameters that are not the rig's.
+    spreads : for the sets of coordinates that designs may keep.
+    """
+    sigma, V = information.directions
+    kept = np.flatnonzero(information.determined)
+    values = information.values
+    parameters = [
+        ParameterSection(name=name, unit=unit, value=float(value), scale=float(scale))
+        for name, unit, value, scale in zip(
+            information.names, information.units, values, information.scale, strict=True
+        )
+    ]
+    directions = [DirectionSection(standard_deviation=float(sigma[k]), vector=V[:, k].tolist()) for k in kept]
+    return UncertaintyFile(
+        format="avis-uncertainty",
+        version=1,
+        rig=rig.name,
+        rig_sha256=rig_sha256(rig),
+        parameter=parameters,
+        covariance=information.covariance.tolist(),
+        direction=directions,
+        undetermined=len(values) - len(kept),
+        spread=[_spread_section(one.thinned()) for one in spreads],
+        provenance=dict(provenance or {}),
+    )
+
+
+def _spread_section(spread: FrfSpread) -> SpreadSection:
+    filter = IdentifiedSpread(2 * np.pi * spread.frequency_Hz, spread.usable(0.95))
+    shape = filter.shape
+    weight = WeightSection(
+        zeros=[[z.real, z.imag] for z in shape.zeros().tolist()],
+        poles=[[p.real, p.imag] for p in shape.poles().tolist()],
+        gain=shape.gain,
+        order=shape.order,
+        slack_dB=max(filter.slack_dB, 0.0),
+    )
+    return SpreadSection(
+        keep=list(spread.keep),
+        frequency_Hz=spread.frequency_Hz.tolist(),
+        measured=spread.measured.tolist(),
+        confidence=list(spread.confidences),
+        noise=spread.noise.tolist(),
+        weight=weight,
+    )
+
+
+def uncertainty_json(content: UncertaintyFile) -> str:
+    """The text of the file."""
+    return content.model_dump_json(indent=1) + "\n"

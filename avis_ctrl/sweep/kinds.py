@@ -6,8 +6,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from avis_ctrl.sweep.job import Job
 from avis_ctrl.sweep.points_file import PointsFile
+
+
+class Job(Protocol):
+    """A point with everything that its result depends on; it is pickled to other processes."""
+
+    @property
+    def inputs(self) -> str:
+        """Everything that the result depends on, as text."""
+
+    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Figures for the table, and further content of the point's file. Raises AvisError."""
 
 
 class Base(Protocol):

@@ -15,7 +15,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.plot.pareto import pareto_front, pareto_png
-from avis_ctrl.study.files import as_json
+from avis_ctrl.study.files import as_json, values_of
 from avis_ctrl.summary import html_table
 from avis_ctrl.sweep.run import Row, Sweep
 
@@ -71,32 +71,18 @@ def _number(row: Row, name: str) -> float:
 
 def _cells(sweep: Sweep, row: Row) -> list[Any]:
     keys, figures = columns(sweep)
-    return [
-        *(row.point.get(key) for key in keys),
-        *(row.figures.get(name) for name in figures),
-        row.seconds,
-        row.status,
-        row.message,
-        row.identity,
-    ]
-
-
-def _head(sweep: Sweep) -> list[str]:
-    keys, figures = columns(sweep)
-    return [*keys, *figures, "seconds", "status", "message", "identity"]
+    values = [*map(row.point.get, keys), *map(row.figures.get, figures)]
+    return [*values, row.seconds, row.status, row.message, row.identity]
 
 
 def _csv(sweep: Sweep) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(_head(sweep))
+    keys, figures = columns(sweep)
+    table.writerow([*keys, *figures, "seconds", "status", "message", "identity"])
     for row in sweep.rows:
-        table.writerow(
-            [
-                "" if cell is None else cell if isinstance(cell, str) else json.dumps(cell, default=str)
-                for cell in _cells(sweep, row)
-            ]
-        )
+        cells = ["" if cell is None else cell for cell in _cells(sweep, row)]
+        table.writerow([cell if isinstance(cell, str) else json.dumps(cell, default=str) for cell in cells])
     return text.getvalue()
 
 
@@ -105,10 +91,7 @@ def _dict(sweep: Sweep, front: list[int]) -> dict[str, Any]:
         {
             "identity": row.identity or None,
             "parameters": row.point,
-            "status": row.status,
-            "message": row.message,
-            "seconds": row.seconds,
-            "figures": row.figures,
+            **values_of(row, "status", "message", "seconds", "figures"),
         }
         for row in sweep.rows
     ]

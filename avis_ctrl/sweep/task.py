@@ -20,7 +20,7 @@ from avis_ctrl.errors import AvisError
 from avis_ctrl.files import write_whole
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.workers import alone
-from avis_ctrl.sweep.job import Job
+from avis_ctrl.sweep.kinds import Job
 
 FORMAT = "avis-sweep-point"
 # Status of results that are kept. A lost point (a process that died, a full disk or memory, a missing library) may

@@ -29,10 +29,10 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.formats.hdf5 import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_file import load_rig as read_rig
+from avis_ctrl.study.file_names import GAP_FILES
 from avis_ctrl.study.gap import GapFinding, GapOptions, find_gap, predict
 from avis_ctrl.study.gap_axis import write_axis_gap, write_axis_predictions
 from avis_ctrl.study.gap_files import read_gap, write_gap, write_gap_predictions
-from avis_ctrl.study.gap_names import GAP_FILES
 
 RIG = load_rig("avis")
 FREE = ("mass", "J1", "isolator1.k_z", "isolator2.c_x", "actuator.Az1", "sensor.Sz2")

@@ -20,8 +20,8 @@ from avis_ctrl.simulation.loop import flicker, simulate
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.design_file import design_from_table, read_study, study_of
 from avis_ctrl.study.plant import build_plant
-from avis_ctrl.study.requirements import check_loop
 from avis_ctrl.study.simulation import bare_loop
+from avis_ctrl.study.verdict import check_loop
 
 FILTER = Electronics(anti_alias_order=3, anti_alias_corner_Hz=200.0)
 OMEGA = 2 * np.pi * np.geomspace(0.1, 2000.0, 40)

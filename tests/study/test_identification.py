@@ -17,9 +17,9 @@ from avis_ctrl.measurement.frequency_response.local_polynomial import local_poly
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation import rehearse
 from avis_ctrl.study.design_file import design_from_table
+from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
 from avis_ctrl.study.identification_design import assumed_weights, design_start
-from avis_ctrl.study.identification_files import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification_output import read_identified, write_identification, write_predictions
 from avis_ctrl.study.plan_file import default_plan
 

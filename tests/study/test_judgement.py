@@ -29,9 +29,9 @@ from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.limits import best_found, limiting
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.random_plants import random_perturbations
-from avis_ctrl.study.requirements import check_requirements
 from avis_ctrl.study.runner import skyhook_limit
 from avis_ctrl.study.skyhooks import classical_skyhook
+from avis_ctrl.study.verdict import check_requirements
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"

@@ -24,8 +24,7 @@ from avis_ctrl.study.plant import build_plant, channels_gain
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import design_provenance
 from avis_ctrl.study.simulation import nominal_loop, with_delta
-from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
-from avis_ctrl.study.uncertainty_writer import uncertainty_content, uncertainty_json
+from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty, uncertainty_content, uncertainty_json
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 
 NAMES = ("mass", "J1", *(f"isolator{i}.{kind}_z" for i in (1, 2, 3, 4) for kind in "kc"), "sensor.Sz1")

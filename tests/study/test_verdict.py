@@ -12,8 +12,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import PlantCheck
 from avis_ctrl.study.design_result import DesignResult, Requirement, Simulated
-from avis_ctrl.study.requirements import check_loop
-from avis_ctrl.study.verdict import all_axes, first_sentence, refuse_unstable, requirement_rows
+from avis_ctrl.study.verdict import all_axes, check_loop, first_sentence, refuse_unstable, requirement_rows
 
 CULPRIT = Culprit("nominal", 1.00016, 0.99, 0.16, ("x", "phi_y"), "companions", ("x", "y"))
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from avis_ctrl.gap.axis.result import AxisGap
-from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.opening import named
 from avis_ctrl.report.identification.gates import figure_of
-from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, Table, document_of, table
+from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, document_of, listed, table
 from avis_ctrl.report.sections.provenance import provenance_table
 
 
@@ -32,21 +31,19 @@ def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Doc
 
 def _summary(gap: AxisGap) -> Section:
     first, *rest = gap.sentences
-    rows = [
-        (
-            wording.titled(one.name),
-            words.percent(one.nrmse),
-            "not computed" if one.chi2_per_dof is None else words.number(one.chi2_per_dof, 4),
-        )
-        for one in gap.stages
-    ]
     pieces: list[Piece] = [
         wording.verdict(f"Verdict: {gap.verdict}. {first}", gap.verdict),
-        table(
+        listed(
             "Error of each model on data that no fit has used, r.m.s., relative to the measured signal. Each row "
             "adds an effect to the model of the row above.",
-            ("model", "error", "chi-square / dof"),
-            rows,
+            gap.stages,
+            {
+                "model": lambda one: wording.titled(one.name),
+                "error": lambda one: words.percent(one.nrmse),
+                "chi-square / dof": lambda one: (
+                    "not computed" if one.chi2_per_dof is None else words.number(one.chi2_per_dof, 4)
+                ),
+            },
         ),
         figure_of("ladder", "The gap before and after each effect.", gap.pictures[:1], height=0.7),
     ]
@@ -58,54 +55,38 @@ def _summary(gap: AxisGap) -> Section:
 
 
 def _model(gap: AxisGap) -> Section:
-    pieces: list[Piece] = [
-        _values(
-            "Parameters of the updated model without its effects, with one standard deviation.",
-            {**gap.parameters, **gap.ratios},
-        )
-    ]
-    if gap.runners_up:
-        pieces.append(
-            table(
-                "What else was fitted in the place of an effect.",
-                ("effect", "in the place of", "probability"),
-                [
-                    (wording.titled(one.name), wording.titled(one.instead_of), wording.probability(one.probability))
-                    for one in gap.runners_up
-                ],
-                "llr",
-            )
-        )
-    return Section("The updated model", "model", tuple(pieces))
+    values = table(
+        "Parameters of the updated model without its effects, with one standard deviation.",
+        ("parameter", "value"),
+        [(name, wording.quantity(p)) for name, p in {**gap.parameters, **gap.ratios}.items()],
+    )
+    others = listed(
+        "What else was fitted in the place of an effect.",
+        gap.runners_up,
+        {
+            "effect": lambda one: wording.titled(one.name),
+            "in the place of": lambda one: wording.titled(one.instead_of),
+            "probability": lambda one: wording.probability(one.probability),
+        },
+        "llr",
+    )
+    return Section("The updated model", "model", (values, others) if gap.runners_up else (values,))
 
 
 def _remaining(gap: AxisGap) -> Section:
-    rows = [
-        (
-            f"{words.number(one['from_Hz'])} to {words.number(one['to_Hz'])} Hz",
-            str(one["output"]),
-            words.percent(one["share"]),
-        )
-        for one in gap.where
-    ]
-    return Section(
-        "What remains",
-        "remaining",
-        (
-            Paragraph(
-                f"The residual on held-out data is {words.percent(gap.stages[-1].nrmse)} of the signal, r.m.s.; "
-                f"its power beyond noise is {words.percent(gap.share_left)} of that of the base model."
-            ),
-            table(
-                "Where most of the residual lies, as a fraction of its power.",
-                ("band", "output", "fraction"),
-                rows,
-                "llr",
-            ),
-            figure_of("lines", "Residual of the base model and of the updated model.", gap.pictures[1:2]),
-        ),
+    residual = Paragraph(
+        f"The residual on held-out data is {words.percent(gap.stages[-1].nrmse)} of the signal, r.m.s.; "
+        f"its power beyond noise is {words.percent(gap.share_left)} of that of the base model."
     )
-
-
-def _values(caption: str, values: Mapping[str, Reported]) -> Table:
-    return table(caption, ("parameter", "value"), [(name, wording.quantity(p)) for name, p in values.items()])
+    where = listed(
+        "Where most of the residual lies, as a fraction of its power.",
+        gap.where,
+        {
+            "band": lambda one: f"{words.number(one['from_Hz'])} to {words.number(one['to_Hz'])} Hz",
+            "output": lambda one: str(one["output"]),
+            "fraction": lambda one: words.percent(one["share"]),
+        },
+        "llr",
+    )
+    lines = figure_of("lines", "Residual of the base model and of the updated model.", gap.pictures[1:2])
+    return Section("What remains", "remaining", (residual, where, lines))

@@ -8,7 +8,20 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, places, steps
+from avis_ctrl.report.figures import (
+    STYLES,
+    Axis,
+    Curve,
+    Figure,
+    Panel,
+    Style,
+    bars,
+    hertz,
+    level,
+    log_limits,
+    places,
+    steps,
+)
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.response_panels import difference, drives, magnitude
@@ -36,21 +49,13 @@ def before_after(found: GapFinding) -> Section:
 
 def spectrum(heat: HeatMap, named: bool) -> Figure:
     """Residual power over noise power by frequency: mean of all channels, and worst channel."""
-    edges = edges_of(heat)
+    edges, panels = edges_of(heat), []
     sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
-    panels = []
+    x, y = hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log")
     for title, reduce in (("Mean of all channels", _mean), ("Worst channel of each band", _worst)):
         curves = [Curve(*steps(edges, reduce(values)), label, style) for label, values, style in sides]
         curves.append(level(edges[0], edges[-1], 1.0, "noise alone", NOISE))
-        panels.append(
-            Panel(
-                hertz(float(edges[0]), float(edges[-1])),
-                Axis("residual / noise power [-]", "log"),
-                tuple(curves),
-                (),
-                title,
-            )
-        )
+        panels.append(Panel(x, y, tuple(curves), (), title))
     return Figure(
         "gap_spectrum",
         "The gap on held-out data: power of the residual relative to that of the "
@@ -86,19 +91,12 @@ def ladder(gap: Gap) -> Figure:
     noise = 100 * gap.noise_nrmse
     low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
     limits = float(10 ** np.floor(np.log10(low))), high
-    bars = Curve(
-        place,
-        np.where(np.isfinite(values) & (values > 0), values, np.nan),
-        "error of the model",
-        Style("#8fbbdc"),
-        line=False,
-        bars=0.6,
-    )
+    errors = bars(place, np.where(values > 0, values, np.nan), "error of the model", Style("#8fbbdc"), 0.6)
     lines = [level(-0.5, len(values) - 0.5, noise, "noise alone", STYLES["limit"])] if noise > 0 else []
     return Figure(
         "ladder",
         "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. Logarithmic scale.",
-        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), (bars, *lines)),),
+        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), (errors, *lines)),),
         height=0.7,
     )
 
@@ -109,14 +107,14 @@ def rung(name: str, k: int) -> str:
 
 
 def _stages(gap: Gap) -> Table:
-    rows = []
-    for k, one in enumerate(gap.stages):
-        over = one.nrmse / gap.noise_nrmse if gap.noise_nrmse > 0 else np.nan
-        rows.append(
-            (rung(one.name, k), words.percent(one.nrmse), words.number(over), words.number(one.chi2_per_dof, 4))
-        )
-    if np.isfinite(gap.noise_nrmse):
-        rows.append(("noise alone", words.percent(gap.noise_nrmse), "1", "1"))
+    noise = gap.noise_nrmse
+    over = [one.nrmse / noise if noise > 0 else np.nan for one in gap.stages]
+    rows = [
+        (rung(one.name, k), words.percent(one.nrmse), words.number(over[k]), words.number(one.chi2_per_dof, 4))
+        for k, one in enumerate(gap.stages)
+    ]
+    if np.isfinite(noise):
+        rows.append(("noise alone", words.percent(noise), "1", "1"))
     return table(
         "Each model is fitted to the same records; the figures are those of records or periods that no fit "
         f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from avis_ctrl.gap.result import Considered
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, table
+from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
 FIRST = 12
@@ -15,34 +16,30 @@ MOST = 4
 def candidates(found: GapFinding) -> Section:
     """Candidates that were fitted but not named, the most probable first."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
-    if not ranked:
-        return Section("Rejected candidates", "considered", (Paragraph(_none(found)),))
-    header = ("candidate", "chi-square / dof", "odds", "best size", "why it was not named")
-    rows = [
-        (
-            wording.candidate(one),
-            words.number(one.chi2_per_dof, 4),
-            wording.probability(one.probability),
-            wording.quantities(one.parameters, MOST) or "not stated",
-            one.reason,
-        )
-        for one in ranked
-    ]
-    pieces: list[Piece] = [
-        table(
-            "Candidates that were fitted together with all parameters of the rig, and the reason "
-            "for rejection. Chi-square is that of selected lines of the held-out records, dense "
-            "at the resonances, and differs from that of all lines.",
-            header,
-            rows[:FIRST],
-            "lrrll",
-        )
-    ]
-    if rows[FIRST:]:
-        pieces.append(
-            Fold(f"{len(rows) - FIRST} more candidates", (table("The others.", header, rows[FIRST:], "lrrll"),))
-        )
+    caption = (
+        "Candidates that were fitted together with all parameters of the rig, and the reason for rejection. Chi-square "
+        "is that of selected lines of the held-out records, dense at the resonances, and differs from that of all "
+        "lines."
+    )
+    pieces: list[Piece] = [_table(caption, ranked[:FIRST]) if ranked else Paragraph(_none(found))]
+    if others := ranked[FIRST:]:
+        pieces.append(Fold(f"{len(others)} more candidates", (_table("The others.", others),)))
     return Section("Rejected candidates", "considered", tuple(pieces))
+
+
+def _table(caption: str, some: list[Considered]) -> Table:
+    return listed(
+        caption,
+        some,
+        {
+            "candidate": wording.candidate,
+            "chi-square / dof": lambda one: words.number(one.chi2_per_dof, 4),
+            "odds": lambda one: wording.probability(one.probability),
+            "best size": lambda one: wording.quantities(one.parameters, MOST) or "not stated",
+            "why it was not named": lambda one: one.reason,
+        },
+        "lrrll",
+    )
 
 
 def _none(found: GapFinding) -> str:

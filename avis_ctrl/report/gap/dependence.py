@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, steps
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, markers, steps
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
 from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.gap import GapFinding
@@ -53,21 +53,13 @@ HOW = {
 def dependence(found: GapFinding) -> Section:
     """The residual of each record by level and by time, and the decomposition of the power of the outputs."""
     gap = found.gap
-    pieces: list[Piece] = []
-    if gap.records:
-        pieces.append(by_record(gap))
-    else:
-        pieces.append(Paragraph("The residual of single records was not computed.", "note"))
-    pieces.append(Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"))
-    pieces += (
-        coherence(gap.shares)
-        if gap.shares
-        else [
-            Paragraph(
-                "No fractions of power were computed: the driven records have too few lines for their inputs.", "note"
-            )
-        ]
-    )
+    no_records = Paragraph("The residual of single records was not computed.", "note")
+    no_shares = "No fractions of power were computed: the driven records have too few lines for their inputs."
+    pieces: list[Piece] = [
+        by_record(gap) if gap.records else no_records,
+        Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"),
+        *(coherence(gap.shares) if gap.shares else [Paragraph(no_shares, "note")]),
+    ]
     return Section("Level, time and coherence", "dependence", tuple(pieces))
 
 
@@ -99,13 +91,11 @@ def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> P
         for held, word in ((False, "fitted"), (True, "held out")):
             some = [one for one in gap.records if one.held_out == held]
             curves.append(
-                Curve(
+                markers(
                     np.array([of(one) for one in some]),
                     np.array([value(one) for one in some]),
                     f"{label}, {word}",
                     Style(style.colour),
-                    points=True,
-                    line=False,
                     hollow=not held,
                 )
             )
@@ -149,39 +139,27 @@ def _explained(one: PowerShares) -> str:
 def figure(one: PowerShares, name: str) -> Figure:
     """One panel per output, with fractions of its power on a logarithmic axis."""
     edges = np.asarray(one.bands_Hz, float)
-    positive = np.concatenate([np.ravel(v) for v in one.shares.values()])
-    positive = positive[np.isfinite(positive) & (positive > SETTINGS.least_drawn)]
+    drawn = {
+        key: np.where(np.isfinite(share) & (share > SETTINGS.least_drawn), share, np.nan)
+        for key, share in one.shares.items()
+    }
+    positive = np.concatenate([share[np.isfinite(share)] for share in drawn.values()])
     low = float(10 ** np.floor(np.log10(positive.min(initial=0.1))))
+    x, y = hertz(float(edges[0]), float(edges[-1])), Axis("fraction of the power [-]", "log", (low, 2.0))
     panels = []
     for k, output in enumerate(one.outputs):
-        curves = tuple(
-            Curve(*steps(edges, _drawn(one.shares[key][:, k])), label, style)
-            for key, (label, style) in LOOKS.items()
-            if key in one.shares
-        )
-        panels.append(
-            Panel(
-                hertz(float(edges[0]), float(edges[-1])),
-                Axis("fraction of the power [-]", "log", (low, 2.0)),
-                curves,
-                (),
-                output,
-            )
-        )
-    records = ", ".join(one.records)
+        looks = [(drawn[key][:, k], *look) for key, look in LOOKS.items() if key in drawn]
+        curves = tuple(Curve(*steps(edges, share), label, style) for share, label, style in looks)
+        panels.append(Panel(x, y, curves, (), output))
     return Figure(
         name,
         f"What accounts for the power of each output at {words.number(one.level_V)} V r.m.s. "
-        f"({one.excitation}, records {records}), by frequency; the fractions of a band add up to 1. A line "
-        "that ends is below what can be determined.",
+        f"({one.excitation}, records {', '.join(one.records)}), by frequency; the fractions of a band add up to 1. A "
+        "line that ends is below what can be determined.",
         tuple(panels),
         2,
         0.72,
     )
-
-
-def _drawn(share: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(share) & (share > SETTINGS.least_drawn), share, np.nan)
 
 
 def _whole(one: PowerShares) -> Table:

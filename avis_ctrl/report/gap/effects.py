@@ -40,17 +40,8 @@ def _sizes(gap: Gap) -> Table:
     for one in (*gap.effects, *gap.traces):
         for name, p in one.parameters.items():
             value, sigma = words.with_std(p.value, p.std)
-            known = np.isfinite(p.std) and p.std > 0
-            rows.append(
-                (
-                    one.name,
-                    one.location,
-                    name,
-                    value,
-                    f"± {sigma}" if known else "none",
-                    "" if p.unit == "1" else words.unit(p.unit),
-                )
-            )
+            spread = f"± {sigma}" if np.isfinite(p.std) and p.std > 0 else "none"
+            rows.append((one.name, one.location, name, value, spread, "" if p.unit == "1" else words.unit(p.unit)))
     return table(
         "Parameters of the named effects. Those of the table are fitted together with all parameters of the "
         "rig and all tolerances. Their standard deviation includes the noise and what no effect explains. "
@@ -106,44 +97,27 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
 
 def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
     """Parameters that no record determines individually."""
-    if not groups:
-        return []
     told = "; ".join(words.joined(list(group)) for group in groups)
-    return [
-        Paragraph(
-            f"No record can determine {told} individually, only in combination. Their individual values "
-            "follow from the combination and the rig file.",
-            "note",
-        )
-    ]
+    text = (
+        f"No record can determine {told} individually, only in combination. Their individual values follow from the "
+        "combination and the rig file."
+    )
+    return [Paragraph(text, "note")] if groups else []
 
 
 def _always(gap: Gap) -> list[Piece]:
     """Second-order terms of large rotations, which are part of every model and not an effect."""
-    own = [
-        (name, value)
-        for name, value in zip(gap.updated.names, gap.updated.values, strict=True)
-        if name.startswith(f"{LargeMotion.name}@")
-    ]
-    if not own:
-        return []
-    sigma = _deviations(gap)
-    told = []
-    for name, value in own:
-        size, spread = words.with_std(value, sigma.get(name, np.nan))
-        told.append(
-            f"{wording.titled(name.rpartition('.')[2])} {size} ± {spread}"
-            if name in sigma
-            else f"{wording.titled(name.rpartition('.')[2])} {words.number(value)}"
-        )
-    return [
-        Paragraph(
-            "Every model, with or without a named effect, also contains the second-order terms of large "
-            "rotations, which exist in every table. Their factors, 0 or 1 in theory, are fitted as well and "
-            f"are often poorly determined: {'; '.join(told)}.",
-            "note",
-        )
-    ]
+    sigma, told = _deviations(gap), []
+    for name, value in zip(gap.updated.names, gap.updated.values, strict=True):
+        if name.startswith(f"{LargeMotion.name}@"):
+            both = words.with_std(value, sigma[name]) if name in sigma else (words.number(value),)
+            told.append(f"{wording.titled(name.rpartition('.')[2])} {' ± '.join(both)}")
+    text = (
+        "Every model, with or without a named effect, also contains the second-order terms of large rotations, which "
+        "exist in every table. Their factors, 0 or 1 in theory, are fitted as well and are often poorly determined: "
+        f"{'; '.join(told)}."
+    )
+    return [Paragraph(text, "note")] if told else []
 
 
 def _deviations(gap: Gap) -> dict[str, float]:

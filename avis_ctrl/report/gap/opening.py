@@ -10,7 +10,7 @@ from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import ladder
 from avis_ctrl.report.gap.remaining import next_step
-from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
 # Maximum number of an effect's parameters in a row; the section on parameters lists all.
@@ -104,22 +104,18 @@ def _stage(name: str) -> str:
 
 def named(gap: Gap | AxisGap, remark: str) -> Table:
     """The named effects with their sizes, traces (very small effects) last. remark : on their probabilities."""
-    rows = [
-        (
-            f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}",
-            one.location,
-            wording.quantities(one.parameters, MOST),
-            words.percent(np.nan if one.share is None else one.share),
-            wording.probability(one.probability),
-            ", ".join(map(wording.titled, one.indistinguishable_from)) or "none",
-        )
-        for one in (*gap.effects, *gap.traces)
-    ]
-    return table(
+    return listed(
         "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
         "held-out data if only this effect is removed, divided by the residual power beyond noise of the "
         f"model without effects. Effects below 1 % are called traces.{remark}",
-        ("effect", "place", "size", "fraction of the gap", "probability", "indistinguishable from"),
-        rows,
+        [*gap.effects, *gap.traces],
+        {
+            "effect": lambda one: f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}",
+            "place": lambda one: one.location,
+            "size": lambda one: wording.quantities(one.parameters, MOST),
+            "fraction of the gap": lambda one: words.percent(np.nan if one.share is None else one.share),
+            "probability": lambda one: wording.probability(one.probability),
+            "indistinguishable from": lambda one: ", ".join(map(wording.titled, one.indistinguishable_from)) or "none",
+        },
         "lllrrl",
     )

@@ -11,7 +11,7 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import edges_of
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
 # The colour scale runs from half the noise power to at least ten times the noise power.
@@ -51,24 +51,21 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     known = known[np.isfinite(known) & (known > 0)]
     top = float(10 ** np.ceil(np.log10(max(LEAST_TOP, known.max(initial=LEAST_TOP))) - 1e-9))
     edges, n = edges_of(heat), len(heat.columns)
-    rows = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
-    sides = [("After re-identification", heat.before)] + ([("With the named effects", heat.after)] if named else [])
-    panels = tuple(
-        Panel(
-            hertz(float(edges[0]), float(edges[-1])),
-            rows,
-            (),
-            (),
-            title,
-            Heat(edges, np.asarray(values, float).T, "residual / noise power [-]", (LOWEST, top)),
-        )
-        for title, values in sides
-    )
+    x = hertz(float(edges[0]), float(edges[-1]))
+    y = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
+
+    def panel(title: str, values: np.ndarray) -> Panel:
+        z = np.asarray(values, float).T
+        return Panel(x, y, (), (), title, Heat(edges, z, "residual / noise power [-]", (LOWEST, top)))
+
+    panels = [panel("After re-identification", heat.before)]
+    if named:
+        panels.append(panel("With the named effects", heat.after))
     return Figure(
         "heat_map",
         "Power of the residual on held-out data relative to that of the measured noise, by "
         "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.",
-        panels,
+        tuple(panels),
         len(panels),
         max(0.75, min(2.4, 0.085 * n + 0.25)),
     )
@@ -79,19 +76,19 @@ def _short(name: str) -> str:
     return name if len(name) <= LETTERS else f"{name[: LETTERS - 1]}…"
 
 
-def table_of(listed: Sequence[Where], caption: str) -> Table:
+def table_of(places: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
-    rows = [(wording.place(one), words.percent(one.share), _stated(one.excess), _chance(one.p_value)) for one in listed]
-    return table(
+    return listed(
         f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
         "noise power. p-value: probability of such a residual by noise alone, family-wise over all places.",
-        ("place", "fraction", "over noise", "p-value"),
-        rows,
+        places,
+        {
+            "place": wording.place,
+            "fraction": lambda one: words.percent(one.share),
+            "over noise": lambda one: words.number(one.excess) if np.isfinite(one.excess) else "not stated",
+            "p-value": lambda one: _chance(one.p_value),
+        },
     )
-
-
-def _stated(value: float) -> str:
-    return words.number(value) if np.isfinite(value) else "not stated"
 
 
 def _chance(value: float) -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.identification.ekf_result import EkfResult, kinds
+from avis_ctrl.identification.ekf_result import EkfResult, Innovations, kinds
 from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style
-from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table, yes_or_no
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, level
+from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
 
@@ -111,36 +111,28 @@ def _table(found: Identification, result: EkfResult) -> Table:
 
 def _figure(found: Identification, result: EkfResult, title: str, index: list[int], number: int) -> Figure:
     information, curves = found.information, result.history
-    t = curves.time_s
+    t, panels = curves.time_s, []
     frame = (float(t[0]), float(max(t[-1], curves.boundaries_s[-1])))
-    panels = []
+    edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
     for k in index:
         name = result.names[k]
-        likely = float(information.values[information.names.index(name)])
+        place = information.names.index(name)
+        likely = float(information.values[place])
         # The wide band of the prior at the first point would hide the estimates.
         low = float(np.min(curves.lower[1:, k], initial=likely))
         high = float(np.max(curves.upper[1:, k], initial=likely))
         pad = 0.05 * (high - low) or 1.0
         ends = (low - pad, high + pad)
-        edges = [b for b in curves.boundaries_s if frame[0] < b < frame[1]]
-        x = np.array([v for b in edges for v in (b, b, np.nan)])
-        y = np.array([v for _ in edges for v in (*ends, np.nan)])
-        drawn = [
+        begun = np.array([(b, b, np.nan) for b in edges]).ravel(), np.array([(*ends, np.nan) for _ in edges]).ravel()
+        drawn = (
             Curve(t, curves.theta[:, k], "estimate", ESTIMATE),
-            Curve(np.array(frame), np.array([likely, likely]), "maximum likelihood", LIKELY),
-            Curve(x, y, "a record begins", RECORDS),
-        ]
-        band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
-        known = "" if information.known[information.names.index(name)] else " *"
-        panels.append(
-            Panel(
-                Axis("time in the records [s]", "linear", frame),
-                Axis(f"[{words.unit(result.units[k])}]", "linear", ends),
-                tuple(drawn),
-                (band,),
-                f"{name}{known}",
-            )
+            level(*frame, likely, "maximum likelihood", LIKELY),
+            Curve(*begun, "a record begins", RECORDS),
         )
+        band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
+        x = Axis("time in the records [s]", "linear", frame)
+        y = Axis(f"[{words.unit(result.units[k])}]", "linear", ends)
+        panels.append(Panel(x, y, drawn, (band,), name + ("" if information.known[place] else " *")))
     return Figure(
         f"kalman_{number}",
         f"{title}: the extended Kalman filter's estimate against time, as in "
@@ -160,26 +152,23 @@ def _names(found: Identification, result: EkfResult) -> list[str]:
 
 
 def _consistency(found: Identification, result: EkfResult) -> Table:
-    rows = []
-    for name, one in zip(_names(found, result), result.innovations, strict=True):
-        n_y = one.autocorrelation.shape[1]
-        low, high = (v / n_y for v in one.nis_interval)
-        rows.append(
-            (
-                name,
-                words.number(one.nis_per_output, 4),
-                f"{low:.4f} to {high:.4f}",
-                f"{words.number(100 * one.outside, 2)} %",
-                yes_or_no(one.consistent),
-            )
-        )
-    return table(
+    def expected(one: Innovations) -> str:
+        low, high = (v / one.autocorrelation.shape[1] for v in one.nis_interval)
+        return f"{low:.4f} to {high:.4f}"
+
+    return listed(
         "Innovations of the filter: mean normalised square per output, the interval that contains 99.9 % of "
         "such means for a consistent filter, and the fraction of autocorrelations outside the 95 % limits of "
         "white noise. If the innovations are larger than the filter's covariance predicts, its standard "
         "deviations are too small.",
-        ("record", "mean square", "expected", "beyond the bound", "consistent"),
-        rows,
+        list(zip(_names(found, result), result.innovations, strict=True)),
+        {
+            "record": lambda row: row[0],
+            "mean square": lambda row: words.number(row[1].nis_per_output, 4),
+            "expected": lambda row: expected(row[1]),
+            "beyond the bound": lambda row: f"{words.number(100 * row[1].outside, 2)} %",
+            "consistent": lambda row: yes_or_no(row[1].consistent),
+        },
         "lrrrc",
     )
 

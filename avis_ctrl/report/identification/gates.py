@@ -37,11 +37,8 @@ SETTINGS = GateFigureSettings()
 def gates(findings: Sequence[Finding]) -> Section:
     """Table of all findings, and their pictures."""
     if not findings:
-        return Section(
-            "Gates",
-            "gates",
-            (Paragraph("The gates (automatic checks of the data) need records in the time domain; there were none."),),
-        )
+        none = "The gates (automatic checks of the data) need records in the time domain; there were none."
+        return Section("Gates", "gates", (Paragraph(none),))
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
@@ -147,11 +144,9 @@ def _curve(series: Series, style: Style) -> Curve:
 
 def _line(limit: Limit, panel: Panel, style: Style) -> Curve:
     """A limit as a straight line across the data."""
-    if limit.axis == "x":
-        low, high = _span(panel, "y")
-        return Curve(np.array([limit.value, limit.value]), np.array([low, high]), limit.name, style)
-    low, high = _span(panel, "x")
-    return Curve(np.array([low, high]), np.array([limit.value, limit.value]), limit.name, style)
+    at, across = np.array([limit.value, limit.value]), np.array(_span(panel, "y" if limit.axis == "x" else "x"))
+    x, y = (at, across) if limit.axis == "x" else (across, at)
+    return Curve(x, y, limit.name, style)
 
 
 def _span(panel: Panel, which: str) -> tuple[float, float]:
@@ -164,18 +159,11 @@ def _span(panel: Panel, which: str) -> tuple[float, float]:
 
 def _framed(panel: Panel) -> Panel:
     """Ranges of the axes: a logarithmic x axis spans the data; on a linear one a few whole numbers become ticks."""
-    if panel.x.scale == "log":
-        low, high = _span(panel, "x")
-        return replace(panel, x=replace(panel.x, range=(low / 1.1, high * 1.1)), y=_with_range(panel))
-    if panel.x.ticks:
-        return replace(panel, y=_with_range(panel))
+    x, y = panel.x, replace(panel.y, range=log_range(panel)) if panel.y.scale == "log" else panel.y
     numbers = np.unique(np.concatenate([c.x for c in panel.curves] or [np.zeros(0)]))
-    if 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
-        return replace(
-            panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)), y=_with_range(panel)
-        )
-    return replace(panel, y=_with_range(panel))
-
-
-def _with_range(panel: Panel) -> Axis:
-    return replace(panel.y, range=log_range(panel)) if panel.y.scale == "log" else panel.y
+    if x.scale == "log":
+        low, high = _span(panel, "x")
+        x = replace(x, range=(low / 1.1, high * 1.1))
+    elif not x.ticks and 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
+        x = replace(x, ticks=tuple((float(v), f"{v:g}") for v in numbers))
+    return replace(panel, x=x, y=y)

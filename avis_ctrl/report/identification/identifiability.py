@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, level
+from avis_ctrl.report.figures import Axis, Figure, Panel, Style, level, log_limits, markers
 from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, table
 from avis_ctrl.study.identification import Identification
 
@@ -55,32 +55,22 @@ def _combinations(found: Identification) -> Table:
 
 def _directions(found: Identification) -> Figure:
     sigma = found.identifiability.information.directions[0]
-    n, known = len(sigma), np.isfinite(sigma)
-    place = np.arange(1, n + 1, dtype=float)
-    shown = np.where(known & (sigma < 1e6), sigma, np.nan)
-    lost = int(n - np.count_nonzero(np.isfinite(shown)))
-    top = max(10.0, 3 * float(np.nanmax(shown))) if np.isfinite(shown).any() else 10.0
-    bottom = float(np.nanmin(shown)) / 3 if np.isfinite(shown).any() else 1e-3
-    beyond = (
-        f" On {lost} more directions the data contain no information."
-        if lost > 1
-        else " On one more direction the data contain no information."
-        if lost
-        else ""
+    n = len(sigma)
+    shown = np.where(np.isfinite(sigma) & (sigma < 1e6), sigma, np.nan)
+    lost = int(np.count_nonzero(np.isnan(shown)))
+    bottom, top = log_limits(shown, 1 / 3, 3, (1e-3, 10.0))
+    beyond = {0: "", 1: " On one more direction the data contain no information."}.get(
+        lost, f" On {lost} more directions the data contain no information."
     )
     curves = (
-        Curve(place, shown, "relative standard deviation", Style("#0072b2"), points=True, line=False),
+        markers(np.arange(1, n + 1, dtype=float), shown, "relative standard deviation", Style("#0072b2")),
         level(0.5, n + 0.5, 1.0, "not determined above"),
     )
+    x = Axis("direction, by precision", "linear", (0.5, n + 0.5))
+    y = Axis("relative standard deviation [-]", "log", (bottom, max(10.0, top)))
     return Figure(
         "directions",
         "Relative standard deviations along the principal directions of the information "
         f"matrix, the most precise first.{beyond}",
-        (
-            Panel(
-                Axis("direction, by precision", "linear", (0.5, n + 0.5)),
-                Axis("relative standard deviation [-]", "log", (bottom, top)),
-                curves,
-            ),
-        ),
+        (Panel(x, y, curves),),
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.distortion_lines import Kind, distortion_levels
+from avis_ctrl.measurement.frequency_response.distortion_lines import DistortionLevels, Kind, distortion_levels
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.records import records, remarks
@@ -43,24 +45,11 @@ def _records(found: Identification, campaign: Campaign) -> Table:
 def distortion(campaign: Campaign) -> Table | None:
     """Even and odd distortion of the multisines with detection (unexcited) lines; None if there are none."""
     rows = []
-    for record in campaign.records:
-        if record.header.excitation != "multisine" or record.header.periods < 2:
-            continue
-        try:
-            levels = distortion_levels(campaign, record.header.name)
-        except InputError:  # every line is excited: no line to detect distortion on
-            continue
-        linear = levels.rms("excited")
-        cells = []
-        for kind in DISTORTIONS:
-            ratio = np.divide(levels.rms(kind), linear, out=np.zeros_like(linear), where=linear > 0)
-            worst = int(np.argmax(ratio))
-            cells.append(
-                f"{words.number(100 * ratio[worst], 2)} % ({levels.outputs[worst]})"
-                if ratio[worst] > 0
-                else "below the noise"
-            )
-        rows.append((record.header.name, *cells))
+    for h in (record.header for record in campaign.records):
+        if h.excitation == "multisine" and h.periods >= 2:
+            with suppress(InputError):  # every line is excited: no line to detect distortion on
+                levels = distortion_levels(campaign, h.name)
+                rows.append((h.name, *(_largest(levels, kind) for kind in DISTORTIONS)))
     if not rows:
         return None
     return table(
@@ -71,6 +60,15 @@ def distortion(campaign: Campaign) -> Table | None:
         ("record", "even", "odd"),
         rows,
         "lrr",
+    )
+
+
+def _largest(levels: DistortionLevels, kind: Kind) -> str:
+    linear = levels.rms("excited")
+    ratio = np.divide(levels.rms(kind), linear, out=np.zeros_like(linear), where=linear > 0)
+    worst = int(np.argmax(ratio))
+    return (
+        f"{words.number(100 * ratio[worst], 2)} % ({levels.outputs[worst]})" if ratio[worst] > 0 else "below the noise"
     )
 
 

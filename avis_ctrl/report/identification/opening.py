@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, markers
 from avis_ctrl.report.identification.validation import errors, modes
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
 from avis_ctrl.report.sections.tolerances import tolerances
@@ -32,16 +32,9 @@ def parameters(found: Identification) -> Section:
     """All parameters, changes of the values with tolerances, and what the standard deviations include."""
     fit = found.campaign_fit
     notes = [*([found.caution] if fit.tolerances else []), *fit.notes]
-    return Section(
-        "Parameters",
-        "parameters",
-        (
-            _parameters(found),
-            _changes(found),
-            *tolerances(fit.tolerances),
-            *(Paragraph(words.sentence(note), "note") for note in notes),
-        ),
-    )
+    said = (Paragraph(words.sentence(note), "note") for note in notes)
+    pieces = (_parameters(found), _changes(found), *tolerances(fit.tolerances), *said)
+    return Section("Parameters", "parameters", pieces)
 
 
 def _measured(found: Identification) -> Paragraph:
@@ -113,44 +106,23 @@ def _changes(found: Identification) -> Figure:
     information, start = found.information, found.campaign_fit.start.values
     size = np.where(start == 0, information.scale, np.abs(start))
     change = 100 * (information.values - start) / size
-    bars = 200 * information.standard_deviation / size
+    twice = 200 * information.standard_deviation / size
     known, n = information.known, len(start)
     place = np.arange(n, 0, -1.0)
-    curves = [
-        Curve(
-            change[known],
-            place[known],
-            "determined individually, ± 2 σ",
-            Style("#0072b2"),
-            points=True,
-            line=False,
-            error=bars[known],
-            along="x",
-        )
-    ]
+    alone, together = Style("#0072b2"), Style("#9a9a9a")
+    error = {"error": twice[known], "along": "x"}
+    curves = [markers(change[known], place[known], "determined individually, ± 2 σ", alone, **error)]
     if not known.all():
-        curves.append(
-            Curve(
-                change[~known],
-                place[~known],
-                f"{TOGETHER}: the nearest to the start",
-                Style("#9a9a9a"),
-                points=True,
-                line=False,
-            )
-        )
+        label = f"{TOGETHER}: the nearest to the start"
+        curves.append(markers(change[~known], place[~known], label, together))
     curves.append(Curve(np.zeros(2), np.array([0.3, n + 0.7]), "", STYLES["faint"]))
-    ticks = tuple((float(p), name) for p, name in zip(place, information.names, strict=True))
-    longest = float(np.max(bars[known])) if known.any() else np.nan
-    caption = (
-        f"Change of each parameter from its starting value. The longest bar (2 σ) is "
-        f"{words.number(longest, 2)} % of its starting value; bars shorter than a marker are hidden by it."
-        if known.any()
-        else "Change of each parameter from its starting value; none is determined individually."
-    )
-    return Figure(
-        "changes",
-        caption,
-        (Panel(Axis("change from the start [%]"), Axis("", "linear", (0.3, n + 0.7), ticks), tuple(curves)),),
-        height=max(0.5, 0.07 * n),
-    )
+    caption = "Change of each parameter from its starting value; none is determined individually."
+    if known.any():
+        longest = words.number(float(np.max(twice[known])), 2)
+        caption = (
+            f"Change of each parameter from its starting value. The longest bar (2 σ) is {longest} % of its starting "
+            "value; bars shorter than a marker are hidden by it."
+        )
+    names = Axis("", "linear", (0.3, n + 0.7), tuple(zip(place.tolist(), information.names, strict=True)))
+    panel = Panel(Axis("change from the start [%]"), names, tuple(curves))
+    return Figure("changes", caption, (panel,), height=max(0.5, 0.07 * n))

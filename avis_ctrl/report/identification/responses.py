@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.identification.overlays import ResponseOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_limits
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_limits, markers
 from avis_ctrl.report.pieces import Paragraph, Piece, Section
 from avis_ctrl.report.response_panels import (
     MEASURED,
@@ -33,16 +33,8 @@ def responses(found: Identification) -> Section:
     """Large figures of the strongest input of each output, and small ones of all pairs."""
     seen = found.validation.overlay
     if seen is None:
-        return Section(
-            "Frequency responses",
-            "responses",
-            (
-                Paragraph(
-                    "No measured frequency response can be shown; the notes of the section on validation state the "
-                    "reason."
-                ),
-            ),
-        )
+        why = "No measured frequency response can be shown; the notes of the section on validation state the reason."
+        return Section("Frequency responses", "responses", (Paragraph(why),))
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
     pieces: list[Piece] = [
@@ -93,18 +85,15 @@ def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     f, measured, model = seen.frequency_Hz, seen.measured[:, i, j], seen.model[:, i, j]
     base = np.unwrap(np.angle(model))
     # Phases are unwrapped relative to that of the identified model.
-    shown = {
-        name: np.rad2deg(base + np.angle(value / model))
-        for name, value in (("measured", measured), ("start", seen.start[:, i, j]))
-    }
+    shown, start = (np.rad2deg(base + np.angle(value / model)) for value in (measured, seen.start[:, i, j]))
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))
     keep = thin(len(f), MOST_POINTS)
     curves = (
-        Curve(f[keep], shown["measured"][keep], "measured", MEASURED, points=True, line=False),
+        markers(f[keep], shown[keep], "measured", MEASURED),
         Curve(f, np.rad2deg(base), "identified", MODEL),
-        Curve(f, shown["start"], "start", START),
+        Curve(f, start, "start", START),
     )
-    band = Band(f, shown["measured"] - s, shown["measured"] + s, "measured, ± 2 σ", SCATTER)
+    band = Band(f, shown - s, shown + s, "measured, ± 2 σ", SCATTER)
     return Panel(frequencies(seen), Axis("phase [°]"), curves, (band,), title(seen, i, j))
 
 
@@ -124,30 +113,23 @@ def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
 
 
 def _overview(seen: ResponseOverlay) -> Figure:
-    columns = drives(seen)
-    keep = thin(len(seen.frequency_Hz), MOST_SMALL)
-    f, n_y = seen.frequency_Hz[keep], len(seen.outputs)
+    columns, keep = drives(seen), thin(len(seen.frequency_Hz), MOST_SMALL)
+    f, last = seen.frequency_Hz[keep], len(seen.outputs) - 1
     size = np.abs(np.concatenate([seen.model[:, :, columns], seen.start[:, :, columns]]))
     limits = log_limits(size, 0.7, 1.5, quantile=0.02)
+    styles = {
+        "measured": (seen.measured, Style("#7a7a7a", "solid", 2.6)),
+        "identified": (seen.model, Style(MODEL.colour, "solid", 1.0)),
+        "start": (seen.start, Style(START.colour, "dash", 1.0)),
+    }
     panels = []
-    for i in range(n_y):
+    for i, output in enumerate(seen.outputs):
         for j in columns:
-            first, last = j == columns[0], i == n_y - 1
-            measured, start, model = (np.abs(G[keep, i, j]) for G in (seen.measured, seen.start, seen.model))
-            curves = (
-                Curve(f, measured, "measured", Style("#7a7a7a", "solid", 2.6)),
-                Curve(f, model, "identified", Style(MODEL.colour, "solid", 1.0)),
-                Curve(f, start, "start", Style(START.colour, "dash", 1.0)),
-            )
-            panels.append(
-                Panel(
-                    Axis("[Hz]" if last else "", "log", frequencies(seen).range, silent=not last),
-                    Axis(f"{seen.outputs[i]}" if first else "", "log", limits, silent=not first),
-                    curves,
-                    (),
-                    seen.inputs[j] if i == 0 else "",
-                )
-            )
+            left, foot = j == columns[0], i == last
+            curves = tuple(Curve(f, np.abs(G[keep, i, j]), label, style) for label, (G, style) in styles.items())
+            x = Axis("[Hz]" if foot else "", "log", frequencies(seen).range, silent=not foot)
+            y = Axis(output if left else "", "log", limits, silent=not left)
+            panels.append(Panel(x, y, curves, (), "" if i else seen.inputs[j]))
     return Figure(
         "overview",
         f"Magnitude of every pair on the same scales [{unit(seen, columns[0])}]: inputs from "

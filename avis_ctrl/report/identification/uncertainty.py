@@ -16,16 +16,11 @@ TITLE = "Uncertainty for design"
 def uncertainty(found: Identification, made: InDesign | None) -> Section:
     """Directions of the parameters, and the filter that covers the measured spread."""
     if made is None:
-        return Section(
-            TITLE,
-            "uncertainty",
-            (
-                Paragraph(
-                    "The uncertainty model for a controller design was not computed with this report; the covariance "
-                    "is in result.json."
-                ),
-            ),
+        missing = (
+            "The uncertainty model for a controller design was not computed with this report; the covariance is in "
+            "result.json."
         )
+        return Section(TITLE, "uncertainty", (Paragraph(missing),))
     kept = words.joined([words.axis(name) for name in made.spread.keep])
     count = len(made.directions)
     bounded = (
@@ -41,16 +36,8 @@ def uncertainty(found: Identification, made: InDesign | None) -> Section:
         "or if the design file states a larger uncertainty of the drives, the filter is increased accordingly."
     )
     left = words.number(100 * float(np.max(made.found.rest, initial=0.0)), 2)
+    rest = f"The remaining parameter uncertainty changes the response by at most {left} %; the filter covers it."
     rig = found.rig.parameters()
-    return Section(
-        TITLE,
-        "uncertainty",
-        (
-            Paragraph(text),
-            *directions(made, {name: p.value for name, p in rig.items()}, {name: p.unit for name, p in rig.items()}),
-            Paragraph(
-                f"The remaining parameter uncertainty changes the response by at most {left} %; the filter covers it."
-            ),
-            spread(made),
-        ),
-    )
+    nominal, units = {name: p.value for name, p in rig.items()}, {name: p.unit for name, p in rig.items()}
+    pieces = (Paragraph(text), *directions(made, nominal, units), Paragraph(rest), spread(made))
+    return Section(TITLE, "uncertainty", pieces)

@@ -7,8 +7,8 @@ import numpy as np
 from avis_ctrl.identification.validation import HeldOut
 from avis_ctrl.identification.whiteness import Correlation, Whiteness
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, log_limits, numbered, places
-from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, table, yes_or_no
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, bars, log_limits, markers, numbered, places
+from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.study.identification import Identification
 
 BEFORE, AFTER, FLOOR = Style("#e69f00"), Style("#0072b2"), Style("#7a7a7a")
@@ -23,21 +23,16 @@ def validation(found: Identification) -> Section:
     drawn = v.held_out[:MOST_DRAWN]
     for one in drawn:
         # The errors of the first record are in the summary.
-        pieces += [
-            _chi_square(one, v.outputs),
-            *([errors(one, v.outputs)] if one is not drawn[0] else []),
-            _nrms(one, v.outputs),
-        ]
+        bars_of_errors = [] if one is drawn[0] else [errors(one, v.outputs)]
+        pieces += [_chi_square(one, v.outputs), *bars_of_errors, _nrms(one, v.outputs)]
         if one.whiteness is not None:
-            pieces += [_whiteness(one.name, one.whiteness)]
+            pieces.append(_whiteness(one.name, one.whiteness))
     if len(v.held_out) > len(drawn):
-        pieces.append(
-            Paragraph(
-                f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records "
-                "and pieces; the table lists all.",
-                "note",
-            )
+        left_out = (
+            f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records and pieces; the table "
+            "lists all."
         )
+        pieces.append(Paragraph(left_out, "note"))
     if v.modes:
         pieces += _measured_modes(found)
     pieces.append(Bullets(tuple(dict.fromkeys(map(words.sentence, (*v.sentences[1:], *v.notes))))))
@@ -45,29 +40,22 @@ def validation(found: Identification) -> Section:
 
 
 def _records(found: Identification) -> Table:
-    rows = []
-    for one in found.validation.held_out:
-        low, high = one.chi2_interval
-        white = one.whiteness
-        rows.append(
-            (
-                one.name,
-                str(one.lines),
-                words.number(one.chi2_per_dof, 4),
-                f"{low:.4f} to {high:.4f}",
-                words.number(one.chi2_start, 4),
-                "none" if np.isnan(one.chi2_local) else words.number(one.chi2_local, 4),
-                yes_or_no(one.consistent),
-                "not tested" if white is None else yes_or_no(white.white),
-            )
-        )
     noise = "; ".join(dict.fromkeys(one.noise for one in found.validation.held_out))
-    return table(
+    return listed(
         "Chi-square per degree of freedom of the held-out data, with its 95 % interval for a residual that is "
         f'due only to noise and parameter uncertainty. Noise: {noise}. "Local noise" is the same chi-square '
         "with the noise covariance of a local polynomial model.",
-        ("record", "lines", "chi-square", "expected", "start model", "local noise", "consistent", "white"),
-        rows,
+        found.validation.held_out,
+        {
+            "record": lambda one: one.name,
+            "lines": lambda one: str(one.lines),
+            "chi-square": lambda one: words.number(one.chi2_per_dof, 4),
+            "expected": lambda one: "{:.4f} to {:.4f}".format(*one.chi2_interval),
+            "start model": lambda one: words.number(one.chi2_start, 4),
+            "local noise": lambda one: "none" if np.isnan(one.chi2_local) else words.number(one.chi2_local, 4),
+            "consistent": lambda one: yes_or_no(one.consistent),
+            "white": lambda one: "not tested" if one.whiteness is None else yes_or_no(one.whiteness.white),
+        },
         "lrrrrrcc",
     )
 
@@ -76,8 +64,8 @@ def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     x, axis = places(outputs, "output")
     low, high = one.output_chi2_interval.T
     curves = (
-        Curve(x, (low + high) / 2, "95 % interval", FLOOR, points=True, line=False, error=(high - low) / 2),
-        Curve(x, one.output_chi2_per_dof, "held-out data", AFTER, points=True, line=False),
+        markers(x, (low + high) / 2, "95 % interval", FLOOR, error=(high - low) / 2),
+        markers(x, one.output_chi2_per_dof, "held-out data", AFTER),
     )
     return Figure(
         f"chi_square_{one.name}",
@@ -93,7 +81,7 @@ def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     values = [100 * v for v in (one.nrms_start, one.nrms, one.nrms_floor)]
     labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
     curves = tuple(
-        Curve(x + 0.26 * (k - 1), v, label, style, line=False, bars=0.24)
+        bars(x + 0.26 * (k - 1), v, label, style, 0.24)
         for k, (v, label, style) in enumerate(zip(values, labels, styles, strict=True))
     )
     limits = log_limits(np.concatenate(values), 1 / 3, 2, (0.01, 100.0))
@@ -107,27 +95,25 @@ def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
 
 
 def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
-    def percent(values: np.ndarray | None, k: int) -> str:
-        return "none" if values is None else f"{words.number(100 * float(values[k]), 3)} %"
-
-    rows = [
-        (
-            name,
-            percent(one.nrms_start, k),
-            percent(one.nrms, k),
-            percent(one.nrms_floor, k),
-            percent(one.nrms_time_start, k),
-            percent(one.nrms_time, k),
-            percent(one.nrms_time_whole, k),
-        )
-        for k, name in enumerate(outputs)
-    ]
+    columns = {
+        "start": one.nrms_start,
+        "identified": one.nrms,
+        "noise alone": one.nrms_floor,
+        "in time, start": one.nrms_time_start,
+        "in time, identified": one.nrms_time,
+        "in time, no filter": one.nrms_time_whole,
+    }
+    shown = [len(outputs) * ["none"] if values is None else list(map(_percent, values)) for values in columns.values()]
     note = f" In time: {one.time_note}." if one.time_note else ""
     return table(
         f"Normalised r.m.s. errors of record {one.name}, on the spectral lines of the band and in time.{note}",
-        ("output", "start", "identified", "noise alone", "in time, start", "in time, identified", "in time, no filter"),
-        rows,
+        ("output", *columns),
+        list(zip(outputs, *shown, strict=True)),
     )
+
+
+def _percent(share: float) -> str:
+    return f"{words.number(100 * float(share), 3)} %"
 
 
 def _whiteness(name: str, white: Whiteness) -> Figure:
@@ -143,75 +129,56 @@ def _whiteness(name: str, white: Whiteness) -> Figure:
 
 
 def _correlation(one: Correlation) -> Panel:
-    outputs = list(dict.fromkeys(row.partition(" with ")[0] for row in one.rows))
-    of = np.array([outputs.index(row.partition(" with ")[0]) for row in one.rows])
-    curves = [
-        Curve(one.lags, one.value[of == k].max(axis=0), name, Style(numbered(k).colour, "solid", 1.0))
-        for k, name in enumerate(outputs)
-    ]
+    of = [row.partition(" with ")[0] for row in one.rows]
+    curves = []
+    for k, name in enumerate(dict.fromkeys(of)):
+        rows = [value for value, output in zip(one.value, of, strict=True) if output == name]
+        curves.append(Curve(one.lags, np.max(rows, axis=0), name, Style(numbered(k).colour, "solid", 1.0)))
     curves.append(Curve(one.lags, one.limit.max(axis=0), "limit", Style("#b3261e", "dash", 1.4)))
-    return Panel(
-        Axis(f"lag [{one.lag_unit}]"),
-        Axis("correlation [-]", "linear", (0.0, 1.15 * float(max(one.value.max(), one.limit.max())))),
-        tuple(curves),
-        (),
-        f"{one.what[:1].upper()}{one.what[1:]}",
-    )
+    y = Axis("correlation [-]", "linear", (0.0, 1.15 * float(max(one.value.max(), one.limit.max()))))
+    return Panel(Axis(f"lag [{one.lag_unit}]"), y, tuple(curves), (), f"{one.what[:1].upper()}{one.what[1:]}")
 
 
 def modes(found: Identification) -> Table:
     """Natural frequencies and damping of the start and of the identified model."""
-    rows = [
-        (
-            row.shape,
-            words.number(row.start_frequency_Hz, 4),
-            words.number(row.frequency_Hz, 4),
-            words.number(100 * row.start_damping),
-            words.number(100 * row.damping),
-        )
-        for row in found.validation.modes
-    ]
-    return table(
+    return listed(
         "Modes of the start and of the identified model. Shapes are given by the distribution of the kinetic energy.",
-        ("shape", "frequency, start [Hz]", "identified [Hz]", "damping ratio, start [%]", "identified [%]"),
-        rows,
+        found.validation.modes,
+        {
+            "shape": lambda row: row.shape,
+            "frequency, start [Hz]": lambda row: words.number(row.start_frequency_Hz, 4),
+            "identified [Hz]": lambda row: words.number(row.frequency_Hz, 4),
+            "damping ratio, start [%]": lambda row: words.number(100 * row.start_damping),
+            "identified [%]": lambda row: words.number(100 * row.damping),
+        },
     )
 
 
 def _measured_modes(found: Identification) -> list[Piece]:
     """Identified and measured modes with standard deviations."""
-    rows = found.validation.modes
-    frequency = [
-        (
-            r.shape,
-            _pair(r.frequency_Hz, r.frequency_std_Hz),
-            _pair(r.measured_frequency_Hz, r.measured_frequency_std_Hz),
-            _sigma(r.frequency_sigma),
-        )
-        for r in rows
-    ]
-    damping = [
-        (
-            r.shape,
-            _pair(100 * r.damping, 100 * r.damping_std),
-            _pair(100 * r.measured_damping, 100 * r.measured_damping_std),
-            _sigma(r.damping_sigma),
-        )
-        for r in rows
-    ]
-    return [
-        table(caption, ("shape", f"identified [{unit}]", f"measured [{unit}]", "difference [σ]"), several)
-        for caption, unit, several in (
-            (
-                "Natural frequencies of the identified model beside those measured in the held-out data without the "
-                "rig's equations, with one standard deviation. The difference is model minus measured, divided by "
-                "its standard deviation.",
-                "Hz",
-                frequency,
-            ),
-            ("Damping ratios in the same way.", "%", damping),
-        )
-    ]
+    frequencies = listed(
+        "Natural frequencies of the identified model beside those measured in the held-out data without the rig's "
+        "equations, with one standard deviation. The difference is model minus measured, divided by its standard "
+        "deviation.",
+        found.validation.modes,
+        {
+            "shape": lambda row: row.shape,
+            "identified [Hz]": lambda row: _pair(row.frequency_Hz, row.frequency_std_Hz),
+            "measured [Hz]": lambda row: _pair(row.measured_frequency_Hz, row.measured_frequency_std_Hz),
+            "difference [σ]": lambda row: _sigma(row.frequency_sigma),
+        },
+    )
+    dampings = listed(
+        "Damping ratios in the same way.",
+        found.validation.modes,
+        {
+            "shape": lambda row: row.shape,
+            "identified [%]": lambda row: _pair(100 * row.damping, 100 * row.damping_std),
+            "measured [%]": lambda row: _pair(100 * row.measured_damping, 100 * row.measured_damping_std),
+            "difference [σ]": lambda row: _sigma(row.damping_sigma),
+        },
+    )
+    return [frequencies, dampings]
 
 
 def _pair(value: float, sigma: float) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
-from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, table, yes_or_no
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
+from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.summary import digits_apart
 
@@ -67,46 +67,37 @@ def certificate(result: DesignResult) -> Paragraph:
 
 def _figure(name: str, result: DesignResult, bound_of: BoundOf, label: str, what: str, meaning: str) -> Figure:
     curves = []
-    for c in result.controllers:
-        if c.name == "passive":
-            continue
+    for c in sorted(result.controllers, key=lambda c: c.name == "passive"):
         b, style = bound_of(c), controller_style(c.name)
         order = np.argsort(b.frequencies)
         f = b.frequencies[order] / (2 * np.pi)
         curves.append(Curve(f, b.upper_curve[order], c.title, style))
-        curves.append(Curve(f, b.lower_curve[order], "", Style(style.colour, "dot", 0.9)))
-    passive = bound_of(result.controller("passive"))
-    order = np.argsort(passive.frequencies)
-    curves.append(
-        Curve(passive.frequencies[order] / (2 * np.pi), passive.upper_curve[order], "passive", STYLES["passive"])
-    )
+        if c.name != "passive":
+            curves.append(Curve(f, b.lower_curve[order], "", Style(style.colour, "dot", 0.9)))
     curves.append(level(0.01, 1000.0, 1.0, "mu = 1"))
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
-    top = min(max(finite) * 1.3, 30.0)
-    panel = Panel(hertz(0.01, 500.0), Axis(label, "log", (0.05, top)), tuple(curves))
+    y = Axis(label, "log", (0.05, min(max(finite) * 1.3, 30.0)))
+    panel = Panel(hertz(0.01, 500.0), y, tuple(curves))
     return Figure(name, f"Upper bounds (thick) and lower bounds (thin, dotted) of {what}. {meaning}", (panel,))
 
 
 def _stability(result: DesignResult) -> Table:
-    rows = []
-    for c in result.controllers:
-        b = c.stability
-        margin = words.number(1 / b.upper) if c.stable and np.isfinite(b.upper) and b.upper > 0 else "none"
-        rows.append(
-            (
-                c.title,
-                words.bound(b.upper, 4),
-                words.bound(b.lower, 4),
-                words.hertz(b.omega),
-                margin,
-                stable_for_the_set(c),
-            )
-        )
-    return table(
+    def margin(c: ControllerResult) -> str:
+        upper = c.stability.upper
+        return words.number(1 / upper) if c.stable and np.isfinite(upper) and upper > 0 else "none"
+
+    return listed(
         "Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
         "upper bound of mu reaches 1.",
-        ("controller", "mu upper", "mu lower", "peak at", "margin", "stable for the set"),
-        rows,
+        result.controllers,
+        {
+            "controller": lambda c: c.title,
+            "mu upper": lambda c: words.bound(c.stability.upper, 4),
+            "mu lower": lambda c: words.bound(c.stability.lower, 4),
+            "peak at": lambda c: words.hertz(c.stability.omega),
+            "margin": margin,
+            "stable for the set": stable_for_the_set,
+        },
         "lrrrrc",
     )
 
@@ -119,23 +110,21 @@ def stable_for_the_set(c: ControllerResult) -> Mark:
 
 
 def _worst(result: DesignResult) -> Table:
-    rows = []
-    for name in ("mu", "skyhook", "loops", "hinf"):
-        c = next((one for one in result.controllers if one.name == name), None)
-        if c is None:
-            continue
-        for what, b, gain in (
-            ("mu of the weighted performance", c.mu, False),
-            ("stability", c.stability, False),
-            ("peak transmissibility", c.worst_peak, True),
-        ):
-            value = words.decibel(b.lower) if gain else words.bound(b.lower, 4)
-            rows.append((f"{c.title}: {what}", value, words.hertz(b.omega), "; ".join(b.words) or "none was found"))
+    tuned = [c for name in ("mu", "skyhook", "loops", "hinf") for c in result.controllers if c.name == name]
+    cases = [
+        case
+        for c in tuned
+        for case in (
+            (f"{c.title}: mu of the weighted performance", c.mu, words.bound(c.mu.lower, 4)),
+            (f"{c.title}: stability", c.stability, words.bound(c.stability.lower, 4)),
+            (f"{c.title}: peak transmissibility", c.worst_peak, words.decibel(c.worst_peak.lower)),
+        )
+    ]
     return table(
         "The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
         "perturbations of mu have the size 1/mu: if mu is below 1, they are larger than the declared uncertainty. "
         "Those of the transmissibility are within it.",
         ("worst case of", "reaches", "at", "perturbation"),
-        rows,
+        [(what, value, words.hertz(b.omega), "; ".join(b.words) or "none was found") for what, b, value in cases],
         "lrrl",
     )

@@ -10,7 +10,7 @@ from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, numbered
-from avis_ctrl.report.pieces import Piece, Section, Table, table
+from avis_ctrl.report.pieces import Piece, Section, Table, listed
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 HZ = np.geomspace(0.01, 500.0, 500)
@@ -49,35 +49,22 @@ def _system(c: ControllerResult) -> StateSpace:
 
 def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
     rate = result.rig.sample_rate_Hz
-    rows = [
-        (
-            c.title,
-            f"controllers/{c.name}.json",
-            str(c.order),
-            f"{words.number(c.fastest_pole_Hz)} Hz",
-            words.number(2 * c.fastest_pole_Hz / rate),
-            words.yes(_system(c).is_stable()),
-            f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
-            _offset(c.rest.percent) if c.rest else "",
-        )
-        for c in made
-    ]
-    return table(
+    return listed(
         f"The controllers and their state-space files. The fastest pole is compared with half the sample "
         f"rate of {words.number(rate, 4)} Hz. The gain at zero frequency converts offsets of the sensor "
         "electronics into drive voltage. The last column is the fraction of a drive's range that the largest "
         "offsets of the rig file use up, each with its worst-case sign.",
-        (
-            "controller",
-            "file",
-            "order",
-            "fastest pole",
-            "relative to half the rate",
-            "stable itself",
-            "gain at rest",
-            "offset needs",
-        ),
-        rows,
+        made,
+        {
+            "controller": lambda c: c.title,
+            "file": lambda c: f"controllers/{c.name}.json",
+            "order": lambda c: str(c.order),
+            "fastest pole": lambda c: f"{words.number(c.fastest_pole_Hz)} Hz",
+            "relative to half the rate": lambda c: words.number(2 * c.fastest_pole_Hz / rate),
+            "stable itself": lambda c: words.yes(_system(c).is_stable()),
+            "gain at rest": lambda c: f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
+            "offset needs": lambda c: _offset(c.rest.percent) if c.rest else "",
+        },
         "llrrrcrr",
     )
 
@@ -166,21 +153,16 @@ def _above(curves: list[Curve], least: float) -> float:
 
 
 def _poles(mu: ControllerResult) -> Table:
-    poles = _system(mu).poles()
-    shown = sorted((p for p in poles if p.imag >= 0), key=abs)
-    rows = []
-    for p in shown[: SETTINGS.poles]:
-        kind = "pair" if p.imag > 0 else "real"
-        damping = -p.real / abs(p) if abs(p) > 0 else 1.0
-        rows.append((f"{words.number(abs(p) / (2 * np.pi), 4)} Hz", words.number(damping), kind))
-    left = (
-        f" The fastest {len(shown) - SETTINGS.poles} are listed only in the file."
-        if len(shown) > SETTINGS.poles
-        else ""
-    )
-    return table(
+    poles = sorted((p for p in _system(mu).poles() if p.imag >= 0), key=abs)
+    beyond = len(poles) - SETTINGS.poles
+    left = f" The fastest {beyond} are listed only in the file." if beyond > 0 else ""
+    return listed(
         f"Poles of the mu controller, slowest first; a pair counts once.{left}",
-        ("frequency", "damping ratio", "kind"),
-        rows,
+        poles[: SETTINGS.poles],
+        {
+            "frequency": lambda p: f"{words.number(abs(p) / (2 * np.pi), 4)} Hz",
+            "damping ratio": lambda p: words.number(-p.real / abs(p) if abs(p) > 0 else 1.0),
+            "kind": lambda p: "pair" if p.imag > 0 else "real",
+        },
         "rrl",
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, markers
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identified_uncertainty import JUDGED_HZ, InDesign
@@ -97,29 +97,13 @@ def spread(found: InDesign) -> Figure:
     s, weight = found.spread, found.weight
     f = np.geomspace(min(JUDGED_HZ[0], s.frequency_Hz[0]), max(JUDGED_HZ[-1], s.frequency_Hz[-1]), 400)
     omega = 2 * np.pi * f
+    noise, covering = 100 * (s.bound(found.confidence) - s.measured), 100 * weight.shape.magnitude(omega)
     curves = (
-        Curve(
-            s.frequency_Hz,
-            100 * s.measured,
-            "measured minus model, with noise",
-            Style("#0072b2"),
-            points=True,
-            line=False,
-        ),
-        Curve(
-            s.frequency_Hz,
-            100 * (s.bound(found.confidence) - s.measured),
-            "noise of the measurement",
-            Style("#7a7a7a", "dot", 1.4),
-        ),
+        markers(s.frequency_Hz, 100 * s.measured, "measured minus model, with noise", Style("#0072b2")),
+        Curve(s.frequency_Hz, noise, "noise of the measurement", Style("#7a7a7a", "dot", 1.4)),
         Curve(weight.omega / (2 * np.pi), 100 * weight.data, "bound to be covered", Style("#d55e00", "dash", 1.5)),
         Curve(f, 100 * weight.envelope(omega), "envelope", Style("#e69f00", "dashdot", 1.3)),
-        Curve(
-            f,
-            100 * weight.shape.magnitude(omega),
-            f"filter of order {weight.shape.order}",
-            Style("#222222", "solid", 2.0),
-        ),
+        Curve(f, covering, f"filter of order {weight.shape.order}", Style("#222222", "solid", 2.0)),
     )
     return Figure(
         "spread",

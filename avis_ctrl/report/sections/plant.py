@@ -50,18 +50,9 @@ def generalized_plant(result: DesignResult) -> Section:
         f"{words.joined([words.axis(a) for a in plant.axes])}."
     )
     meanings = Bullets(tuple(f"{n}: {w.meaning}" for n, w in plant.weights.items()))
-    pieces: list[Piece] = [
-        summary,
-        drawing,
-        _signals(plant),
-        Heading("Uncertainty"),
-        _blocks(result),
-        *identified(result),
-        Heading("Weights"),
-        meanings,
-        _transmissibility_weight(result),
-        _effort(result),
-    ]
+    pieces: list[Piece] = [summary, drawing, _signals(plant)]
+    pieces += [Heading("Uncertainty"), _blocks(result), *identified(result)]
+    pieces += [Heading("Weights"), meanings, _transmissibility_weight(result), _effort(result)]
     pieces += [*_chains(plant), _noise(result), *_compliance(result)]
     return Section("Generalized plant", "plant", tuple(pieces))
 
@@ -144,18 +135,15 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
 
 
 def _effort(result: DesignResult) -> Figure:
-    plant = result.plant
-    omega = 2 * np.pi * HZ
-    curves = []
+    plant, omega, curves = result.plant, 2 * np.pi * HZ, []
     for k, axis in enumerate(plant.axes):
-        weight = plant.effort_weight(axis)
-        if EFFORT not in plant.weights:
-            curves.append(Curve(HZ, weight.bound(omega), f"1/|W_u|, allowed, {words.axis(axis)}", STYLES["limit"]))
-        elif not k:
-            curves.append(Curve(HZ, weight.bound(omega), "1/|W_u|, allowed", STYLES["limit"]))
+        weight, shown = plant.effort_weight(axis), words.axis(axis)
+        if EFFORT not in plant.weights or not k:  # one limit for all axes is drawn once
+            of = "" if EFFORT in plant.weights else f", {shown}"
+            curves.append(Curve(HZ, weight.bound(omega), f"1/|W_u|, allowed{of}", STYLES["limit"]))
         closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
-        curves.append(Curve(HZ, gain, f"mu synthesis, {words.axis(axis)}", numbered(k)))
+        curves.append(Curve(HZ, gain, f"mu synthesis, {shown}", numbered(k)))
     return Figure(
         "weight_effort",
         "Control effort: voltage of the drive that saturates first when a force acts along "

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, numbered
-from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, listed, table
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.instruments import Sensor
 from avis_ctrl.rigs.rig import Parameter, Rig
@@ -37,15 +38,8 @@ def rig(result: DesignResult) -> Section:
         rig_drawing(one),
         f"Top view and side view of the rig {one.name}",
     )
-    pieces: list[Piece] = [
-        drawing,
-        *_parameters(one),
-        _modes(one),
-        _drives(one),
-        _sensors(one),
-        _electronics(result),
-        *_reduction(result),
-    ]
+    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _drives(one), _sensors(one)]
+    pieces += [_electronics(result), *_reduction(result)]
     return Section("The rig", "rig", tuple(pieces))
 
 
@@ -115,68 +109,62 @@ def _modes(one: Rig) -> Table:
 
 def _drives(one: Rig) -> Table:
     actuators = one.mounted_body().actuators
-    rows = [
-        (
-            a.name,
-            *_placed(a.position, a.direction),
-            f"{words.number(a.constant_N_per_V)} N/V",
-            f"±{words.number(limit)} V",
-            f"±{words.number(a.constant_N_per_V * limit)} N",
-        )
-        for a, limit in zip(actuators, one.limits_of([a.name for a in actuators]).tolist(), strict=True)
-    ]
-    return table(
+    limits = one.limits_of([a.name for a in actuators]).tolist()
+    return listed(
         "Drives: position relative to the geometric centre, direction of the force on the payload for a "
         "positive voltage.",
-        ("name", "x, y, z [m]", "direction", "force constant", "limit", "largest force"),
-        rows,
+        list(zip(actuators, limits, strict=True)),
+        {
+            "name": lambda row: row[0].name,
+            "x, y, z [m]": lambda row: _position(row[0].position),
+            "direction": lambda row: _direction(row[0].direction),
+            "force constant": lambda row: f"{words.number(row[0].constant_N_per_V)} N/V",
+            "limit": lambda row: f"±{words.number(row[1])} V",
+            "largest force": lambda row: f"±{words.number(row[0].constant_N_per_V * row[1])} N",
+        },
         "lllrrr",
     )
 
 
 def _sensors(one: Rig) -> Table:
-    rows = []
-    for s in one.sensors():
-        kind, gain, scale, unit = _KINDS[s.quantity]
-        row = (
-            s.name,
-            kind,
-            *_placed(np.array(s.position), np.array(s.direction)),
-            f"{_value(s.gain)} {gain}",
-            _corner(s),
-            f"{words.number(1e3 * s.noise_rms_V)} mV",
-        )
-        full = (f"±{words.number(scale * one.converter.range_V / s.gain)} {unit}",) if one.converter else ()
-        rows.append((*row, *full))
-    header = (
-        "name",
-        "kind",
-        "x, y, z [m]",
-        "direction",
-        "gain",
-        "corner",
-        "noise",
-        *(("limit",) if one.converter else ()),
-    )
-    return table(
+    columns: dict[str, Callable[[Sensor], str]] = {
+        "name": lambda s: s.name,
+        "kind": lambda s: _KINDS[s.quantity][0],
+        "x, y, z [m]": lambda s: _position(np.array(s.position)),
+        "direction": lambda s: _direction(np.array(s.direction)),
+        "gain": lambda s: f"{_value(s.gain)} {_KINDS[s.quantity][1]}",
+        "corner": _corner,
+        "noise": lambda s: f"{words.number(1e3 * s.noise_rms_V)} mV",
+    }
+    if (converter := one.converter) is not None:
+
+        def limit(s: Sensor) -> str:
+            *_, scale, unit = _KINDS[s.quantity]
+            return f"±{words.number(scale * converter.range_V / s.gain)} {unit}"
+
+        columns["limit"] = limit
+    beyond = ", motion at the converter's limit" if converter is not None else ""
+    return listed(
         "Sensors on the payload: position relative to the geometric centre, direction of the motion that "
         "gives a positive voltage, gain in the passband with preamplifier, corner with the damping ratio in "
-        "brackets, r.m.s. of white noise per sample"
-        + (", motion at the converter's limit" if one.converter else "")
-        + ". Position sensors, if any, "
-        "measure relative to the chassis.",
-        header,
-        rows,
+        f"brackets, r.m.s. of white noise per sample{beyond}. "
+        "Position sensors, if any, measure relative to the chassis.",
+        one.sensors(),
+        columns,
         "llllrlrr",
     )
 
 
-def _placed(position: np.ndarray, direction: np.ndarray) -> tuple[str, str]:
-    """Position and direction as text; a direction along an axis is named after the axis."""
+def _position(position: np.ndarray) -> str:
+    return ", ".join(map(_value, position))
+
+
+def _direction(direction: np.ndarray) -> str:
+    """A direction along an axis is named after the axis."""
     along = int(np.argmax(np.abs(direction)))
-    axis = ("−" if direction[along] < 0 else "+") + "xyz"[along]
-    skewed = abs(direction[along]) < 1 - 1e-9
-    return ", ".join(map(_value, position)), ", ".join(words.number(d) for d in direction) if skewed else axis
+    if abs(direction[along]) < 1 - 1e-9:
+        return ", ".join(map(words.number, direction))
+    return ("−" if direction[along] < 0 else "+") + "xyz"[along]
 
 
 def _corner(s: Sensor) -> str:
@@ -211,21 +199,8 @@ def _electronics(result: DesignResult) -> Table:
 def _reduction(result: DesignResult) -> list[Piece]:
     error = result.reduction
     if not error.left_out.size:
-        return [
-            Heading("Design model"),
-            Paragraph(
-                "The controller is designed on a model with all six degrees of freedom; no coordinate is locked."
-            ),
-        ]
-    rows = [
-        (
-            words.axis(out),
-            name,
-            words.quantity(error.max_dB[out, name], "dB"),
-            words.quantity(error.rms_dB[out, name], "dB"),
-        )
-        for out, name in error.max_dB
-    ]
+        told = "The controller is designed on a model with all six degrees of freedom; no coordinate is locked."
+        return [Heading("Design model"), Paragraph(told)]
     kept = words.joined(list(error.keep))
     text = (
         f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
@@ -237,11 +212,16 @@ def _reduction(result: DesignResult) -> list[Piece]:
     return [
         Heading("Error of the design model"),
         Paragraph(text),
-        table(
+        listed(
             "Difference between the design model and six degrees of freedom, relative to the largest gain, over "
             "0.1 to 100 Hz.",
-            ("output", "input", "largest", "r.m.s."),
-            rows,
+            list(error.max_dB),
+            {
+                "output": lambda channel: words.axis(channel[0]),
+                "input": lambda channel: channel[1],
+                "largest": lambda channel: words.quantity(error.max_dB[channel], "dB"),
+                "r.m.s.": lambda channel: words.quantity(error.rms_dB[channel], "dB"),
+            },
             "llrr",
         ),
         _compared(error),
@@ -260,37 +240,24 @@ def _largest(error: ReductionError) -> str:
 
 
 def _compared(error: ReductionError) -> Figure:
-    f = error.omega / (2 * np.pi)
-    curves = []
+    f, curves, apart = error.omega / (2 * np.pi), [], []
     for k, name in enumerate(error.keep):
         colour = numbered(k).colour
         curves += [
             Curve(f, in_dB(error.full[:, k, k]), f"{name}, six degrees of freedom", Style(colour, "solid", 2.2)),
             Curve(f, in_dB(error.reduced[:, k, k]), f"{name}, design model", Style("#111111", "dot", 1.6)),
         ]
+        apart.append(Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(colour, "dash", 1.4)))
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
     curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
-    panel = Panel(
-        hertz(),
-        Axis("gain [dB]", "linear", (-80.0, 40.0)),
-        tuple(curves),
-        title="transmissibility along each kept axis",
-    )
-    apart = [
-        Curve(f, in_dB(error.relative[:, k, k]), f"{name}, difference", Style(numbered(k).colour, "dash", 1.4))
-        for k, name in enumerate(error.keep)
-    ]
-    lower = Panel(
-        hertz(),
-        Axis("difference [dB]", "linear", (-140.0, 20.0)),
-        tuple(apart),
-        title="difference, relative to the largest gain",
-    )
+    gain, difference = Axis("gain [dB]", "linear", (-80.0, 40.0)), Axis("difference [dB]", "linear", (-140.0, 20.0))
+    upper = Panel(hertz(), gain, tuple(curves), title="transmissibility along each kept axis")
+    lower = Panel(hertz(), difference, tuple(apart), title="difference, relative to the largest gain")
     return Figure(
         "reduction",
         "Transmissibility without control, floor to payload along each kept axis: six degrees "
         "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
         "the floor's other axes. Beside it, their difference.",
-        (panel, lower),
+        (upper, lower),
         2,
     )

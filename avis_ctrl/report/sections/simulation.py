@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, hertz
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, table, yes_or_no
+from avis_ctrl.report.figures import PALETTE, STYLES, Axis, Curve, Figure, Panel, Style, hertz, markers
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, listed, table, yes_or_no
 from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
 from avis_ctrl.study.companions import Companions
@@ -41,26 +41,24 @@ def _plants(check: SimulationCheck) -> Table:
     loop = check.first.loop
     limits = dict(zip(loop.rig.equations_of_motion().actuators, loop.limits_V.tolist(), strict=True))
     differ = len(set(limits.values())) > 1
-    rows = [
-        (
-            p.name,
-            Mark("pass", True) if p.passed else Mark("FAIL", False),
-            Mark("diverged", False) if p.diverged else yes_or_no(p.stable),
-            _agreement(p),
-            f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
-            str(p.clipped_dac + p.clipped_adc),
-            ", ".join(f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()),
-        )
-        for p in check.plants
-    ]
     nearest = "of the drive that comes closest to its limit;" if differ else "limit"
-    return table(
+    return listed(
         f"Every simulated plant. Commanded voltages, {nearest} {words.limits(limits)}; clipped samples of "
         "drives and converter together. The velocity contains all frequencies up to "
         f"{words.number(loop.rig.sample_rate_Hz / 2)} Hz, unlike the comparison of controllers, which is for the band "
         "of the floor only.",
-        ("plant", "verdict", "stable", "bands that agree", "peak voltage", "clipped", "velocity r.m.s. [µm/s]"),
-        rows,
+        check.plants,
+        {
+            "plant": lambda p: p.name,
+            "verdict": lambda p: Mark("pass", True) if p.passed else Mark("FAIL", False),
+            "stable": lambda p: Mark("diverged", False) if p.diverged else yes_or_no(p.stable),
+            "bands that agree": _agreement,
+            "peak voltage": lambda p: f"{words.number(p.peak_V)}{f' of {words.number(p.limit_V)}' if differ else ''} V",
+            "clipped": lambda p: str(p.clipped_dac + p.clipped_adc),
+            "velocity r.m.s. [µm/s]": lambda p: ", ".join(
+                f"{words.axis(a)} {words.number(1e6 * v)}" for a, v in p.payload_rms.items()
+            ),
+        },
         "lcccrrl",
     )
 
@@ -118,30 +116,15 @@ def _spectrum(name: str, s: SpectrumAgreement) -> Figure:
 
 
 def _ratios(check: SimulationCheck) -> Figure:
-    axes = next(p.spectrum.axes for p in check.plants if p.spectrum is not None)
+    found = [p.spectrum for p in check.plants if p.spectrum is not None]
+    first, each = found[0], Style("#0072b2", "solid", 0.7)
     panels = []
-    for k, axis in enumerate(axes):
-        curves = []
-        for p in check.plants:
-            if p.spectrum is not None:
-                curves.append(
-                    Curve(
-                        p.spectrum.midband_Hz,
-                        10 * np.log10(p.spectrum.ratio[k]),
-                        "each plant",
-                        Style("#0072b2", "solid", 0.7),
-                        points=True,
-                        line=False,
-                    )
-                )
-        s = next(p.spectrum for p in check.plants if p.spectrum is not None)
-        for edge in (s.lower, s.upper):
-            curves.append(Curve(s.midband_Hz, 10 * np.log10(edge[k]), "limits of random scatter", STYLES["limit"]))
-        panels.append(
-            Panel(
-                hertz(0.8, 100.0), Axis("simulated over predicted [dB]", "linear"), tuple(curves), (), words.axis(axis)
-            )
-        )
+    for k, axis in enumerate(first.axes):
+        curves = [markers(s.midband_Hz, 10 * np.log10(s.ratio[k]), "each plant", each) for s in found]
+        for edge in (first.lower, first.upper):
+            curves.append(Curve(first.midband_Hz, 10 * np.log10(edge[k]), "limits of random scatter", STYLES["limit"]))
+        y = Axis("simulated over predicted [dB]", "linear")
+        panels.append(Panel(hertz(0.8, 100.0), y, tuple(curves), (), words.axis(axis)))
     return Figure(
         "spectrum_ratio",
         "Power in third octaves, simulated over predicted, for every plant. The dashed "
@@ -153,17 +136,12 @@ def _ratios(check: SimulationCheck) -> Figure:
 
 def _record(check: SimulationCheck) -> Figure:
     first = check.first
-    part = slice(0, min(5000, len(first.time)))
+    time = first.time[:5000]
     motion = [
-        Curve(
-            first.time[part],
-            1e6 * first.velocity(axis)[part],
-            words.axis(axis),
-            Style(("#0072b2", "#d55e00", "#009e73")[k % 3], "solid", 0.9),
-        )
+        Curve(time, 1e6 * first.velocity(axis)[:5000], words.axis(axis), Style(PALETTE[k % 3], "solid", 0.9))
         for k, axis in enumerate(first.loop.axes)
     ]
-    span = (float(first.time[part][0]), float(first.time[part][-1]))
+    span = (float(time[0]), float(time[-1]))
     return Figure(
         "record",
         f'The first seconds of the simulation of the plant "{check.plants[0].name}": payload '

@@ -34,20 +34,12 @@ def _third_octaves(result: DesignResult) -> Figure:
     bands = first.third_octave_Hz
     curves = []
     for c in CRITERIA:
-        limit = c.limit(bands)
-        curves.append(
-            Curve(
-                bands,
-                np.where(np.isfinite(limit), 1e6 * limit, np.nan),
-                "VC-A (top) to VC-G" if c.name == "VC-A" else "",
-                STYLES["faint"],
-            )
-        )
+        limit, label = 1e6 * c.limit(bands), "VC-A (top) to VC-G" if c.name == "VC-A" else ""
+        curves.append(Curve(bands, np.where(np.isfinite(limit), limit, np.nan), label, STYLES["faint"]))
     curves.append(Curve(bands, 1e6 * first.floor_third_octaves, "floor", STYLES["plain"]))
     for one in _settled(result):
-        curves.append(
-            Curve(bands, 1e6 * one.site.payload_third_octaves.max(axis=1), one.title, controller_style(one.name))
-        )
+        payload = 1e6 * one.site.payload_third_octaves.max(axis=1)
+        curves.append(Curve(bands, payload, one.title, controller_style(one.name)))
     ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in _settled(result))
     panel = Panel(hertz(1.0, 100.0), Axis("velocity [µm/s r.m.s.]", "log"), tuple(curves))
     return Figure(
@@ -76,24 +68,14 @@ def _motion(result: DesignResult) -> Table:
 
 
 def _volts(result: DesignResult) -> Table:
-    rows = [
-        (
-            c.title,
-            *(
-                f"{words.number(rms)} / {words.number(c.site.volts_peak[name])}"
-                for name, rms in c.site.volts_rms.items()
-            ),
-        )
-        for c in _settled(result)
-        if c.K is not None
-    ]
-    names = result.plant.actuators
+    names, controlled = result.plant.actuators, [c for c in _settled(result) if c.K is not None]
     limits = dict(zip(names, result.rig.limits_of(names).tolist(), strict=True))
+    both = [(c, c.site.volts_rms, c.site.volts_peak) for c in controlled]
     return table(
         "Voltages on the site by channel, r.m.s. / peak [V]. The peak is the level that a Gaussian signal "
         f"exceeds once in ten minutes; the limit is {words.limits(limits)}.",
         ("controller", *names),
-        rows,
+        [(c.title, *(f"{words.number(rms[n])} / {words.number(peak[n])}" for n in rms)) for c, rms, peak in both],
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, hertz
-from avis_ctrl.report.pieces import Section, Table, table
+from avis_ctrl.report.pieces import Section, Table, listed
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
 GAIN_DB = (-60.0, 40.0)
@@ -22,16 +22,17 @@ def transmissibility(result: DesignResult) -> Section:
 
 def _against_skyhook(result: DesignResult) -> Table:
     low, high = result.design.transmissibility.band_Hz
-    rows = [
-        (words.axis(one.axis), words.decibel(one.mu), words.decibel(one.skyhook), words.decibel(one.advantage))
-        for one in result.by_axis
-    ]
-    return table(
+    return listed(
         f"Worst case of each axis over {low:g} to {high:g} Hz, for floor motion in any combination of the "
         "kept axes: upper bound of the mu controller over the whole set, and lower bound of the tuned skyhook, "
         "which a plant of the set reaches.",
-        ("axis", "mu synthesis, at most", "skyhook, at least", "improvement, at least"),
-        rows,
+        result.by_axis,
+        {
+            "axis": lambda one: words.axis(one.axis),
+            "mu synthesis, at most": lambda one: words.decibel(one.mu),
+            "skyhook, at least": lambda one: words.decibel(one.skyhook),
+            "improvement, at least": lambda one: words.decibel(one.advantage),
+        },
         "lrrr",
     )
 

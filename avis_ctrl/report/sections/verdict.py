@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, table, yes_or_no
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, listed, table, yes_or_no
 from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
@@ -18,36 +18,22 @@ from avis_ctrl.summary import digits_apart
 def verdict(result: DesignResult) -> Section:
     """Summary page: the task, the verdict on each requirement, the certificate, and one figure."""
     low, high = result.design.transmissibility.band_Hz
-    rows = [
-        (
-            r.name,
-            Mark("met" if r.met else "NOT MET", r.met),
-            words.quantity(r.value, r.unit, 3 if r.met else digits_apart(r.value, r.limit, 3)),
-            f"{r.comparison} {words.quantity(r.limit, r.unit)}",
-        )
-        for r in result.requirements
-    ]
-    met = (
-        [
-            table(
-                "Requirements of the design and the results of the mu controller. Values in dB are the largest "
-                "singular value from floor to payload, rotations as displacement of the edge; the band is "
-                f"{low:g} to {high:g} Hz. The row of the offset is the DC voltage of a drive if every sensor channel "
-                "has the largest offset that follows from the rig file, with the worst signs.",
-                ("requirement", "verdict", "result", "limit"),
-                rows,
-                "lcrr",
-            )
-        ]
-        if rows
-        else []
+    judged = listed(
+        "Requirements of the design and the results of the mu controller. Values in dB are the largest "
+        "singular value from floor to payload, rotations as displacement of the edge; the band is "
+        f"{low:g} to {high:g} Hz. The row of the offset is the DC voltage of a drive if every sensor channel "
+        "has the largest offset that follows from the rig file, with the worst signs.",
+        result.requirements,
+        {
+            "requirement": lambda r: r.name,
+            "verdict": lambda r: Mark("met" if r.met else "NOT MET", r.met),
+            "result": lambda r: words.quantity(r.value, r.unit, 3 if r.met else digits_apart(r.value, r.limit, 3)),
+            "limit": lambda r: f"{r.comparison} {words.quantity(r.limit, r.unit)}",
+        },
+        "lcrr",
     )
-    return Section(
-        "Summary",
-        "verdict",
-        (_sentence(result), _asked(result, bool(met)), *met, certificate(result), summary_figure(result)),
-        alone=True,
-    )
+    task: list[Piece] = [_sentence(result), _asked(result), *([judged] if result.requirements else [])]
+    return Section("Summary", "verdict", (*task, certificate(result), summary_figure(result)), alone=True)
 
 
 def _sentence(result: DesignResult) -> Paragraph:
@@ -58,8 +44,8 @@ def _sentence(result: DesignResult) -> Paragraph:
     return Paragraph(said, "verdict", good)
 
 
-def _asked(result: DesignResult, judged: bool) -> Paragraph:
-    """The task. judged : whether a table of requirements follows."""
+def _asked(result: DesignResult) -> Paragraph:
+    """The task."""
     design, uncertain = result.design, result.design.uncertainty.parameters_percent
     low, high = design.transmissibility.band_Hz
     spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
@@ -69,7 +55,7 @@ def _asked(result: DesignResult, judged: bool) -> Paragraph:
         f"{result.rig.name}. It must stabilise {members}. The weight of the synthesis demands a transmissibility "
         f"of at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and of at most "
         f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
-        + (" The table lists the requirements of the design file:" if judged else "")
+        + (" The table lists the requirements of the design file:" if result.requirements else "")
     )
 
 
@@ -123,25 +109,17 @@ def comparison(result: DesignResult) -> Section:
     ]
     # The delivered controller first: on a narrow page the last columns are the least read.
     controllers = sorted(result.controllers, key=lambda c: c.name != "mu")
-    body = [(name, *(value(c) for c in controllers)) for name, value in rows]
-    notes = [Paragraph(f"{c.title}: {'; '.join(c.notes)}", "note") for c in controllers if c.notes]
-    notes += [Paragraph(f"The controller {c.title!r} is not in the table: {c.reason}", "note") for c in result.failed]
-    floor = controllers[0].site.floor_rating
-    return Section(
-        "Controllers compared",
-        "comparison",
-        (
-            table(
-                "All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
-                'whole uncertainty set; "unstable" means that the controller is not proved to stabilise every plant of '
-                f"the set. The floor itself meets {floor or 'no criterion'}.",
-                ("", *(c.title for c in controllers)),
-                body,
-            ),
-            *_remarks(result),
-            *notes,
-        ),
+    compared = table(
+        "All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
+        'whole uncertainty set; "unstable" means that the controller is not proved to stabilise every plant of '
+        f"the set. The floor itself meets {controllers[0].site.floor_rating or 'no criterion'}.",
+        ("", *(c.title for c in controllers)),
+        [(name, *(value(c) for c in controllers)) for name, value in rows],
     )
+    notes = [f"{c.title}: {'; '.join(c.notes)}" for c in controllers if c.notes]
+    notes += [f"The controller {c.title!r} is not in the table: {c.reason}" for c in result.failed]
+    pieces = (compared, *_remarks(result), *(Paragraph(note, "note") for note in notes))
+    return Section("Controllers compared", "comparison", pieces)
 
 
 def _remarks(result: DesignResult) -> list[Piece]:
@@ -157,7 +135,7 @@ def _settled(c: ControllerResult, text: str) -> str:
 
 
 def _micro(axes: dict[str, float]) -> str:
-    return words.micro(max(axes.values()), "m/s")
+    return f"{words.number(1e6 * max(axes.values()))} µm/s"
 
 
 def _volts(channels: dict[str, float]) -> str:
