@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -17,11 +17,12 @@ from avis_ctrl.measurement.gates.finding import (
     Finding,
     Limit,
     Picture,
-    Series,
+    Severity,
+    curves,
     percent,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, moving, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, octaves, record_spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -111,13 +112,13 @@ class Comparison(Gate):
         h = seen.header
         if not seen.driven or h.excitation == "sine":
             return None
+        kept = _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, record_spectra(seen))
         u, y, wrap = usable(seen)
-        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
-            return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
+            return kept
         P = len(periods)
         variance = smoothed(np.sum(np.abs(windowed(periods - y)) ** 2, axis=0) / (P - 1)) / P
-        return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of, _Mean(u, y, variance, P - 1))
+        return replace(kept, mean=_Mean(u, y, variance, P - 1))
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
@@ -128,25 +129,14 @@ class Comparison(Gate):
         level = FALSE_ALARM / max(1, len(apart) * n_y)
         levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
-        return [
-            *_judged(
-                self.name,
-                repeats,
-                campaign,
-                _drifted,
-                agreed,
-                "Repeatability was not tested: no two driven records of one level and enough length.",
-            ),
-            *_judged(
-                LEVEL_DEPENDENCE,
-                levels,
-                campaign,
-                _nonlinear,
-                "The responses at all levels agree",
-                "Dependence on the level was not tested: no driven records of one kind and enough length at "
-                f"two levels, at least a factor {SETTINGS.apart:g} apart.",
-            ),
-        ]
+        untested = "Repeatability was not tested: no two driven records of one level and enough length."
+        found = _judged(self.name, repeats, campaign, _drifted, agreed, untested)
+        untested = (
+            "Dependence on the level was not tested: no driven records of one kind and enough length at two levels, at "
+            f"least a factor {SETTINGS.apart:g} apart."
+        )
+        agreed = "The responses at all levels agree"
+        return found + _judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, agreed, untested)
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
@@ -178,33 +168,17 @@ def _judged(
 ) -> list[Finding]:
     """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
-        return [
-            Finding(
-                gate,
-                "ok",
-                untested,
-                picture=Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ()),
-            )
-        ]
+        picture = Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ())
+        return [Finding(gate, "ok", untested, picture=picture)]
     found = []
     for d in differences:
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
         if bad.any():
             names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-            large = d.relative[bad].max() > SETTINGS.large
+            severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
             sentence, records = described(d, bad, names)
-            found.append(
-                Finding(
-                    gate,
-                    "warning" if large else "note",
-                    sentence,
-                    names,
-                    records,
-                    float(d.T[bad].max()),
-                    1.0,
-                    _picture(d, campaign.y_names),
-                )
-            )
+            picture = _picture(d, campaign.y_names)
+            found.append(Finding(gate, severity, sentence, names, records, d.T[bad].max(), 1.0, picture))
     if found:
         return found
     d = max(differences, key=lambda d: d.noise)
@@ -215,17 +189,12 @@ def _judged(
         if blind
         else ""
     )
-    return [
-        Finding(
-            gate,
-            "note" if blind else "ok",
-            f"{agreed} within their noise, which is up to {100 * d.noise:.2g} "
-            f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}",
-            value=float(d.T.max()),
-            limit=1.0,
-            picture=_picture(d, campaign.y_names),
-        )
-    ]
+    sentence = (
+        f"{agreed} within their noise, which is up to {100 * d.noise:.2g} % of the response in an octave ({d.a} "
+        f"against {d.b}), or within 1 %.{hint}"
+    )
+    picture = _picture(d, campaign.y_names)
+    return [Finding(gate, "note" if blind else "ok", sentence, value=d.T.max(), limit=1.0, picture=picture)]
 
 
 def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
@@ -233,7 +202,7 @@ def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
         f"{d.a} against {d.b}",
         "frequency [Hz]",
         "relative difference [-]",
-        tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
+        curves(names, d.f, d.by_line),
         (Limit("large", SETTINGS.large),),
         "log",
         "log",
