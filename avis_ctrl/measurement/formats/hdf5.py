@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordSource, ranges
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
@@ -98,11 +98,8 @@ def read(
         stated = _check_root(file)
         group = member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
-            words = (
-                "missing; expected a group with one group per record"
-                if group is None
-                else "expected a group, found a data set"
-            )
+            missing = "missing; expected a group with one group per record"
+            words = missing if group is None else "expected a group, found a data set"
             raise InputError(f"{words}; the file holds {_listed(file)}", field="/frf" if response else "/records")
         if response:
             with within("/frf"):
@@ -145,12 +142,11 @@ def _in_order(group: h5py.Group) -> list[str]:
         in_order = group.id.get_create_plist().get_link_creation_order()
     if in_order:
         return members(group)
-    return sorted(
-        members(group),
-        key=lambda name: [
-            (part.isdigit(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)
-        ],
-    )
+
+    def natural(name: str) -> list[tuple[bool, int, str]]:
+        return [(part.isdigit(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
+
+    return sorted(members(group), key=natural)
 
 
 def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
@@ -163,13 +159,10 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
         if dataset is not None:
             parts[role] = _part(dataset, role)
         elif role != "floor":
-            raise InputError(
-                f"missing; expected a data set (samples, channels); the record holds {_listed(record)}", field=role
-            )
-    if "floor" in parts and tuple(parts["floor"].names) != FLOOR_NAMES:
-        raise InputError(
-            f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names", value=parts["floor"].names
-        )
+            message = f"missing; expected a data set (samples, channels); the record holds {_listed(record)}"
+            raise InputError(message, field=role)
+    if "floor" in parts and (names := tuple(parts["floor"].names)) != FLOOR_NAMES:
+        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names", value=names)
     found = attributes(record, *STATED, "period_s")
     for field, expected in STATED.items():
         require(found, field, expected)
@@ -185,12 +178,11 @@ def _part(dataset: Any, role: str) -> Part:
         raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
-        raise InputError(
-            f"expected (samples, channels) with more samples than channels; {samples} samples of "
-            f"{count} channels look transposed",
-            field=role,
-            value=shape,
+        message = (
+            f"expected (samples, channels) with more samples than channels; {samples} samples of {count} channels look "
+            "transposed"
         )
+        raise InputError(message, field=role, value=shape)
     stated = attributes(dataset, "names", "unit")
     with within(role):
         names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
@@ -203,11 +195,8 @@ def _layout(dataset: Any, field: str, kinds: str) -> tuple[tuple[int, ...] | Non
         raise InputError("expected a data set, found a group", field=field)
     shape, dtype = layout(dataset)
     if dtype.kind not in kinds:
-        raise InputError(
-            "expected numbers" if "c" in kinds else "expected real numbers",
-            field=field,
-            value=f"data set of {kind_of(dtype)}",
-        )
+        message = "expected numbers" if "c" in kinds else "expected real numbers"
+        raise InputError(message, field=field, value=f"data set of {kind_of(dtype)}")
     return shape, dtype
 
 
@@ -256,18 +245,12 @@ def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20)
 
 def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None:
     header = record.header
-    group.attrs.update(
-        {
-            "sample_rate_Hz": header.sample_rate_Hz,
-            "excitation": header.excitation,
-            "level_V": header.level_V,
-            "start_s": header.start_s,
-        }
-    )
+    group.attrs.update({name: getattr(header, name) for name in STATED})
     if header.period_s is not None:
         group.attrs["period_s"] = header.period_s
     datasets = {}
-    for role, names, unit in _roles(header):
+    for role in ROLES if header.floor_names else ROLES[:2]:
+        names, unit = getattr(header, f"{role}_names"), getattr(header, f"{role}_unit")
         shape = (header.samples, len(names))
         chunks = (min(CHUNK, header.samples), len(names)) if names else None
         datasets[role] = group.create_dataset(role, shape, np.float64, chunks=chunks)
@@ -277,11 +260,6 @@ def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None
         piece = record.load(start, stop)
         for role, dataset in datasets.items():
             dataset[start:stop] = getattr(piece, role)
-
-
-def _roles(header: RecordHeader) -> list[tuple[str, tuple[str, ...], str]]:
-    roles = [("u", header.u_names, header.u_unit), ("y", header.y_names, header.y_unit)]
-    return roles + ([("floor", header.floor_names, header.floor_unit)] if header.floor_names else [])
 
 
 def write_frequency_response(path: str | Path, response: FrequencyResponse, rig: str = "unnamed") -> None:

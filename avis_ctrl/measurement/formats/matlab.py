@@ -95,7 +95,7 @@ def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
     """
     frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
     n_y, n_u = _sizes(tree, H, len(frequency))
-    fields = {
+    fields: dict[str, Any] = {
         "input_unit": "V",
         "output_unit": "V",
         "outputs": [f"y{i + 1}" for i in range(n_y)],
@@ -104,13 +104,12 @@ def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
     fields |= {field: tree[field] for field in fields if field in tree}
     for field, count in (("outputs", n_y), ("inputs", n_u)):
         as_names(fields[field], field, count)
-    shaped = {
-        field: _lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
-        for field in ("H", "variance", "coherence")
-        if field in tree
-    }
-    averages = {"averages": _array(tree, "averages")} if "averages" in tree else {}
-    return stated_response({"frequency_Hz": frequency, "value": shaped.pop("H"), **fields, **shaped, **averages}, hints)
+    for field, array in (("value", "H"), ("variance", "variance"), ("coherence", "coherence")):
+        if array in tree:
+            fields[field] = _lines_first(_array(tree, array), (len(frequency), n_y, n_u), array)
+    if "averages" in tree:
+        fields["averages"] = _array(tree, "averages")
+    return stated_response({"frequency_Hz": frequency, **fields}, hints)
 
 
 def _array(tree: Mapping[str, Any], name: str) -> np.ndarray:
@@ -145,13 +144,9 @@ def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> 
     if n_y == n_u == 1 and array.size == n:
         return array.reshape(sizes)
     if first and last:
-        raise InputError(
-            f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})",
-            field=field,
-            value=array.shape,
-        )
+        message = f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})"
+        raise InputError(message, field=field, value=array.shape)
     if not first and not last:
-        raise InputError(
-            f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field, value=array.shape
-        )
+        message = f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs"
+        raise InputError(message, field=field, value=array.shape)
     return array.reshape(sizes) if first else np.moveaxis(array.reshape(n_y, n_u, n), 2, 0)

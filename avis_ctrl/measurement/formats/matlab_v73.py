@@ -38,9 +38,8 @@ def variables(path: Path) -> dict[str, Any]:
     """
     with reading(path, "the .mat file (v7.3)"), open_hdf5(path) as file:
         tree = Tree(file, path)
-        return {
-            printable(name): tree.value(member(file, name), 0) for name in members(file) if not name.startswith("#")
-        }
+        shown = [name for name in members(file) if not name.startswith("#")]
+        return {printable(name): tree.value(member(file, name), 0) for name in shown}
 
 
 class Tree:
@@ -95,9 +94,8 @@ class Tree:
 
     def _references(self, item: h5py.Dataset, shape: tuple[int, ...]) -> list[Any]:
         if math.prod(shape) > MOST_CELLS:
-            raise InputError(
-                f"expected at most {MOST_CELLS} cells", field=printable(full_name(item)), value=math.prod(shape)
-            )
+            name = printable(full_name(item))
+            raise InputError(f"expected at most {MOST_CELLS} cells", field=name, value=math.prod(shape))
         return list(values(item).reshape(-1))  # dimensions are stored reversed: this is MATLAB's linear order
 
     def _behind(self, reference: Any, depth: int) -> Any:

@@ -65,7 +65,7 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
     if not header.period_samples or header.periods < 2:
         raise header.error("period_s", "expected a periodic record of at least two periods")
     n, rate = header.period_samples, header.sample_rate_Hz
-    used = channels(campaign, (source,), False)
+    used = channels((source,), False)
     keep = lines(n, rate, checked_band(None, rate))
     drop, remove = chosen_treatment((source,), used, keep, transient)
     mean = average(source, used, keep, drop, remove)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -31,12 +32,17 @@ class Channels:
     input_unit: str
     output_unit: str
 
+    def labels(self, inputs: tuple[str, ...]) -> dict[str, Any]:
+        """Names and units of a `FrequencyResponse` from some of the inputs."""
+        units = {"input_unit": self.input_unit, "output_unit": self.output_unit}
+        return {"inputs": inputs, "outputs": self.outputs, **units}
+
     def of(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """Samples of the inputs (samples, n_u) and of the outputs (samples, n_y)."""
         return np.hstack([record.u, record.floor]) if self.floor and record.floor is not None else record.u, record.y
 
 
-def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | None) -> Channels:
+def channels(records: Sequence[RecordSource], floor: bool | None) -> Channels:
     """Inputs and outputs of an estimate.
 
     Parameters
