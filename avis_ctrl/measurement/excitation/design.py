@@ -22,7 +22,7 @@ on the distribution, and is then valid for signals of this kind.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -311,8 +311,7 @@ def band_limited(
 
 def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
     """Settings as numbers, strings and lists, for files."""
-    values = {one.name: getattr(settings, one.name) for one in fields(settings)}
-    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in vars(settings).items()}
     return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}
 
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordSource, ranges
+from avis_ctrl.measurement.formats import stored
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
@@ -36,17 +37,7 @@ from avis_ctrl.measurement.formats.common import (
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, record_from
 from avis_ctrl.measurement.formats.response import COVARIANCES, stated_response
-from avis_ctrl.measurement.formats.stored import (
-    Columns,
-    access,
-    attributes,
-    full_name,
-    layout,
-    member,
-    members,
-    open_hdf5,
-    values,
-)
+from avis_ctrl.measurement.formats.stored import Columns
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 FORMAT, VERSION = "avis-campaign", 1
@@ -88,15 +79,15 @@ def read(
     InputError : not an HDF5 campaign, a missing or wrong attribute or data set; names file, record and field.
     """
     path, hints = existing_file(path), hints or Hints()
-    with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        names = members(file)
+    with reading(path, "the HDF5 file"), stored.open_hdf5(path) as file:
+        names = stored.members(file)
         response = "frf" in names and "records" not in names
         used = ("averages", "relative_standard_deviation") if response else ()
         for name, value in {"columns": columns, **vars(hints)}.items():
             if value is not None and name not in used:
                 raise InputError("an HDF5 campaign states this itself; omit this argument", field=name, value=value)
         stated = _check_root(file)
-        group = member(file, "frf" if response else "records")
+        group = stored.member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
             missing = "missing; expected a group with one group per record"
             words = missing if group is None else "expected a group, found a data set"
@@ -115,12 +106,12 @@ def read(
 
 def _listed(group: h5py.Group) -> str:
     """Names of the members of a group, for messages."""
-    return ", ".join(sorted(map(printable, members(group)))) or "nothing"
+    return ", ".join(sorted(map(printable, stored.members(group)))) or "nothing"
 
 
 def _check_root(file: h5py.File) -> str:
     """Name of the rig, after format and version have been checked."""
-    found = attributes(file, "format", "version", "rig")
+    found = stored.attributes(file, "format", "version", "rig")
     with within("attributes of the file"):
         require(found, "format", f"{FORMAT!r}")
         require(found, "version", f"{VERSION}")
@@ -138,24 +129,24 @@ def check_version(stated: Any, version: Any) -> None:
 
 def _in_order(group: h5py.Group) -> list[str]:
     """Names in the order of creation, if the file kept it; otherwise in natural order ("2" before "10")."""
-    with access("/records"):
+    with stored.access("/records"):
         in_order = group.id.get_create_plist().get_link_creation_order()
     if in_order:
-        return members(group)
+        return stored.members(group)
 
     def natural(name: str) -> list[tuple[bool, int, str]]:
         return [(part.isdigit(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
 
-    return sorted(members(group), key=natural)
+    return sorted(stored.members(group), key=natural)
 
 
 def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
-    record = member(group, name)
+    record = stored.member(group, name)
     if not isinstance(record, h5py.Group):
         raise InputError("expected a group with u and y, found a data set")
     parts = {}
     for role in ROLES:
-        dataset = member(record, role)
+        dataset = stored.member(record, role)
         if dataset is not None:
             parts[role] = _part(dataset, role)
         elif role != "floor":
@@ -163,7 +154,7 @@ def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
             raise InputError(message, field=role)
     if "floor" in parts and (names := tuple(parts["floor"].names)) != FLOOR_NAMES:
         raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names", value=names)
-    found = attributes(record, *STATED, "period_s")
+    found = stored.attributes(record, *STATED, "period_s")
     for field, expected in STATED.items():
         require(found, field, expected)
     hints = Hints().completed(found)
@@ -183,17 +174,17 @@ def _part(dataset: Any, role: str) -> Part:
             "transposed"
         )
         raise InputError(message, field=role, value=shape)
-    stated = attributes(dataset, "names", "unit")
+    stated = stored.attributes(dataset, "names", "unit")
     with within(role):
         names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
-    return Part(as_names(names, f"{role} names", count), unit, Columns(full_name(dataset), samples))
+    return Part(as_names(names, f"{role} names", count), unit, Columns(stored.full_name(dataset), samples))
 
 
 def _layout(dataset: Any, field: str, kinds: str) -> tuple[tuple[int, ...] | None, np.dtype]:
     """Shape and type of a data set of these kinds of numbers."""
     if not isinstance(dataset, h5py.Dataset):
         raise InputError("expected a data set, found a group", field=field)
-    shape, dtype = layout(dataset)
+    shape, dtype = stored.layout(dataset)
     if dtype.kind not in kinds:
         message = "expected numbers" if "c" in kinds else "expected real numbers"
         raise InputError(message, field=field, value=f"data set of {kind_of(dtype)}")
@@ -204,7 +195,7 @@ def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
     fields = {name: _numbers(path, group, name, kinds) for name, kinds in DATASETS.items()}
     if fields["frequency_Hz"] is None or fields["value"] is None:
         raise InputError(f"expected frequency_Hz and value; the group holds {_listed(group)}")
-    stated = attributes(group, *NAMED, "method", "dof", "averages")
+    stated = stored.attributes(group, *NAMED, "method", "dof", "averages")
     for field, expected in NAMED.items():
         require(stated, field, expected)
     return stated_response(fields | stated, hints)
@@ -212,12 +203,12 @@ def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
 
 def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
     """Values of the data set with this name, None if there is none."""
-    dataset = member(group, name)
+    dataset = stored.member(group, name)
     if dataset is None:
         return None
     shape, dtype = _layout(dataset, name, kinds)
     require_small(path, math.prod(shape or ()) * dtype.itemsize)
-    return values(dataset)
+    return stored.values(dataset)
 
 
 def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20) -> None:

@@ -1,15 +1,8 @@
-"""MATLAB .mat files, v5 and v7.3: records in two layouts, or a frequency response.
+"""MATLAB .mat files, v5 and v7.3: records in the two layouts of `layouts.FORMATS`, or a frequency response.
 
-Layout A, the contract's: a struct array (or cell array of structs) `records` with the fields u, y and sample_rate_Hz,
-and, if known, excitation, level_V, start_s, period_s (empty, 0 or NaN if not periodic), floor, u_names, y_names,
-u_unit, y_unit, floor_unit, t; next to it `rig`.
-
-Layout B, flat variables of one record: u, y, t or fs (Fs, sample_rate_Hz) or Ts, optionally floor, u_names, y_names,
-u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a column mapping assigns variables with other names.
-
-A frequency response is frequency_Hz, H, variance or coherence with averages, inputs, outputs and their units.
-
-Samples of v7.3 files stay on disk. Samples may be rows or columns; ambiguous arrays are rejected.
+`records` may also be a cell array of structs; floor_unit is a further optional field. A column mapping assigns flat
+variables with other names. Samples of v7.3 files stay on disk. Samples may be rows or columns; ambiguous arrays are
+rejected.
 """
 
 from __future__ import annotations

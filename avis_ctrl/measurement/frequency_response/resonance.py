@@ -141,25 +141,21 @@ def _fit(
     ]
     best = min(fits, key=lambda s: s.cost)
     free = 2 * (use.size - 3) * G.shape[1] - 2
-    _check_significant(best.cost, _without_pole(weight, G, w - w0), G.shape[1], free, near_Hz, f[use])
+    _require_pole(best.cost, free, weight, G, w - w0, near_Hz, f[use])
     # E|e|^2 counts real and imaginary parts, each of half the variance.
     misfit = 2 * 2 * best.cost / free
     residue = (scale * project(best.x)[1][:, 0]).reshape(response.value.shape[1:])
     return _result(best.x, best.jac, residue, misfit, scale, w0, f[use], near_Hz, reach)
 
 
-def _without_pole(weight: np.ndarray, G: np.ndarray, d: np.ndarray) -> float:
-    """Half the weighted sum of squared residuals of the background alone."""
+def _require_pole(
+    with_pole: float, free: int, weight: np.ndarray, G: np.ndarray, d: np.ndarray, near_Hz: float, f: np.ndarray
+) -> None:
+    """F test of the pole against the background alone; with_pole : half the sum of squared residuals with it."""
     q, _ = np.linalg.qr(weight.T[:, :, None] * np.stack([np.ones(d.size), d / np.abs(d).max()], axis=1))
     right = (weight * G).T[:, :, None]
-    return float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
-
-
-def _check_significant(
-    with_pole: float, without: float, entries: int, free: int, near_Hz: float, f: np.ndarray
-) -> None:
-    """F test of the pole against the background alone."""
-    added = 2 * entries + 2
+    without = float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
+    added = 2 * G.shape[1] + 2
     ratio = (without - with_pole) / added / max(with_pole / free, np.finfo(float).tiny)
     limit = float(stats.f(added, free).isf(SETTINGS.false_alarm))
     if ratio < limit:

@@ -83,6 +83,13 @@ def curves(names: Sequence[str], x: np.ndarray, y: np.ndarray, style: str = "lin
     return tuple(Series(name, x, column, style) for name, column in zip(names, y.T, strict=True))
 
 
+def over_frequency(
+    title: str, y_label: str, series: tuple[Series, ...], limits: tuple[Limit, ...], y_scale: str = "log"
+) -> Picture:
+    """Curves over frequency on a logarithmic axis."""
+    return Picture(title, "frequency [Hz]", y_label, series, limits, "log", y_scale)
+
+
 def samples_over_time(
     record: str, channel: str, t: np.ndarray, x: np.ndarray, unit: str = "", limits: tuple[Limit, ...] = ()
 ) -> Picture:

@@ -10,7 +10,16 @@ from scipy import signal, stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, Severity
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    over_frequency,
+)
 from avis_ctrl.measurement.gates.h1 import driven_lines
 
 MAINS_HZ = (50.0, 60.0)
@@ -118,15 +127,9 @@ class Hum(Gate):
 
     def _picture(self, kept: _Kept, j: int, campaign: Campaign, at_Hz: Sequence[float]) -> Picture:
         name = campaign.y_names[j]
-        return Picture(
-            f"Record {kept.record}, {name}",
-            "frequency [Hz]",
-            f"amplitude density [{campaign.y_unit}/√Hz]",
-            (Series(name, kept.f[1:], kept.asd[1:, j]),),
-            tuple(Limit(f"{f:g} Hz", f, "x") for f in at_Hz),
-            "log",
-            "log",
-        )
+        label, series = f"amplitude density [{campaign.y_unit}/√Hz]", Series(name, kept.f[1:], kept.asd[1:, j])
+        limits = tuple(Limit(f"{f:g} Hz", f, "x") for f in at_Hz)
+        return over_frequency(f"Record {kept.record}, {name}", label, (series,), limits)
 
 
 def _length(samples: int, rate: float) -> int:

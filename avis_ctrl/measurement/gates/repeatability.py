@@ -19,6 +19,7 @@ from avis_ctrl.measurement.gates.finding import (
     Picture,
     Severity,
     curves,
+    over_frequency,
     percent,
     quoted,
 )
@@ -198,15 +199,8 @@ def _judged(
 
 
 def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
-    return Picture(
-        f"{d.a} against {d.b}",
-        "frequency [Hz]",
-        "relative difference [-]",
-        curves(names, d.f, d.by_line),
-        (Limit("large", SETTINGS.large),),
-        "log",
-        "log",
-    )
+    series, limits = curves(names, d.f, d.by_line), (Limit("large", SETTINGS.large),)
+    return over_frequency(f"{d.a} against {d.b}", "relative difference [-]", series, limits)
 
 
 def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list[_Kept]]:

@@ -19,6 +19,7 @@ from avis_ctrl.measurement.gates.finding import (
     Series,
     Severity,
     curves,
+    over_frequency,
 )
 from avis_ctrl.measurement.gates.h1 import (
     H1,
@@ -92,14 +93,8 @@ class SignalToNoise(Gate):
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = centres(f, bands)
-        picture = Picture(
-            "Signal to noise of the best record",
-            "frequency [Hz]",
-            "ratio [dB]",
-            curves(campaign.y_names, middle, dB, "points"),
-            (Limit("low", SETTINGS.low_dB),),
-            "log",
-        )
+        series, low = curves(campaign.y_names, middle, dB, "points"), Limit("low", SETTINGS.low_dB)
+        picture = over_frequency("Signal to noise of the best record", "ratio [dB]", series, (low,), "linear")
         found = noisy + list(self._weak(campaign.y_names, middle, dB, best.segment_s, picture))
         b, j = divmod(int(np.argmin(dB)), dB.shape[1])
         sentence = (
@@ -200,14 +195,9 @@ class Coherence(Gate):
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
-        picture = Picture(
-            f"Multiple coherence at {top:.3g} V, third octaves",
-            "frequency [Hz]",
-            "coherence [-]",
-            curves(campaign.y_names, middle, mean),
-            (Limit("low", SETTINGS.low_coherence),),
-            "log",
-        )
+        series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence
+        title, limits = f"Multiple coherence at {top:.3g} V, third octaves", (Limit("low", limit),)
+        picture = over_frequency(title, "coherence [-]", series, limits, "linear")
         below, excited = "", _lowest_driven(chosen)
         if best.f[0] > 1.5 * excited:
             below = (
@@ -222,7 +212,7 @@ class Coherence(Gate):
             if group
         ]
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
-        lowest, limit = mean[b, j], SETTINGS.low_coherence
+        lowest = mean[b, j]
         sentence = (
             f"Multiple coherence is at least {lowest:.2f} in every third-octave band from {best.f[0]:.3g} to "
             f"{best.f[-1]:.3g} Hz (lowest {campaign.y_names[j]!r} around {middle[b]:.3g} Hz).{below}"

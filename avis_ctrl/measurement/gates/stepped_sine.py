@@ -15,7 +15,15 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, samples_over_time
+from avis_ctrl.measurement.gates.finding import (
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    over_frequency,
+    samples_over_time,
+)
 from avis_ctrl.measurement.gates.sine_fit import KINDS, SineFit, fit_sine, second_order
 
 
@@ -64,15 +72,10 @@ class _Steps:
 
     def picture(self) -> Picture:
         """Amplitude of each channel relative to the drive."""
-        return Picture(
-            f"Amplitude of each channel by {self.names[self.drive]}",
-            "frequency [Hz]",
-            "ratio [-]",
-            tuple(Series(self.names[j], self.f, np.abs(self.ratio(j)), "points") for j in self.live if j != self.drive),
-            (Limit("proportional", 1.0),),
-            "log",
-            "log",
-        )
+        title = f"Amplitude of each channel by {self.names[self.drive]}"
+        others = (j for j in self.live if j != self.drive)
+        series = tuple(Series(self.names[j], self.f, np.abs(self.ratio(j)), "points") for j in others)
+        return over_frequency(title, "ratio [-]", series, (Limit("proportional", 1.0),))
 
 
 class SteppedSine(Gate):
