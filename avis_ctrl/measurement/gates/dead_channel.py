@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
@@ -40,14 +40,15 @@ SETTINGS = DeadSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
+    """Data of one record; stuck : length and start of a stuck run, and t [s] and y around it, by channel."""
+
     record: str
     driven: bool
     rms: np.ndarray
     spread: np.ndarray
     codes: np.ndarray
-    stuck: dict[int, tuple[int, int]]
+    stuck: dict[int, tuple[int, int, np.ndarray, np.ndarray]]
     response: np.ndarray | None
-    traces: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
 class DeadChannel(Gate):
@@ -65,17 +66,17 @@ class DeadChannel(Gate):
     def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
         y = np.concatenate([p.y for p in seen.pieces])
         t = np.concatenate([p.time for p in seen.pieces]) - seen.header.start_s
-        stuck, traces = {}, {}
+        stuck = {}
         for k in range(y.shape[1]):
             runs = equal_runs(y[:, k])
             (longest, at), second = runs[0], runs[1][0] if len(runs) > 1 else 1
             if max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second) <= longest < len(y):
                 part = slice(max(0, at - longest), at + 2 * longest)
-                stuck[k], traces[k] = runs[0], (t[part], y[part, k])
+                stuck[k] = longest, at, t[part], y[part, k]
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         rms = np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0)
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
-        return _Kept(seen.header.name, seen.driven, rms, spread, codes, stuck, _excess(seen), traces)
+        return _Kept(seen.header.name, seen.driven, rms, spread, codes, stuck, _excess(seen))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         rms = np.array([k.rms for k in kept])
@@ -133,9 +134,9 @@ class DeadChannel(Gate):
             yield Finding(self.name, "note", sentence, idle, picture=picture)
 
     def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
-        (n, at), rate = kept.stuck[j], campaign.sample_rate_Hz
+        (n, at, t, x), rate = kept.stuck[j], campaign.sample_rate_Hz
         limit = Limit("stuck from", at / rate, "x")
-        picture = samples_over_time(kept.record, name, *kept.traces[j], campaign.y_unit, (limit,))
+        picture = samples_over_time(kept.record, name, t, x, campaign.y_unit, (limit,))
         sentence = (
             f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) from "
             f"{at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or repeat the record."

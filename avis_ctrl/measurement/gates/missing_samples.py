@@ -151,9 +151,8 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     """
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
-    rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
-    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
-    length = segment_length(len(u), n_u)
+    rate = seen.header.sample_rate_Hz
+    u, y, length = _beginning(seen)
     of = spectra(u, y, rate, length, wrap=False)
     half = len(of.U) // 2
     parts = [of, Spectra(of.f, of.U[:half], of.Y[:half]), Spectra(of.f, of.U[half:], of.Y[half:])]
@@ -162,6 +161,12 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros((1, 0))
     t = seen.first.header.start_s + (np.arange(len(of.U)) * (length // 2) + length / 2) / rate
     return t, np.array([_delay(of, estimate, rate) for estimate in estimates])
+
+
+def _beginning(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, int]:
+    """u and y of the beginning of the record, and the length of its segments."""
+    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
+    return u, y, segment_length(len(u), moving(seen.first.u))
 
 
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
@@ -189,9 +194,8 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     that are driven before and after it count (`both_sides` of the settings); if these are too few (`showing`), the
     result is -inf.
     """
-    rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
-    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
-    count, length = max(1, round(abs(size))), segment_length(len(u), n_u)
+    rate, count = seen.header.sample_rate_Hz, max(1, round(abs(size)))
+    u, y, length = _beginning(seen)
     of = spectra(u, y, rate, length, wrap=False)
     before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
     first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
