@@ -181,11 +181,8 @@ class Record(RecordSource):
             raise InputError("floor channels are named but there are no floor samples", field=f"record {h.name}: floor")
         columns = {"u": h.u_names, "y": h.y_names} | ({} if self.floor is None else {"floor": h.floor_names})
         for role, names in columns.items():
-            array, field, shape = (
-                np.asarray(getattr(self, role), float),
-                f"record {h.name}: {role}",
-                (h.samples, len(names)),
-            )
+            array, shape = np.asarray(getattr(self, role), float), (h.samples, len(names))
+            field = f"record {h.name}: {role}"
             if array.shape != shape:
                 words = f"expected shape {shape}: {h.samples} samples of {len(names)} channels"
                 raise InputError(words, field=field, value=array.shape)

@@ -143,9 +143,17 @@ def response_from(
     if not keep.all():
         lost = frequency_Hz[~keep]
         method += f"; {len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz"
-    names, units = (tuple(inputs), tuple(outputs)), (input_unit, output_unit)
     return FrequencyResponse(
-        frequency_Hz[keep], value[keep], None, None, *names, *units, entry_variance=variance[keep], method=method
+        frequency_Hz[keep],
+        value[keep],
+        None,
+        None,
+        tuple(inputs),
+        tuple(outputs),
+        input_unit,
+        output_unit,
+        entry_variance=variance[keep],
+        method=method,
     )
 
 

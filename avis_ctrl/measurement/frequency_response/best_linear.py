@@ -210,7 +210,8 @@ def _response(
     per_line = dof or data.dof
     half = _smoothing(smooth_lines, per_line, n_y, line.size)
     C = noise = None if noise is None else _running_mean(noise, half)
-    distortion, said = None, "; noise only, distortion not separated"
+    distortion = None
+    said = "; noise only, distortion not separated"
     if dof:
         E = Y - U @ np.swapaxes(G, 1, 2)
         C = _running_mean(np.swapaxes(E, 1, 2) @ E.conj() / dof, half)

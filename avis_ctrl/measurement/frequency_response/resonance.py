@@ -200,6 +200,13 @@ def _result(
         ]
     )
     spread = np.sqrt(np.diag(by_x @ covariance @ by_x.T))
-    frequency, band = natural / (2 * np.pi), (float(f[0]), float(f[-1]))
-    std = spread[0] / (2 * np.pi), spread[1]
-    return Resonance(frequency, decay / natural, *std, residue, float(misfit), band, f.size)
+    return Resonance(
+        natural / (2 * np.pi),
+        decay / natural,
+        spread[0] / (2 * np.pi),
+        spread[1],
+        residue,
+        float(misfit),
+        (float(f[0]), float(f[-1])),
+        f.size,
+    )

@@ -83,10 +83,8 @@ class ChannelMap(Gate):
                 return _not_compared(kept, copied, campaign, "no model was given", "ok")
             return _not_compared(kept, copied, campaign, "too few driven samples", "note")
         faults, least = explain(comparison), comparison.settings.least_agreement
-        order_picture, sign_picture = (
-            _order_picture(faults, campaign, comparison),
-            _sign_picture(faults, campaign, least),
-        )
+        order_picture = _order_picture(faults, campaign, comparison)
+        sign_picture = _sign_picture(faults, campaign, least)
         order = copied + list(_exchanged(faults, campaign, least, order_picture))
         signs = list(_flipped(faults, campaign, comparison, sign_picture))
         return [
@@ -124,8 +122,8 @@ def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
             f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. in every "
             f"record: {cause}"
         )
-        pair, records, picture = (names[i], names[k]), tuple(h[0] for h in hits), _copy_picture(kept)
-        yield Finding(ORDER, severity, sentence, pair, records, rest, COPIES.different, picture)
+        pair, records = (names[i], names[k]), tuple(record for record, _, _ in hits)
+        yield Finding(ORDER, severity, sentence, pair, records, rest, COPIES.different, _copy_picture(kept))
 
 
 def _exchanged(faults: Faults, campaign: Campaign, least: float, picture: Picture) -> Iterator[Finding]:

@@ -127,7 +127,8 @@ class Hum(Gate):
 
     def _picture(self, kept: _Kept, j: int, campaign: Campaign, at_Hz: Sequence[float]) -> Picture:
         name = campaign.y_names[j]
-        label, series = f"amplitude density [{campaign.y_unit}/√Hz]", Series(name, kept.f[1:], kept.asd[1:, j])
+        label = f"amplitude density [{campaign.y_unit}/√Hz]"
+        series = Series(name, kept.f[1:], kept.asd[1:, j])
         limits = tuple(Limit(f"{f:g} Hz", f, "x") for f in at_Hz)
         return over_frequency(f"Record {kept.record}, {name}", label, (series,), limits)
 

@@ -196,8 +196,8 @@ class Coherence(Gate):
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
         series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence
-        title, limits = f"Multiple coherence at {top:.3g} V, third octaves", (Limit("low", limit),)
-        picture = over_frequency(title, "coherence [-]", series, limits, "linear")
+        title = f"Multiple coherence at {top:.3g} V, third octaves"
+        picture = over_frequency(title, "coherence [-]", series, (Limit("low", limit),), "linear")
         below, excited = "", _lowest_driven(chosen)
         if best.f[0] > 1.5 * excited:
             below = (
