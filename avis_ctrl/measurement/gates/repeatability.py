@@ -80,7 +80,7 @@ class _Kept:
 class Difference:
     """Difference of two records (or levels): T (n_y,) mean |difference|^2 / variance in the most significant octave,
     divided by its 1 % limit for noise alone; relative (n_y,) difference there, noise subtracted; band_Hz (n_y, 2) of
-    this octave.
+    this octave; noise : relative to the response, in the octave where it is largest.
     """
 
     a: str
@@ -252,39 +252,38 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     driven = np.sum(np.abs(windowed(second.u)) ** 2, axis=1)
     keep = driven_lines(driven)
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
-    power = np.abs(D) ** 2
-    by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    T, relative, band = _by_band(
-        f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1, min(first.dof, second.dof), level
-    )
-    noise = _noise(f[keep], variance[keep], size[keep])
-    return Difference(*names, T, relative, band, f[keep], by_line[keep], noise)
+    f, power, variance, size = f[keep], np.abs(D[keep]) ** 2, variance[keep], size[keep]
+    return _in_octaves(names, f, power / variance, power, variance, size, 1, min(first.dof, second.dof), level)
 
 
-def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
-    """Noise of the difference relative to the response, r.m.s. in the octave where it is largest."""
-    return max(
-        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f)
-    )
-
-
-def _by_band(
-    f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int, level: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n_y,) in the most significant octave: mean ratio over the limit of F(n_u L, dof L), relative excess, ends (n_y,
-    2).
+def _in_octaves(
+    names: tuple[str, str],
+    f: np.ndarray,
+    ratio: np.ndarray,
+    power: np.ndarray,
+    noise: np.ndarray,
+    size: np.ndarray,
+    n_u: int,
+    dof: int,
+    level: float,
+) -> Difference:
+    """The difference with this power (n, n_y) on the lines f (n,) Hz, where noise gives `noise` and the response is
+    `size`; ratio : power over the variance of the noise, whose mean over L lines is F(n_u L, dof L) distributed.
     """
     bands = octaves(f)
-    T, relative, ends = (np.zeros((ratio.shape[1], *more)) for more in ((), (), (2,)))
+    T, relative, blur = np.zeros((3, ratio.shape[1]))
+    ends = np.zeros((ratio.shape[1], 2))
     for band in bands:
-        lines = int(band.sum())
+        lines, response = int(band.sum()), np.maximum(size[band].sum(axis=0), 1e-300)
         limit = float(stats.f.isf(level / len(bands), n_u * lines, dof * lines))
         here = ratio[band].mean(axis=0) / limit
-        part = np.sqrt(np.maximum(excess[band].sum(axis=0), 0) / np.maximum(size[band].sum(axis=0), 1e-300))
+        part = np.sqrt(np.maximum((power - noise)[band].sum(axis=0), 0) / response)
         relative = np.where(here > T, part, relative)
         ends[here > T] = f[band][[0, -1]]
         T = np.maximum(T, here)
-    return T, relative, ends
+        blur = np.maximum(blur, np.sqrt(noise[band].sum(axis=0) / response))
+    by_line = np.sqrt(power / np.maximum(size, 1e-300))
+    return Difference(*names, T, relative, ends, f, by_line, float(blur.max()))
 
 
 def _compared(first: list[Spectra], second: list[Spectra], level: float, names: tuple[str, str]) -> Difference | None:
@@ -309,9 +308,7 @@ def _compared(first: list[Spectra], second: list[Spectra], level: float, names: 
     ratio = np.real(np.einsum("fyi,fyi->fy", D.conj(), np.linalg.solve(V, D[..., None])[..., 0])) / rank
     spread = np.trace(V, axis1=2, axis2=3).real
     size, power = np.sum(np.abs(Ga) ** 2, axis=2), np.sum(np.abs(D) ** 2, axis=2)
-    T, relative, band = _by_band(f, ratio, power - spread, size, rank, min(a.dof, b.dof), level)
-    by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    return Difference(*names, T, relative, band, f, by_line, _noise(f, spread, size))
+    return _in_octaves(names, f, ratio, power, spread, size, rank, min(a.dof, b.dof), level)
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
