@@ -58,44 +58,32 @@ class RecordHeader:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.sample_rate_Hz) and self.sample_rate_Hz > 0):
-            raise InputError(
-                "expected a positive sample rate in Hz",
-                field=f"record {self.name}: sample_rate_Hz",
-                value=self.sample_rate_Hz,
-            )
+            raise self.error("sample_rate_Hz", "expected a positive sample rate in Hz")
         if self.samples < 2:
-            raise InputError("expected at least two samples", field=f"record {self.name}", value=self.samples)
+            raise self.error("samples", "expected at least two samples")
         if self.excitation not in EXCITATIONS:
-            raise InputError(
-                f"expected one of {', '.join(EXCITATIONS)}",
-                field=f"record {self.name}: excitation",
-                value=self.excitation,
-            )
+            raise self.error("excitation", f"expected one of {', '.join(EXCITATIONS)}")
         for field in ("u_names", "y_names", "floor_names"):
             names = getattr(self, field)
             if len(set(names)) != len(names):
-                raise InputError("expected different channel names", field=f"record {self.name}: {field}", value=names)
+                raise self.error(field, "expected different channel names")
         if self.period_s is not None:
             self._check_period(self.period_s)
 
     def _check_period(self, period_s: float) -> None:
-        field = f"record {self.name}: period_s"
         if not (np.isfinite(period_s) and period_s > 0):
-            raise InputError("expected a positive period in s", field=field, value=period_s)
+            raise self.error("period_s", "expected a positive period in s")
         count = period_s * self.sample_rate_Hz
+        found = f"at {self.sample_rate_Hz:g} Hz it is {count:.6g}"
         if round(count) < 2:
-            raise InputError(
-                f"expected at least two samples in a period; at {self.sample_rate_Hz:g} Hz it is {count:.6g}; check "
-                "the sample rate and the unit of the time stamps",
-                field=field,
-                value=period_s,
-            )
+            check = "check the sample rate and the unit of the time stamps"
+            raise self.error("period_s", f"expected at least two samples in a period; {found}; {check}")
         if abs(count - round(count)) > 1e-6 * count:
-            raise InputError(
-                f"expected a whole number of samples; at {self.sample_rate_Hz:g} Hz it is {count:.6g}",
-                field=field,
-                value=period_s,
-            )
+            raise self.error("period_s", f"expected a whole number of samples; {found}")
+
+    def error(self, field: str, expected: str) -> InputError:
+        """The error for the value of a field of this header."""
+        return InputError(expected, field=f"record {self.name}: {field}", value=getattr(self, field))
 
     def part(self, start: int, stop: int) -> RecordHeader:
         """Header of samples start .. stop."""
@@ -168,11 +156,8 @@ class RecordSource(ABC):
         step = longest
         if period := self.header.period_samples:
             if period > longest:
-                raise InputError(
-                    f"expected periods of at most {longest} samples, to be read in pieces",
-                    field=f"record {self.header.name}: period_s",
-                    value=self.header.period_s,
-                )
+                words = f"expected periods of at most {longest} samples, to be read in pieces"
+                raise self.header.error("period_s", words)
             step = longest // period * period
         for start, stop in ranges(self.header.samples, step):
             yield self.load(start, stop)
@@ -192,19 +177,17 @@ class Record(RecordSource):
 
     def __post_init__(self) -> None:
         h = self.header
-        columns = {"u": h.u_names, "y": h.y_names} | ({} if self.floor is None else {"floor": h.floor_names})
-        for field, names in columns.items():
-            array = np.asarray(getattr(self, field), float)
-            if array.shape != (h.samples, len(names)):
-                raise InputError(
-                    f"expected shape {(h.samples, len(names))}: {h.samples} samples of {len(names)} channels",
-                    field=f"record {h.name}: {field}",
-                    value=array.shape,
-                )
-            require_finite(array, names, f"record {h.name}: {field}")
-            object.__setattr__(self, field, array)
         if self.floor is None and h.floor_names:
             raise InputError("floor channels are named but there are no floor samples", field=f"record {h.name}: floor")
+        columns = {"u": h.u_names, "y": h.y_names} | ({} if self.floor is None else {"floor": h.floor_names})
+        for role, names in columns.items():
+            array, shape = np.asarray(getattr(self, role), float), (h.samples, len(names))
+            field = f"record {h.name}: {role}"
+            if array.shape != shape:
+                words = f"expected shape {shape}: {h.samples} samples of {len(names)} channels"
+                raise InputError(words, field=field, value=array.shape)
+            require_finite(array, names, field)
+            object.__setattr__(self, role, array)
 
     @property
     def time(self) -> np.ndarray:
@@ -215,12 +198,8 @@ class Record(RecordSource):
         stop = self.header.samples if stop is None else stop
         if (start, stop) == (0, self.header.samples):
             return self
-        return Record(
-            self.header.part(start, stop),
-            self.u[start:stop],
-            self.y[start:stop],
-            None if self.floor is None else self.floor[start:stop],
-        )
+        floor = None if self.floor is None else self.floor[start:stop]
+        return Record(self.header.part(start, stop), self.u[start:stop], self.y[start:stop], floor)
 
 
 class Portion(RecordSource):
@@ -256,14 +235,11 @@ class Campaign:
         if not self.records:
             raise InputError("expected at least one record", field="records")
         first = self.records[0].header
-        for record in self.records[1:]:
-            for field in ("sample_rate_Hz", "u_names", "y_names", "u_unit", "y_unit"):
-                if getattr(record.header, field) != getattr(first, field):
-                    raise InputError(
-                        f"expected {getattr(first, field)!r} as in record {first.name}",
-                        field=f"record {record.header.name}: {field}",
-                        value=getattr(record.header, field),
-                    )
+        for field in ("sample_rate_Hz", "u_names", "y_names", "u_unit", "y_unit"):
+            usual = getattr(first, field)
+            for record in self.records:
+                if getattr(record.header, field) != usual:
+                    raise record.header.error(field, f"expected {usual!r} as in record {first.name}")
 
     @property
     def sample_rate_Hz(self) -> float:

@@ -22,7 +22,7 @@ on the distribution, and is then valid for signals of this kind.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -48,7 +48,6 @@ class ExcitationSignals:
     u : (records, samples, n_u) V, held between samples.
     period_s : period of a multisine, otherwise None.
     line_Hz : (n_lines,) excited lines of all inputs; empty for noise.
-    detection_Hz : lines of the grid inside the band that were left out at random.
     limit_V : maximum voltage.
     crest_before : (records, n_u) crest factor with the initial random phases.
     settings : all settings used for the design, including the seed, as plain values.
@@ -60,7 +59,6 @@ class ExcitationSignals:
     u: np.ndarray
     period_s: float | None
     line_Hz: np.ndarray
-    detection_Hz: np.ndarray
     limit_V: float
     crest_before: np.ndarray
     settings: dict[str, Any] = field(default_factory=dict)
@@ -91,12 +89,11 @@ class ExcitationSignals:
         rms_V = largest if rms_V is None else rms_V
         require_positive(rms_V, "rms_V")
         if rms_V > largest * (1 + 1e-12):
-            raise InputError(
-                f"expected at most {largest:.6g} V r.m.s.: with a crest factor of "
-                f"{self.limit_V / largest:.3f} more would exceed the limit of {self.limit_V:g} V",
-                field="rms_V",
-                value=rms_V,
+            message = (
+                f"expected at most {largest:.6g} V r.m.s.: with a crest factor of {self.limit_V / largest:.3f} more "
+                f"would exceed the limit of {self.limit_V:g} V"
             )
+            raise InputError(message, field="rms_V", value=rms_V)
         # Round-off must not push the peak beyond the limit.
         u = np.clip(self.u * (rms_V / self.rms_V[:, None, :]), -self.limit_V, self.limit_V)
         return replace(self, u=u, settings=self.settings | {"rms_V": float(rms_V)})
@@ -151,11 +148,10 @@ class MultisineSettings:
         require_positive(self.period_s, "period_s")
         samples = self.period_s * self.sample_rate_Hz
         if abs(samples - round(samples)) > 1e-6 * samples or round(samples) < 4:
-            raise InputError(
-                f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is {samples:.6g}",
-                field="period_s",
-                value=self.period_s,
+            message = (
+                f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is {samples:.6g}"
             )
+            raise InputError(message, field="period_s", value=self.period_s)
         for name, known in (("lines", get_args(Lines)), ("scheme", get_args(Scheme))):
             if getattr(self, name) not in known:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
@@ -185,7 +181,7 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
     InputError : a band that leaves an input without lines, a level beyond the limit.
     """
     rng, n_u, N = np.random.default_rng(settings.seed), len(settings.inputs), settings.samples
-    lines, detection = choose_lines(settings, rng)
+    lines, _ = choose_lines(settings, rng)
     amplitude = np.ones(lines.size) / (np.sinc(lines / N) if settings.compensate_hold else 1.0)
     T = orthogonal_matrix(n_u) if settings.scheme == "orthogonal" else np.ones((1, 1))
     u, before = [], []
@@ -204,7 +200,6 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
         np.concatenate(u),
         settings.period_s,
         lines / settings.period_s,
-        detection / settings.period_s,
         settings.limit_V,
         crest_factor(np.moveaxis(np.concatenate(before), 1, -1)),
         _plain(settings),
@@ -237,12 +232,9 @@ def choose_lines(settings: MultisineSettings, rng: np.random.Generator) -> tuple
     lines = grid[~left_out]
     least = len(settings.inputs) if settings.scheme == "zippered" else 1
     if lines.size < least:
-        raise InputError(
-            f"expected a band with at least {least} lines {settings.spacing / settings.period_s:g} Hz "
-            f"apart ({settings.lines}); it has {lines.size}",
-            field="band_Hz",
-            value=settings.band_Hz,
-        )
+        apart = f"{settings.spacing / settings.period_s:g} Hz apart ({settings.lines})"
+        message = f"expected a band with at least {least} lines {apart}; it has {lines.size}"
+        raise InputError(message, field="band_Hz", value=settings.band_Hz)
     return lines, grid[left_out]
 
 
@@ -285,12 +277,8 @@ def noise(settings: NoiseSettings) -> ExcitationSignals:
     rng, N = np.random.default_rng(settings.seed), round(settings.duration_s * settings.sample_rate_Hz)
     if N < 4:
         raise InputError("expected at least 4 samples", field="duration_s", value=settings.duration_s)
-    u = np.array(
-        [
-            band_limited(N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs), rng)
-            for _ in range(settings.records)
-        ]
-    )
+    shape = N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs)
+    u = np.array([band_limited(*shape, rng) for _ in range(settings.records)])
     u = u / np.sqrt(np.mean(u**2, axis=1, keepdims=True))
     return ExcitationSignals(
         "noise",
@@ -298,7 +286,6 @@ def noise(settings: NoiseSettings) -> ExcitationSignals:
         settings.sample_rate_Hz,
         u,
         None,
-        np.zeros(0),
         np.zeros(0),
         settings.limit_V,
         crest_factor(np.moveaxis(u, 1, -1)),
@@ -314,11 +301,8 @@ def band_limited(
     inside = (frequency >= band_Hz[0] * (1 - 1e-9)) & (frequency <= band_Hz[1] * (1 + 1e-9)) & (frequency > 0)
     inside &= 2 * np.arange(frequency.size) < samples
     if not np.any(inside):
-        raise InputError(
-            f"expected a band with a multiple of 1/duration = {sample_rate_Hz / samples:.4g} Hz inside",
-            field="band_Hz",
-            value=band_Hz,
-        )
+        message = f"expected a band with a multiple of 1/duration = {sample_rate_Hz / samples:.4g} Hz inside"
+        raise InputError(message, field="band_Hz", value=band_Hz)
     spectrum = np.zeros((frequency.size, channels), complex)
     draw = rng.standard_normal((2, np.count_nonzero(inside), channels))
     spectrum[inside] = (draw[0] + 1j * draw[1]) * samples / (2 * np.sqrt(np.count_nonzero(inside)))
@@ -327,8 +311,7 @@ def band_limited(
 
 def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
     """Settings as numbers, strings and lists, for files."""
-    values = {one.name: getattr(settings, one.name) for one in fields(settings)}
-    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in vars(settings).items()}
     return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}
 
 
@@ -343,17 +326,13 @@ def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
         require_positive(settings.rms_V, "rms_V")
     require_whole(settings.seed, "seed", 0)
     if len(band_Hz) != 2 or not (np.all(np.isfinite(band_Hz)) and 0 < band_Hz[0] <= band_Hz[1] < rate / 2):
-        raise InputError(
-            f"expected two frequencies above 0 and below half the sample rate ({rate / 2:g} Hz), the lower one first",
-            field="band_Hz",
-            value=tuple(band_Hz),
+        message = (
+            f"expected two frequencies above 0 and below half the sample rate ({rate / 2:g} Hz), the lower one first"
         )
+        raise InputError(message, field="band_Hz", value=tuple(band_Hz))
 
 
 def _check_size(voltages: float, field: str) -> None:
     if voltages > MOST_VOLTAGES:
-        raise InputError(
-            f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory; "
-            f"there would be {voltages:.3g}",
-            field=field,
-        )
+        message = f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory"
+        raise InputError(f"{message}; there would be {voltages:.3g}", field=field)

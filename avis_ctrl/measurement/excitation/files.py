@@ -41,9 +41,8 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
     path = Path(path)
     require_suffix(path)
     if not isinstance(periods, (int, np.integer)) or periods < 1 or (periods > 1 and signals.period_s is None):
-        raise InputError(
-            "expected a whole number, 1 or more (noise is not periodic: 1)", field="periods", value=periods
-        )
+        message = "expected a whole number, 1 or more (noise is not periodic: 1)"
+        raise InputError(message, field="periods", value=periods)
     writer = {".csv": _write_csv, ".mat": _write_mat}.get(path.suffix.lower(), _write_hdf5)
     writer(signals, int(periods), path, rig)
 
@@ -89,12 +88,8 @@ def _write_csv(signals: ExcitationSignals, periods: int, path: Path, rig: str) -
 
 def _write_mat(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
     if (total := signals.u.nbytes * periods) >= MAT5_BYTES:
-        raise InputError(
-            f"expected less than {MAT5_BYTES / 2**30:g} GiB in a .mat file; write .h5 instead",
-            file=path,
-            field="u",
-            value=f"{total / 2**30:.1f} GiB",
-        )
+        message = f"expected less than {MAT5_BYTES / 2**30:g} GiB in a .mat file; write .h5 instead"
+        raise InputError(message, file=path, field="u", value=f"{total / 2**30:.1f} GiB")
     content = {
         "u": np.moveaxis(np.tile(signals.u, (1, periods, 1)), 0, -1),
         "names": np.array(signals.inputs, object),

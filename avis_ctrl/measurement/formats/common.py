@@ -51,9 +51,8 @@ def reading(path: object, what: str = "the file") -> Iterator[None]:
             raise
         raise error.in_file(path) from None
     except MemoryError:
-        raise InputError(
-            "the stated sizes do not fit in memory: the file is damaged, or too large to be read whole", file=path
-        ) from None
+        message = "the stated sizes do not fit in memory: the file is damaged, or too large to be read whole"
+        raise InputError(message, file=path) from None
     except OSError as error:
         raise InputError(f"{what} cannot be read ({short(error)})", file=path) from error
 
@@ -66,9 +65,8 @@ def within(where: str) -> Iterator[None]:
     except InputError as error:
         if error.file is not None or f"{error.field}:".startswith(f"{where}:"):
             raise
-        raise InputError(
-            error.expected, field=f"{where}: {error.field}" if error.field else where, value=error.value
-        ) from None
+        field = f"{where}: {error.field}" if error.field else where
+        raise InputError(error.expected, field=field, value=error.value) from None
 
 
 def existing_file(path: str | Path) -> Path:
@@ -103,11 +101,11 @@ def require_small(path: Path, size: int | None = None) -> int:
     """
     size = path.stat().st_size if size is None else size
     if size > LARGEST_IN_MEMORY:
-        raise InputError(
-            f"has {size / 1e9:.3g} GB; this format is read whole, up to {LARGEST_IN_MEMORY / 1e9:.3g} GB: "
-            "convert the file to an HDF5 campaign (/records/00/u and y), which is read in pieces",
-            file=path,
+        message = (
+            f"has {size / 1e9:.3g} GB; this format is read whole, up to {LARGEST_IN_MEMORY / 1e9:.3g} GB: convert the "
+            "file to an HDF5 campaign (/records/00/u and y), which is read in pieces"
         )
+        raise InputError(message, file=path)
     return size
 
 
@@ -172,11 +170,8 @@ def as_names(value: Any, field: str, count: int | None = None) -> tuple[str, ...
     if not all(name and name.isprintable() for name in names):
         raise InputError("expected printable names that are not empty", field=field, value=brief(names))
     if count is not None and len(names) != count:
-        raise InputError(
-            f"expected one name for each channel; there are {count} channels and {len(names)} names",
-            field=field,
-            value=brief(names),
-        )
+        message = f"expected one name for each channel; there are {count} channels and {len(names)} names"
+        raise InputError(message, field=field, value=brief(names))
     if len(set(names)) != len(names):
         raise InputError("expected different names", field=field, value=brief(names))
     return names
@@ -201,9 +196,8 @@ def unit_of(label: str, field: str, allowed: Sequence[str] | None = None) -> Uni
     text = text[:-1] + "^2" if text.endswith("s2") else text
     known = UNITS.get(text)
     if known is None or (allowed is not None and known[0] not in allowed):
-        raise InputError(
-            f"expected a unit of {', '.join(allowed or OUTPUT_UNITS)} (or mV, mm/s, g, ...)", field=field, value=label
-        )
+        units = ", ".join(allowed or OUTPUT_UNITS)
+        raise InputError(f"expected a unit of {units} (or mV, mm/s, g, ...)", field=field, value=label)
     return Unit(*known)
 
 
@@ -214,12 +208,11 @@ def units_of(value: Any, role: str, count: int) -> tuple[str, tuple[float, ...]]
     if len(array) not in (1, count):
         raise InputError(f"expected one unit, or one for each of {count} channels", field=field, value=brief(value))
     units = [unit_of(as_text(item, field), field, ALLOWED[role]) for item in array]
-    if len({unit.si for unit in units}) > 1:
-        raise InputError(
-            "expected one physical quantity for all channels", field=field, value=[unit.si for unit in units]
-        )
+    found = [unit.si for unit in units]
+    if len(set(found)) > 1:
+        raise InputError("expected one physical quantity for all channels", field=field, value=found)
     factors = tuple(unit.factor for unit in units)
-    return units[0].si, factors * count if len(factors) == 1 else factors
+    return found[0], factors * count if len(factors) == 1 else factors
 
 
 def require(fields: Mapping[str, Any], name: str, expected: str) -> Any:
@@ -231,14 +224,9 @@ def require(fields: Mapping[str, Any], name: str, expected: str) -> Any:
 
 def stated_period(value: Any, field: str) -> float | None:
     """Period of a record in s; None if empty, NaN or 0, as struct arrays and tables mark records without a period."""
-    if isinstance(value, np.ndarray) and value.size == 0:
-        return None
-    single = _single(value)
-    if single is None or (
-        isinstance(single, (int, float)) and not isinstance(single, bool) and (single == 0 or np.isnan(single))
-    ):
-        return None
-    return as_number(single, field)
+    single = None if isinstance(value, np.ndarray) and value.size == 0 else _single(value)
+    none = single is None or (type(single) in (int, float) and (single == 0 or np.isnan(single)))
+    return None if none else as_number(single, field)
 
 
 def is_number(text: str) -> bool:

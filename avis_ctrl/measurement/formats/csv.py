@@ -24,7 +24,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource, require_finite
 from avis_ctrl.measurement.formats.common import INPUT_NAME, existing_file, is_number, reading, require_small, within
-from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
+from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, campaign_from, mapped, pick, record_from
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
 CHUNK = 1 << 16  # lines that are converted to numbers at once
@@ -59,11 +59,8 @@ def read(
     path, hints = Path(path), hints or Hints()
     files = [path]
     if path.is_dir():
-        files = sorted(
-            file
-            for file in path.iterdir()
-            if file.suffix.lower() == ".csv" and file.is_file() and not file.name.startswith(".")
-        )
+        shown = [file for file in path.iterdir() if not file.name.startswith(".")]
+        files = sorted(file for file in shown if file.suffix.lower() == ".csv" and file.is_file())
         if not files:
             raise InputError("expected CSV files (*.csv) in the directory; there is none", file=path)
     with reading(path):
@@ -75,9 +72,8 @@ def read(
         records.append(record)
         notes += assumed
         rigs.append(stated)
-    harmonised, assumed = one_clock(records)
     with reading(path):
-        return Campaign(rig or rigs[0] or UNNAMED, harmonised, str(path), tuple([*notes, *assumed]))
+        return campaign_from(records, notes, rig or rigs[0], path)
 
 
 def is_text(head: bytes) -> bool:
@@ -130,11 +126,8 @@ def _layout(lines: Iterator[str], numbered: bool = False) -> Layout:
         if numbered:  # no header line; the columns are given by number
             names = [str(k + 1) for k in range(len(titles))]
             return Layout(names, [None] * len(names), separator, stated, count - 1)
-        raise InputError(
-            "expected a header line with the names of the columns, found numbers",
-            field=f"line {count}",
-            value=line[:60],
-        )
+        message = "expected a header line with the names of the columns, found numbers"
+        raise InputError(message, field=f"line {count}", value=line[:60])
     names, units = [], []
     for title in titles:
         match = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", title)
@@ -168,23 +161,21 @@ def _roles(layout: Layout, columns: Mapped | None, path: Path) -> dict[str, list
             for role, pattern in USUAL.items()
         }
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(layout.names) else []
-    for role, wanted in (("t", "at most one column"), ("y", "at least one column")):
-        if len(roles[role]) > 1 if role == "t" else not roles[role]:
-            if not roles["t"] and not _followed_by_numbers(path, layout, layout.separator):
-                raise InputError(
-                    "expected columns separated by commas, semicolons or tabs; these are separated by spaces"
-                    if _followed_by_numbers(path, layout, None)
-                    else "not a measurement file: a text without a header line followed by lines of numbers",
-                    field=f"line {layout.lines}",
-                    value=", ".join(layout.names)[:60],
-                )
-            raise InputError(
-                f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns, on "
-                "the command line --columns u=NAME+NAME,y=NAME+NAME (roles t, u, y, floor)",
-                field=role,
-                value=roles[role],
-            )
-    return roles
+    if len(roles["t"]) <= 1 and roles["y"]:
+        return roles
+    if not roles["t"] and not _followed_by_numbers(path, layout, layout.separator):
+        message = (
+            "expected columns separated by commas, semicolons or tabs; these are separated by spaces"
+            if _followed_by_numbers(path, layout, None)
+            else "not a measurement file: a text without a header line followed by lines of numbers"
+        )
+        raise InputError(message, field=f"line {layout.lines}", value=", ".join(layout.names)[:60])
+    role, wanted = ("t", "at most one column") if len(roles["t"]) > 1 else ("y", "at least one column")
+    message = (
+        f"expected {wanted}; the file has {', '.join(layout.names)}; assign them with columns, on the command line "
+        "--columns u=NAME+NAME,y=NAME+NAME (roles t, u, y, floor)"
+    )
+    raise InputError(message, field=role, value=roles[role])
 
 
 def _followed_by_numbers(path: Path, layout: Layout, separator: str | None) -> bool:
@@ -207,14 +198,12 @@ def _record(path: Path, columns: Mapped | None, hints: Hints) -> tuple[RecordSou
         table, place = _table(lines, layout, use)
     at = {layout.names[k]: i for i, k in enumerate(use)}
     unit = dict(zip(layout.names, layout.units, strict=True))
+    parts = {}
     for role, names in roles.items():
-        if role != "t":
-            require_finite(table[:, [at[name] for name in names]], names, None, place)
-    parts = {
-        role: Part(names, [unit[name] for name in names], table[:, [at[name] for name in names]])
-        for role, names in roles.items()
-        if role != "t" and (names or role != "floor")
-    }
+        if role in ("u", "y") or (role == "floor" and names):
+            samples = table[:, [at[name] for name in names]]
+            require_finite(samples, names, None, place)
+            parts[role] = Part(names, [unit[name] for name in names], samples)
     hints = _with_stated(hints, layout.stated)
     time = roles["t"][0] if roles["t"] else ""
     rate, start, note = _clock(table[:, at[time]] if time else None, unit.get(time), place, hints)
@@ -260,17 +249,11 @@ def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> tuple[np.nda
             chunk = [line.replace(",", ".") for line in chunk]
         for number, line in enumerate(chunk, row + 1):
             count = line.count(layout.separator)
-            if (
-                count != separators
-                and line.strip()
-                and (count, line.rstrip()[-1:]) != (separators + 1, layout.separator.strip())
-            ):
-                raise InputError(
-                    f"expected {separators + 1} columns, as in the header; there are {count + 1}"
-                    + ("; with decimal commas, separate columns by ;" * (layout.separator == ",")),
-                    field=f"line {number}",
-                    value=line[:60],
-                )
+            ends = (count, line.rstrip()[-1:]) == (separators + 1, layout.separator.strip())
+            if count != separators and line.strip() and not ends:
+                hint = "; with decimal commas, separate columns by ;" if layout.separator == "," else ""
+                message = f"expected {separators + 1} columns, as in the header; there are {count + 1}{hint}"
+                raise InputError(message, field=f"line {number}", value=line[:60])
         filled = [line for line in chunk if line.strip()]
         numbers.append(np.array([number for number, line in enumerate(chunk, row + 1) if line.strip()], dtype=int))
         try:
@@ -294,10 +277,8 @@ def _misfit(chunk: list[str], row: int, sample: int, layout: Layout, use: list[i
             if not is_number(entries[column]) or "_" in entries[column]:
                 found = entries[column].strip()
                 units = "; units belong in the header, such as t [s]" if sample == 0 and found.isalpha() else ""
-                return InputError(
-                    f"expected a number{units}" if found else "expected a number, found nothing",
-                    field=f"line {number} (sample {sample}), column {layout.names[column]}",
-                    value=found[:40],
-                )
+                message = f"expected a number{units}" if found else "expected a number, found nothing"
+                field = f"line {number} (sample {sample}), column {layout.names[column]}"
+                return InputError(message, field=field, value=found[:40])
         sample += bool(line.strip())
     return InputError("expected numbers", field=f"lines {row + 1} to {row + len(chunk)}")

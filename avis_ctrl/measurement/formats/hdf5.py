@@ -20,7 +20,8 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Campaign, RecordSource, ranges
+from avis_ctrl.measurement.formats import stored
 from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
@@ -36,17 +37,7 @@ from avis_ctrl.measurement.formats.common import (
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, record_from
 from avis_ctrl.measurement.formats.response import COVARIANCES, stated_response
-from avis_ctrl.measurement.formats.stored import (
-    Columns,
-    access,
-    attributes,
-    full_name,
-    layout,
-    member,
-    members,
-    open_hdf5,
-    values,
-)
+from avis_ctrl.measurement.formats.stored import Columns
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 FORMAT, VERSION = "avis-campaign", 1
@@ -88,21 +79,18 @@ def read(
     InputError : not an HDF5 campaign, a missing or wrong attribute or data set; names file, record and field.
     """
     path, hints = existing_file(path), hints or Hints()
-    with reading(path, "the HDF5 file"), open_hdf5(path) as file:
-        names = members(file)
+    with reading(path, "the HDF5 file"), stored.open_hdf5(path) as file:
+        names = stored.members(file)
         response = "frf" in names and "records" not in names
         used = ("averages", "relative_standard_deviation") if response else ()
         for name, value in {"columns": columns, **vars(hints)}.items():
             if value is not None and name not in used:
                 raise InputError("an HDF5 campaign states this itself; omit this argument", field=name, value=value)
         stated = _check_root(file)
-        group = member(file, "frf" if response else "records")
+        group = stored.member(file, "frf" if response else "records")
         if not isinstance(group, h5py.Group):
-            words = (
-                "missing; expected a group with one group per record"
-                if group is None
-                else "expected a group, found a data set"
-            )
+            missing = "missing; expected a group with one group per record"
+            words = missing if group is None else "expected a group, found a data set"
             raise InputError(f"{words}; the file holds {_listed(file)}", field="/frf" if response else "/records")
         if response:
             with within("/frf"):
@@ -118,12 +106,12 @@ def read(
 
 def _listed(group: h5py.Group) -> str:
     """Names of the members of a group, for messages."""
-    return ", ".join(sorted(map(printable, members(group)))) or "nothing"
+    return ", ".join(sorted(map(printable, stored.members(group)))) or "nothing"
 
 
 def _check_root(file: h5py.File) -> str:
     """Name of the rig, after format and version have been checked."""
-    found = attributes(file, "format", "version", "rig")
+    found = stored.attributes(file, "format", "version", "rig")
     with within("attributes of the file"):
         require(found, "format", f"{FORMAT!r}")
         require(found, "version", f"{VERSION}")
@@ -141,36 +129,32 @@ def check_version(stated: Any, version: Any) -> None:
 
 def _in_order(group: h5py.Group) -> list[str]:
     """Names in the order of creation, if the file kept it; otherwise in natural order ("2" before "10")."""
-    with access("/records"):
+    with stored.access("/records"):
         in_order = group.id.get_create_plist().get_link_creation_order()
     if in_order:
-        return members(group)
-    return sorted(
-        members(group),
-        key=lambda name: [
-            (part.isdigit(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)
-        ],
-    )
+        return stored.members(group)
+
+    def natural(name: str) -> list[tuple[bool, int, str]]:
+        return [(part.isdigit(), int(part) if part.isdecimal() else 0, part) for part in re.split(r"(\d+)", name)]
+
+    return sorted(stored.members(group), key=natural)
 
 
 def _record(group: h5py.Group, name: str, path: str) -> RecordSource:
-    record = member(group, name)
+    record = stored.member(group, name)
     if not isinstance(record, h5py.Group):
         raise InputError("expected a group with u and y, found a data set")
     parts = {}
     for role in ROLES:
-        dataset = member(record, role)
+        dataset = stored.member(record, role)
         if dataset is not None:
             parts[role] = _part(dataset, role)
         elif role != "floor":
-            raise InputError(
-                f"missing; expected a data set (samples, channels); the record holds {_listed(record)}", field=role
-            )
-    if "floor" in parts and tuple(parts["floor"].names) != FLOOR_NAMES:
-        raise InputError(
-            f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names", value=parts["floor"].names
-        )
-    found = attributes(record, *STATED, "period_s")
+            message = f"missing; expected a data set (samples, channels); the record holds {_listed(record)}"
+            raise InputError(message, field=role)
+    if "floor" in parts and (names := tuple(parts["floor"].names)) != FLOOR_NAMES:
+        raise InputError(f"expected the three velocities {', '.join(FLOOR_NAMES)}", field="floor names", value=names)
+    found = stored.attributes(record, *STATED, "period_s")
     for field, expected in STATED.items():
         require(found, field, expected)
     hints = Hints().completed(found)
@@ -185,29 +169,25 @@ def _part(dataset: Any, role: str) -> Part:
         raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
     if count > samples:
-        raise InputError(
-            f"expected (samples, channels) with more samples than channels; {samples} samples of "
-            f"{count} channels look transposed",
-            field=role,
-            value=shape,
+        message = (
+            f"expected (samples, channels) with more samples than channels; {samples} samples of {count} channels look "
+            "transposed"
         )
-    stated = attributes(dataset, "names", "unit")
+        raise InputError(message, field=role, value=shape)
+    stated = stored.attributes(dataset, "names", "unit")
     with within(role):
         names, unit = require(stated, "names", "the channels' names"), require(stated, "unit", "such as 'V'")
-    return Part(as_names(names, f"{role} names", count), unit, Columns(full_name(dataset), samples))
+    return Part(as_names(names, f"{role} names", count), unit, Columns(stored.full_name(dataset), samples))
 
 
 def _layout(dataset: Any, field: str, kinds: str) -> tuple[tuple[int, ...] | None, np.dtype]:
     """Shape and type of a data set of these kinds of numbers."""
     if not isinstance(dataset, h5py.Dataset):
         raise InputError("expected a data set, found a group", field=field)
-    shape, dtype = layout(dataset)
+    shape, dtype = stored.layout(dataset)
     if dtype.kind not in kinds:
-        raise InputError(
-            "expected numbers" if "c" in kinds else "expected real numbers",
-            field=field,
-            value=f"data set of {kind_of(dtype)}",
-        )
+        message = "expected numbers" if "c" in kinds else "expected real numbers"
+        raise InputError(message, field=field, value=f"data set of {kind_of(dtype)}")
     return shape, dtype
 
 
@@ -215,7 +195,7 @@ def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
     fields = {name: _numbers(path, group, name, kinds) for name, kinds in DATASETS.items()}
     if fields["frequency_Hz"] is None or fields["value"] is None:
         raise InputError(f"expected frequency_Hz and value; the group holds {_listed(group)}")
-    stated = attributes(group, *NAMED, "method", "dof", "averages")
+    stated = stored.attributes(group, *NAMED, "method", "dof", "averages")
     for field, expected in NAMED.items():
         require(stated, field, expected)
     return stated_response(fields | stated, hints)
@@ -223,12 +203,12 @@ def _response(path: Path, group: h5py.Group, hints: Hints) -> FrequencyResponse:
 
 def _numbers(path: Path, group: h5py.Group, name: str, kinds: str) -> Any:
     """Values of the data set with this name, None if there is none."""
-    dataset = member(group, name)
+    dataset = stored.member(group, name)
     if dataset is None:
         return None
     shape, dtype = _layout(dataset, name, kinds)
     require_small(path, math.prod(shape or ()) * dtype.itemsize)
-    return values(dataset)
+    return stored.values(dataset)
 
 
 def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20) -> None:
@@ -256,18 +236,12 @@ def write_campaign(path: str | Path, campaign: Campaign, longest: int = 1 << 20)
 
 def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None:
     header = record.header
-    group.attrs.update(
-        {
-            "sample_rate_Hz": header.sample_rate_Hz,
-            "excitation": header.excitation,
-            "level_V": header.level_V,
-            "start_s": header.start_s,
-        }
-    )
+    group.attrs.update({name: getattr(header, name) for name in STATED})
     if header.period_s is not None:
         group.attrs["period_s"] = header.period_s
     datasets = {}
-    for role, names, unit in _roles(header):
+    for role in ROLES if header.floor_names else ROLES[:2]:
+        names, unit = getattr(header, f"{role}_names"), getattr(header, f"{role}_unit")
         shape = (header.samples, len(names))
         chunks = (min(CHUNK, header.samples), len(names)) if names else None
         datasets[role] = group.create_dataset(role, shape, np.float64, chunks=chunks)
@@ -277,11 +251,6 @@ def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None
         piece = record.load(start, stop)
         for role, dataset in datasets.items():
             dataset[start:stop] = getattr(piece, role)
-
-
-def _roles(header: RecordHeader) -> list[tuple[str, tuple[str, ...], str]]:
-    roles = [("u", header.u_names, header.u_unit), ("y", header.y_names, header.y_unit)]
-    return roles + ([("floor", header.floor_names, header.floor_unit)] if header.floor_names else [])
 
 
 def write_frequency_response(path: str | Path, response: FrequencyResponse, rig: str = "unnamed") -> None:

@@ -1,15 +1,8 @@
-"""MATLAB .mat files, v5 and v7.3: records in two layouts, or a frequency response.
+"""MATLAB .mat files, v5 and v7.3: records in the two layouts of `layouts.FORMATS`, or a frequency response.
 
-Layout A, the contract's: a struct array (or cell array of structs) `records` with the fields u, y and sample_rate_Hz,
-and, if known, excitation, level_V, start_s, period_s (empty, 0 or NaN if not periodic), floor, u_names, y_names,
-u_unit, y_unit, floor_unit, t; next to it `rig`.
-
-Layout B, flat variables of one record: u, y, t or fs (Fs, sample_rate_Hz) or Ts, optionally floor, u_names, y_names,
-u_unit, y_unit, excitation, level_V, period_s, start_s, rig; a column mapping assigns variables with other names.
-
-A frequency response is frequency_Hz, H, variance or coherence with averages, inputs, outputs and their units.
-
-Samples of v7.3 files stay on disk. Samples may be rows or columns; ambiguous arrays are rejected.
+`records` may also be a cell array of structs; floor_unit is a further optional field. A column mapping assigns flat
+variables with other names. Samples of v7.3 files stay on disk. Samples may be rows or columns; ambiguous arrays are
+rejected.
 """
 
 from __future__ import annotations
@@ -95,7 +88,7 @@ def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
     """
     frequency, H = _array(tree, "frequency_Hz").reshape(-1), _array(tree, "H")
     n_y, n_u = _sizes(tree, H, len(frequency))
-    fields = {
+    fields: dict[str, Any] = {
         "input_unit": "V",
         "output_unit": "V",
         "outputs": [f"y{i + 1}" for i in range(n_y)],
@@ -104,13 +97,12 @@ def _response(tree: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
     fields |= {field: tree[field] for field in fields if field in tree}
     for field, count in (("outputs", n_y), ("inputs", n_u)):
         as_names(fields[field], field, count)
-    shaped = {
-        field: _lines_first(_array(tree, field), (len(frequency), n_y, n_u), field)
-        for field in ("H", "variance", "coherence")
-        if field in tree
-    }
-    averages = {"averages": _array(tree, "averages")} if "averages" in tree else {}
-    return stated_response({"frequency_Hz": frequency, "value": shaped.pop("H"), **fields, **shaped, **averages}, hints)
+    for field, array in (("value", "H"), ("variance", "variance"), ("coherence", "coherence")):
+        if array in tree:
+            fields[field] = _lines_first(_array(tree, array), (len(frequency), n_y, n_u), array)
+    if "averages" in tree:
+        fields["averages"] = _array(tree, "averages")
+    return stated_response({"frequency_Hz": frequency, **fields}, hints)
 
 
 def _array(tree: Mapping[str, Any], name: str) -> np.ndarray:
@@ -145,13 +137,9 @@ def _lines_first(array: np.ndarray, sizes: tuple[int, int, int], field: str) -> 
     if n_y == n_u == 1 and array.size == n:
         return array.reshape(sizes)
     if first and last:
-        raise InputError(
-            f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})",
-            field=field,
-            value=array.shape,
-        )
+        message = f"the dimension of frequency is ambiguous: there are as many lines as channels ({n})"
+        raise InputError(message, field=field, value=array.shape)
     if not first and not last:
-        raise InputError(
-            f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs", field=field, value=array.shape
-        )
+        message = f"expected shape {sizes} or {(n_y, n_u, n)}: lines, outputs, inputs"
+        raise InputError(message, field=field, value=array.shape)
     return array.reshape(sizes) if first else np.moveaxis(array.reshape(n_y, n_u, n), 2, 0)

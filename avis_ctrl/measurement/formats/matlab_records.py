@@ -18,7 +18,7 @@ from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
 from avis_ctrl.measurement.formats.common import as_names, as_number, as_text, numbers, require_small, within
 from avis_ctrl.measurement.formats.hdf5 import FORMAT, VERSION, check_version
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, Unreadable, describe, overview
-from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
+from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, campaign_from, mapped, pick, record_from
 from avis_ctrl.measurement.formats.stored import Columns
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
@@ -78,8 +78,7 @@ def campaign(path: Path, tree: Mapping[str, Any], columns: Mapped | None, rig: s
             record, assumed = _record(path, name, {**tree, **fields}, fields, columns, own, end)
         built.append(record)
         notes += assumed
-    harmonised, assumed = one_clock(built)
-    return Campaign(_rig(rig, tree), harmonised, str(path), (*notes, *assumed))
+    return campaign_from(built, notes, _rig(rig, tree), path)
 
 
 def flat_campaign(
@@ -98,9 +97,8 @@ def _structs(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
     records = tree["records"]
     records = [records] if isinstance(records, dict) else records
     if not isinstance(records, list) or not records or not all(isinstance(record, dict) for record in records):
-        raise InputError(
-            "expected a struct array or a cell array of structs", field="records", value=describe(tree["records"])
-        )
+        found = describe(tree["records"])
+        raise InputError("expected a struct array or a cell array of structs", field="records", value=found)
     return records
 
 
@@ -154,11 +152,11 @@ def _record(
     flat = fields is tree
     for role in ("u", "y"):
         if not chosen[role] and (role == "y" or hints.excitation not in ("rest", "floor")):
-            raise InputError(
-                f"no variable has a usual name; the file has {overview(fields)}; assign the variables "
-                "with columns (such as u=vir, y=qm, t=t)",
-                field=role,
+            message = (
+                f"no variable has a usual name; the file has {overview(fields)}; assign the variables with columns "
+                "(such as u=vir, y=qm, t=t)"
             )
+            raise InputError(message, field=role)
     matrices = {
         role: [_matrix(fields[variable], variable) for variable in chosen[role]]
         for role in ("u", "y", "floor")
@@ -169,9 +167,8 @@ def _record(
     if not chosen["sample_rate_Hz"] and hints.sample_rate_Hz is None and chosen["t"]:
         notes.append(f"sample rate not stated; {rate:.9g} Hz by {chosen['t'][0]}")
     stated = _stated_names(matrices, chosen, tree)
-    samples = _sample_count(
-        matrices, {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1}, known
-    )
+    channels = {role: len(names) for role, names in stated.items() if len(matrices[role]) == 1}
+    samples = _sample_count(matrices, channels, known)
     if hints.start_s is None and end_s is not None and (not chosen["t"] or start < end_s):
         start = end_s
         notes.append("start_s not stated; it follows the record before it")
@@ -191,17 +188,13 @@ def _record(
             )
             notes += [] if flat else [f"{role}_names not stated; numbered {names[0]} to {names[-1]}"]
         elif len(names) != sum(counts):
-            raise InputError(
-                f"expected {sum(counts)} names, one per channel; there are {len(names)}",
-                field=f"{role}_names",
-                value=names,
-            )
+            message = f"expected {sum(counts)} names, one per channel; there are {len(names)}"
+            raise InputError(message, field=f"{role}_names", value=names)
         label = _plain(fields.get(f"{role}_unit"))
-        place = (
-            Columns(str(items[0].dataset), samples, items[0].shape[0] == samples)
-            if stored
-            else np.hstack([np.zeros((samples, 0)), *(_oriented(item, samples, role) for item in items)])
-        )
+        if stored:
+            place: Columns | np.ndarray = Columns(str(items[0].dataset), samples, items[0].shape[0] == samples)
+        else:
+            place = np.hstack([np.zeros((samples, 0)), *(_oriented(item, samples, role) for item in items)])
         parts[role] = Part(names, None if _empty(label) else label, place)
     record, assumed = record_from(name, parts, rate, start, hints, str(path) if stored else "")
     return record, [*(f"record {name}: {note}" for note in notes), *assumed]
@@ -282,9 +275,8 @@ def _sample_count(
             if role in channels:
                 lengths = {length for length, others in ((rows, columns), (columns, rows)) if others == channels[role]}
                 if not lengths:
-                    raise InputError(
-                        f"expected {channels[role]} channels, as many as names; it is {rows}x{columns}", field=role
-                    )
+                    message = f"expected {channels[role]} channels, as many as names; it is {rows}x{columns}"
+                    raise InputError(message, field=role)
             possible = lengths if possible is None else possible & lengths
     if not possible:
         also = "" if known is None else f", t has {known}"
@@ -307,13 +299,8 @@ def _oriented(item: Matrix, samples: int, field: str) -> np.ndarray:
 
 def _with_stated(hints: Hints, tree: Mapping[str, Any]) -> Hints:
     """Hints completed with variables or fields of the same names."""
-    return hints.completed(
-        {
-            field: _plain(tree[field])
-            for field in ("level_V", "start_s", "period_s", "excitation")
-            if not _empty(tree.get(field))
-        }
-    )
+    names = [name for name in ("level_V", "start_s", "period_s", "excitation") if not _empty(tree.get(name))]
+    return hints.completed({name: _plain(tree[name]) for name in names})
 
 
 def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int | None) -> tuple[str, ...]:
@@ -321,11 +308,8 @@ def _names(value: Sequence[str], tree: Mapping[str, Any], field: str, count: int
     if len(value) == 1 and value[0] in tree:
         return as_names(_plain(tree[value[0]]), field, count)
     if len(value) == 1 and count is None:
-        raise InputError(
-            f"neither a variable nor a list of channel names (A+B+...); the file has {overview(tree)}",
-            field=field,
-            value=value[0],
-        )
+        message = f"neither a variable nor a list of channel names (A+B+...); the file has {overview(tree)}"
+        raise InputError(message, field=field, value=value[0])
     return as_names(list(value), field, count)
 
 

@@ -80,11 +80,8 @@ def _order(header: bytes) -> str:
     """Byte order of the file, as a format character of struct and numpy."""
     order = {b"IM": "<", b"MI": ">"}.get(header[126:128])
     if order is None or struct.unpack(order + "H", header[124:126])[0] != 0x0100:
-        raise InputError(
-            "expected version 0x0100 and the mark MI in bytes 124 to 127 of the header; damaged?",
-            value=header[124:128].hex(),
-            field="header",
-        )
+        message = "expected version 0x0100 and the mark MI in bytes 124 to 127 of the header; damaged?"
+        raise InputError(message, field="header", value=header[124:128].hex())
     return order
 
 
@@ -284,10 +281,10 @@ def _structs(elements: Elements, shape: tuple[int, ...], depth: int) -> Any:
         raise _damaged("field names: empty or equal ones")
     count = math.prod(shape)
     _require_room(elements, count * len(names))
-    if count != 1 and (count > MOST_CELLS or not names):
-        return Unreadable(
-            "struct array without fields" if not names else f"struct array of more than {MOST_CELLS} structs"
-        )
+    if count != 1 and not names:
+        return Unreadable("struct array without fields")
+    if count > MOST_CELLS:
+        return Unreadable(f"struct array of more than {MOST_CELLS} structs")
     items = [{name: _inner(elements, f"field {name}", depth) for name in names} for _ in range(count)]
     return items[0] if count == 1 else items
 

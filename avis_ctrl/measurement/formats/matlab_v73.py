@@ -13,18 +13,9 @@ import h5py
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.measurement.formats import stored
 from avis_ctrl.measurement.formats.common import printable, reading, require_small
 from avis_ctrl.measurement.formats.matlab_tree import DEEPEST, EMPTY, MOST_CELLS, TOO_DEEP, Matrix, Unreadable
-from avis_ctrl.measurement.formats.stored import (
-    attributes,
-    full_name,
-    layout,
-    member,
-    members,
-    open_hdf5,
-    values,
-    values_in,
-)
 
 MOST_ITEMS = 200_000  # of a file: references may be circular
 
@@ -36,11 +27,10 @@ def variables(path: Path) -> dict[str, Any]:
     ------
     InputError : not an HDF5 file, damaged, truncated.
     """
-    with reading(path, "the .mat file (v7.3)"), open_hdf5(path) as file:
+    with reading(path, "the .mat file (v7.3)"), stored.open_hdf5(path) as file:
         tree = Tree(file, path)
-        return {
-            printable(name): tree.value(member(file, name), 0) for name in members(file) if not name.startswith("#")
-        }
+        shown = [name for name in stored.members(file) if not name.startswith("#")]
+        return {printable(name): tree.value(stored.member(file, name), 0) for name in shown}
 
 
 class Tree:
@@ -58,7 +48,7 @@ class Tree:
             return TOO_DEEP
         if not isinstance(item, (h5py.Group, h5py.Dataset)):
             return Unreadable("unknown item")
-        stated = attributes(item, "MATLAB_class", "MATLAB_sparse", "MATLAB_empty")
+        stated = stored.attributes(item, "MATLAB_class", "MATLAB_sparse", "MATLAB_empty")
         kind = stated.get("MATLAB_class", b"")
         kind = printable(kind.decode("ascii", "replace") if isinstance(kind, bytes) else str(kind))
         if isinstance(item, h5py.Group):
@@ -68,7 +58,7 @@ class Tree:
         return self._array(item, kind, "MATLAB_empty" in stated, depth)
 
     def _array(self, item: h5py.Dataset, kind: str, empty: bool, depth: int) -> Any:
-        shape, dtype = layout(item)
+        shape, dtype = stored.layout(item)
         if shape is None:
             return Unreadable("unknown item")
         if kind == "char":
@@ -86,7 +76,7 @@ class Tree:
         if dtype.kind != "u" or dtype.itemsize != 2:
             return Unreadable(f"text of type {dtype}")
         require_small(self.path, 2 * math.prod(shape))
-        codes = values(item)
+        codes = stored.values(item)
         if not codes.size:
             return ""
         rows = codes.T if codes.ndim == 2 else codes.reshape(1, -1)
@@ -95,21 +85,20 @@ class Tree:
 
     def _references(self, item: h5py.Dataset, shape: tuple[int, ...]) -> list[Any]:
         if math.prod(shape) > MOST_CELLS:
-            raise InputError(
-                f"expected at most {MOST_CELLS} cells", field=printable(full_name(item)), value=math.prod(shape)
-            )
-        return list(values(item).reshape(-1))  # dimensions are stored reversed: this is MATLAB's linear order
+            name = printable(stored.full_name(item))
+            raise InputError(f"expected at most {MOST_CELLS} cells", field=name, value=math.prod(shape))
+        return list(stored.values(item).reshape(-1))  # dimensions are stored reversed: this is MATLAB's linear order
 
     def _behind(self, reference: Any, depth: int) -> Any:
-        return self.value(member(self.file, reference), depth + 1)
+        return self.value(stored.member(self.file, reference), depth + 1)
 
     def _struct(self, group: h5py.Group, depth: int) -> Any:
         """A struct, or a struct array: each of its fields has one reference per element."""
-        fields = {name: member(group, name) for name in members(group)}
+        fields = {name: stored.member(group, name) for name in stored.members(group)}
         arrays = {}
         for name, field in fields.items():
-            if isinstance(field, h5py.Dataset) and not attributes(field, "MATLAB_class"):
-                shape, dtype = layout(field)
+            if isinstance(field, h5py.Dataset) and not stored.attributes(field, "MATLAB_class"):
+                shape, dtype = stored.layout(field)
                 if shape is not None and h5py.check_ref_dtype(dtype):
                     arrays[name] = self._references(field, shape)
         if not fields or len(arrays) < len(fields):
@@ -120,20 +109,20 @@ class Tree:
             for i in range(count)
         ]
 
-    def _matrix(self, item: h5py.Dataset, stored: tuple[int, ...], dtype: np.dtype) -> Matrix:
-        name, path = full_name(item), self.path
+    def _matrix(self, item: h5py.Dataset, reverse: tuple[int, ...], dtype: np.dtype) -> Matrix:
+        name, path = stored.full_name(item), self.path
         complex_parts = dtype.names == ("real", "imag")
 
         def read() -> np.ndarray:
             with reading(path, printable(name)):
-                require_small(path, math.prod(stored) * dtype.itemsize)
-                array = values_in(path, name).T
-            if array.shape == stored[::-1] and array.dtype == dtype:
+                require_small(path, math.prod(reverse) * dtype.itemsize)
+                array = stored.values_in(path, name).T
+            if array.shape == reverse[::-1] and array.dtype == dtype:
                 if not complex_parts:
                     return array
                 if array["real"].dtype.kind in "fiu" and array["imag"].dtype.kind in "fiu":
                     return array["real"] + 1j * array["imag"]
             raise InputError("changed since it was opened, or holds no numbers", file=path, field=printable(name))
 
-        shape = stored[::-1] if len(stored) != 1 else (stored[0], 1)
+        shape = reverse[::-1] if len(reverse) != 1 else (reverse[0], 1)
         return Matrix(shape, "c" if complex_parts else dtype.kind, read, None if complex_parts else name)

@@ -36,13 +36,12 @@ def parse_columns(text: str) -> dict[str, list[str]]:
     columns: dict[str, list[str]] = {}
     for part in text.split(","):
         role, equals, names = (word.strip() for word in part.partition("="))
-        if not equals or role not in ROLES or role in columns or not all(name.strip() for name in names.split("+")):
-            raise InputError(
-                f"expected role=name, each role once, such as u=A1+A2,y=S1,t=time; the roles are {', '.join(ROLES)}",
-                field="columns",
-                value=part.strip(),
-            )
-        columns[role] = [name.strip() for name in names.split("+")]
+        listed = [name.strip() for name in names.split("+")]
+        if not equals or role not in ROLES or role in columns or not all(listed):
+            roles = ", ".join(ROLES)
+            message = f"expected role=name, each role once, such as u=A1+A2,y=S1,t=time; the roles are {roles}"
+            raise InputError(message, field="columns", value=part.strip())
+        columns[role] = listed
     return columns
 
 
@@ -90,10 +89,8 @@ def _format(path: Path, head: bytes) -> str:
     if _is_hdf5(path, head):
         with open_hdf5(path) as file:
             # A v7.3 file that lost its text header.
-            found = not attributes(file, "format") and any(
-                item is not None and attributes(item, "MATLAB_class")
-                for item in (member(file, name) for name in members(file))
-            )  # None: a broken link
+            items = () if attributes(file, "format") else [member(file, name) for name in members(file)]
+            found = any(item is not None and attributes(item, "MATLAB_class") for item in items)  # None: a broken link
         return "matlab" if found else "hdf5"
     lines = head.lstrip().splitlines()
     if len(lines) > 1 and lines[0].strip() == b"-1" and lines[1][:6].strip().rstrip(b"bB").isdigit():
@@ -126,11 +123,8 @@ def renamed(measured: Campaign | FrequencyResponse, naming: Mapping[str, list[st
     for role, names in naming.items():
         old = getattr(measured, fields[role])
         if len(names) != len(old):
-            raise InputError(
-                f"expected {len(old)} names, for the channels {', '.join(old)}; there are {len(names)}",
-                field=f"columns: {role}",
-                value="+".join(names),
-            )
+            message = f"expected {len(old)} names, for the channels {', '.join(old)}; there are {len(names)}"
+            raise InputError(message, field=f"columns: {role}", value="+".join(names))
         changes[fields[role]] = tuple(names)
     if not changes:
         return measured

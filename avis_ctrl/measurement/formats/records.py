@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.campaign import EXCITATIONS, FLOOR_NAMES, Portion, Record, RecordHeader, RecordSource, ranges
+from avis_ctrl.measurement.campaign import (
+    EXCITATIONS,
+    FLOOR_NAMES,
+    Campaign,
+    Portion,
+    Record,
+    RecordHeader,
+    RecordSource,
+    ranges,
+)
 from avis_ctrl.measurement.formats.common import as_number, as_text, stated_period, unit_of, units_of, within
 from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
@@ -145,7 +155,8 @@ def record_from(
     InputError : parts of different lengths, a unit of another quantity, a missing period, samples that are not finite.
     """
     with within(f"record {name}"):
-        return _record(name, parts, rate_Hz, start_s, hints, path)
+        record, notes = _record(name, parts, rate_Hz, start_s, hints, path)
+    return record, [f"record {name}: {note}" for note in notes]
 
 
 def _record(
@@ -172,11 +183,8 @@ def _record(
     for role, part in parts.items():
         units[role], factors, assumed = _units(role, part, hints)
         notes += assumed
-        samples[role] = (
-            replace(part.samples, factors=factors)
-            if isinstance(part.samples, Columns)
-            else part.samples * np.array(factors)
-        )
+        stored = part.samples
+        samples[role] = replace(stored, factors=factors) if isinstance(stored, Columns) else stored * np.array(factors)
     excitation, period, level = hints.excitation, hints.period_s, hints.level_V
     stated = level is not None and (excitation is not None or period is not None)
     rms = None if stated or not channels["u"] else _root_mean_square(samples["u"], channels["u"], path)
@@ -191,23 +199,13 @@ def _record(
         notes += [] if rms is None else [f"level_V not stated; taken as the r.m.s. of u, {level:.4g}"]
     if level < 0:
         raise InputError("expected 0 or more", field="level_V", value=level)
+    start_s = start_s if hints.start_s is None else hints.start_s
+    by_role: dict[str, Any] = {f"{role}_names": names for role, names in channels.items()}
+    by_role |= {f"{role}_unit": unit for role, unit in units.items()}
     header = RecordHeader(
-        name,
-        rate_Hz,
-        lengths["y"],
-        channels["u"],
-        channels["y"],
-        excitation,
-        level,
-        start_s if hints.start_s is None else hints.start_s,
-        period,
-        units["u"],
-        units["y"],
-        channels.get("floor", ()),
-        units.get("floor", "m/s"),
+        name, rate_Hz, lengths["y"], excitation=excitation, level_V=level, start_s=start_s, period_s=period, **by_role
     )
-    record = StoredRecord(header, path, samples) if path else Record(header, **samples)
-    return record, [f"record {name}: {note}" for note in notes]
+    return StoredRecord(header, path, samples) if path else Record(header, **samples), notes
 
 
 def _units(role: str, part: Part, hints: Hints) -> tuple[str, tuple[float, ...], list[str]]:
@@ -240,13 +238,15 @@ def with_header(record: RecordSource, **changes: Any) -> RecordSource:
     return replace(record, header=replace(record.header, **changes))  # type: ignore[type-var]
 
 
-def one_clock(records: Sequence[RecordSource]) -> tuple[tuple[RecordSource, ...], list[str]]:
-    """Give all records the rate of the first if their rates differ only by the rounding of time stamps."""
-    first, notes, result = records[0].header.sample_rate_Hz, [], []
+def campaign_from(records: Sequence[RecordSource], notes: Sequence[str], rig: str, path: Path) -> Campaign:
+    """Campaign of a file's records, which get the rate of the first if theirs differ only by the rounding of time
+    stamps.
+    """
+    first, result, notes = records[0].header.sample_rate_Hz, [], [*notes]
     for record in records:
         rate = record.header.sample_rate_Hz
         if rate != first and abs(rate - first) <= SETTINGS.same_rate * first:
             notes.append(f"record {record.header.name}: sample rate {rate:.9g} Hz taken as {first:.9g} Hz")
             record = with_header(record, sample_rate_Hz=first)
         result.append(record)
-    return tuple(result), notes
+    return Campaign(rig or UNNAMED, tuple(result), str(path), tuple(notes))

@@ -61,21 +61,14 @@ def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyRespons
         "output_unit": over.si,
         "method": as_text(fields.get("method", ""), "method"),
     }
-    coherence, variance = fields.get("coherence"), fields.get("variance")
     if fields.get("noise") is not None and fields.get("gram") is not None:
         if factor != 1.0:
             raise InputError("expected SI units for noise and gram", field="units", value=str(fields["output_unit"]))
         dof = fields.get("dof", np.inf)
+        common["dof"] = np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof")
         common |= {field: fields.get(field) for field in COVARIANCES}
-        return FrequencyResponse(
-            frequency,
-            value,
-            inputs=inputs,
-            outputs=outputs,
-            **common,
-            dof=np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof"),
-        )
-    averages = hints.averages
+        return FrequencyResponse(frequency, value, inputs=inputs, outputs=outputs, **common)
+    averages, variance = hints.averages, fields.get("variance")
     if averages is None and fields.get("averages") is not None:
         averages = as_number(fields["averages"], "averages")
     return response_from(
@@ -83,7 +76,7 @@ def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyRespons
         value * factor,
         inputs,
         outputs,
-        coherence=coherence,
+        coherence=fields.get("coherence"),
         averages=averages,
         variance=None if variance is None else variance * factor**2,
         relative_standard_deviation=hints.relative_standard_deviation,
@@ -124,9 +117,8 @@ def response_from(
     if variance is not None:
         variance = _plain(variance, "variance", "fiu")
         if variance.shape != shape or not np.all(variance >= 0):
-            raise InputError(
-                f"expected shape {shape} and no negative or missing value", field="variance", value=variance.shape
-            )
+            message = f"expected shape {shape} and no negative or missing value"
+            raise InputError(message, field="variance", value=variance.shape)
     elif coherence is not None:
         coherence = _coherence(coherence, value.shape, averages)
         keep = np.all(coherence > 0, axis=(1, 2))
@@ -137,18 +129,17 @@ def response_from(
         variance[keep] = coherence_variance(value[keep], coherence[keep], averages)
         method = f"{method}; variance from coherence, {averages:g} averages".lstrip("; ")
     elif relative_standard_deviation is not None:
-        if not (np.isfinite(relative_standard_deviation) and relative_standard_deviation > 0):
-            raise InputError(
-                "expected a positive number", field="relative_standard_deviation", value=relative_standard_deviation
-            )
-        variance = (relative_standard_deviation * np.abs(value)) ** 2
-        method = f"{method}; stated relative standard deviation {relative_standard_deviation:g}".lstrip("; ")
+        share = relative_standard_deviation
+        if not (np.isfinite(share) and share > 0):
+            raise InputError("expected a positive number", field="relative_standard_deviation", value=share)
+        variance = (share * np.abs(value)) ** 2
+        method = f"{method}; stated relative standard deviation {share:g}".lstrip("; ")
     else:
-        raise InputError(
-            "the file has neither variance nor coherence; pass relative_standard_deviation (such as 0.05) "
-            "to state the errors",
-            field="uncertainty of the frequency response",
+        message = (
+            "the file has neither variance nor coherence; pass relative_standard_deviation (such as 0.05) to state the "
+            "errors"
         )
+        raise InputError(message, field="uncertainty of the frequency response")
     if not keep.all():
         lost = frequency_Hz[~keep]
         method += f"; {len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz"
@@ -170,12 +161,9 @@ def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
     array = np.asarray(array)
     if array.dtype.kind not in kinds:
         raise InputError("expected numbers", field=field, value=f"array of {kind_of(array.dtype)}")
-    if not np.all(np.isfinite(array)):
-        raise InputError(
-            f"expected finite numbers; NaN or infinite: {np.count_nonzero(~np.isfinite(array))}, the "
-            f"first at line {np.argwhere(~np.isfinite(array))[0][0]}",
-            field=field,
-        )
+    if (bad := ~np.isfinite(array)).any():
+        found = f"{np.count_nonzero(bad)}, the first at line {np.argwhere(bad)[0][0]}"
+        raise InputError(f"expected finite numbers; NaN or infinite: {found}", field=field)
     return array
 
 
@@ -184,12 +172,11 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
     if coherence.shape == shape[:2] and shape[2] == 1:
         coherence = coherence[:, :, None]
     if coherence.shape == shape[:2]:
-        raise InputError(
-            f"multiple coherence of {shape[2]} inputs does not determine the errors of single entries; "
-            "expected the ordinary coherence of each entry, or variance",
-            field="coherence",
-            value=coherence.shape,
+        message = (
+            f"multiple coherence of {shape[2]} inputs does not determine the errors of single entries; expected the "
+            "ordinary coherence of each entry, or variance"
         )
+        raise InputError(message, field="coherence", value=coherence.shape)
     if coherence.shape != shape:
         raise InputError(f"expected shape {shape}", field="coherence", value=coherence.shape)
     if np.any(coherence < 0) or np.any(coherence > 1 + ROUNDING):
@@ -198,7 +185,6 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
     if averages is None:
         raise InputError("missing; the errors follow from coherence and the number of averages", field="averages")
     if not (np.isfinite(averages) and averages >= 2):
-        raise InputError(
-            "expected 2 or more; with one average the coherence is always 1", field="averages", value=averages
-        )
+        message = "expected 2 or more; with one average the coherence is always 1"
+        raise InputError(message, field="averages", value=averages)
     return np.minimum(coherence, 1.0)

@@ -35,9 +35,8 @@ def access(what: object) -> Iterator[None]:
     try:
         yield
     except DAMAGE as error:
-        raise InputError(
-            f"cannot be read; damaged or cut short? ({short(error)})", field=printable(str(what))
-        ) from error
+        message = f"cannot be read; damaged or cut short? ({short(error)})"
+        raise InputError(message, field=printable(str(what))) from error
 
 
 def members(group: h5py.Group) -> list[str]:
@@ -125,11 +124,8 @@ class Columns:
         array = numbers(block.T if self.channels_first else block, self.dataset)
         array = array[:, None] if array.ndim == 1 else array
         if array.shape != (stop - start, len(self.factors)):
-            raise InputError(
-                f"expected {stop - start} samples of {len(self.factors)} channels",
-                field=self.dataset,
-                value=array.shape,
-            )
+            message = f"expected {stop - start} samples of {len(self.factors)} channels"
+            raise InputError(message, field=self.dataset, value=array.shape)
         if set(self.factors) != {1.0}:
             array *= self.factors
         require_finite(array, names, field, lambda row: f"sample {start + row}")
@@ -158,18 +154,12 @@ class StoredRecord(RecordSource):
         """
         h, stop = self.header, self.header.samples if stop is None else stop
         if not 0 <= start < stop <= h.samples:
-            raise InputError(
-                f"expected 0 <= start < stop <= {h.samples}",
-                file=self.path,
-                field=f"record {h.name}: samples",
-                value=(start, stop),
-            )
+            message, field = f"expected 0 <= start < stop <= {h.samples}", f"record {h.name}: samples"
+            raise InputError(message, file=self.path, field=field, value=(start, stop))
         names = {"u": h.u_names, "y": h.y_names, "floor": h.floor_names}
         with reading(self.path, f"record {h.name}"):
-            return Record(
-                h.part(start, stop),
-                **{
-                    role: columns.load(self.path, names[role], f"record {h.name}: {role}", start, stop)
-                    for role, columns in self.columns.items()
-                },
-            )
+            samples = {
+                role: columns.load(self.path, names[role], f"record {h.name}: {role}", start, stop)
+                for role, columns in self.columns.items()
+            }
+            return Record(h.part(start, stop), **samples)

@@ -45,44 +45,30 @@ def sample_rate_from(
     time_s = np.asarray(time_s, float)
     if time_s.ndim != 1 or len(time_s) < 2:
         raise InputError("expected at least two time stamps", field=field, value=time_s.shape)
-    if not np.all(np.isfinite(time_s)):
-        bad = np.flatnonzero(~np.isfinite(time_s))
-        raise InputError(
-            f"expected finite time stamps; NaN or infinite: {len(bad)}, the first at {place(int(bad[0]))}", field=field
-        )
+    finite = np.isfinite(time_s)
+    if not finite.all():
+        found = f"{np.count_nonzero(~finite)}, the first at {place(int(np.argmin(finite)))}"
+        raise InputError(f"expected finite time stamps; NaN or infinite: {found}", field=field)
     step = np.diff(time_s)
-    if np.any(step <= 0):
-        bad = np.flatnonzero(step <= 0)
-        first = int(bad[0]) + 1
-        raise InputError(
-            f"expected increasing time stamps; not later than the one before: {len(bad)}, the first at "
-            f"{place(first)}: {time_s[first]:.9g} s after {time_s[first - 1]:.9g} s",
-            field=field,
-        )
     usual = float(np.median(step))
-    if np.any(step > SETTINGS.gap * usual):
-        bad = np.flatnonzero(step > SETTINGS.gap * usual)
-        first = int(bad[0]) + 1
-        raise InputError(
-            f"expected evenly spaced time stamps; gaps: {len(bad)}, the first before {place(first)}: "
-            f"{step[first - 1]:.6g} s instead of {usual:.6g} s",
-            field=field,
-        )
+    back, gap = step <= 0, step > SETTINGS.gap * usual
+    if back.any():
+        k = int(np.argmax(back)) + 1
+        found = f"{np.count_nonzero(back)}, the first at {place(k)}: {time_s[k]:.9g} s after {time_s[k - 1]:.9g} s"
+        raise InputError(f"expected increasing time stamps; not later than the one before: {found}", field=field)
+    if gap.any():
+        k = int(np.argmax(gap)) + 1
+        found = f"{np.count_nonzero(gap)}, the first before {place(k)}: {step[k - 1]:.6g} s instead of {usual:.6g} s"
+        raise InputError(f"expected evenly spaced time stamps; gaps: {found}", field=field)
     mean = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
     off = np.abs(time_s - time_s[0] - mean * np.arange(len(time_s))) / mean
     worst = int(np.argmax(off))
     if off[worst] > SETTINGS.jitter:
-        raise InputError(
-            f"expected evenly spaced time stamps; {np.count_nonzero(off > SETTINGS.jitter)} are more than "
-            f"{SETTINGS.jitter:g} of a sample off, the worst at {place(worst)} by {off[worst]:.3g} samples of "
-            f"{mean:.6g} s",
-            field=field,
-        )
-    note = (
-        f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even"
-        if off[worst] > SETTINGS.rounding
-        else ""
-    )
+        found = f"{np.count_nonzero(off > SETTINGS.jitter)} are more than {SETTINGS.jitter:g} of a sample off"
+        at = f"the worst at {place(worst)} by {off[worst]:.3g} samples of {mean:.6g} s"
+        raise InputError(f"expected evenly spaced time stamps; {found}, {at}", field=field)
+    uneven = off[worst] > SETTINGS.rounding
+    note = f"time stamps are uneven by up to {off[worst]:.2g} of a sample; taken as even" if uneven else ""
     return rounded(1 / mean, (2 * float(off[worst]) + 1e-9) / (len(time_s) - 1)), float(time_s[0]), note
 
 

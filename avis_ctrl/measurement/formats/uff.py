@@ -26,7 +26,7 @@ from avis_ctrl.measurement.formats.common import (
     require_small,
     unit_of,
 )
-from avis_ctrl.measurement.formats.records import UNNAMED, Hints, Mapped, Part, mapped, one_clock, pick, record_from
+from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, campaign_from, mapped, pick, record_from
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
@@ -75,10 +75,8 @@ def read(
         if RESPONSE in kinds:
             return _response(found, hints)
         held = ", ".join(f"{kind} ({WORDS.get(kind, 'other')})" for kind in kinds) or "no data set 58"
-        raise InputError(
-            f"expected functions of type 1 (time response) or 4 (frequency response); the file has {held}",
-            field="function type",
-        )
+        message = f"expected functions of type 1 (time response) or 4 (frequency response); the file has {held}"
+        raise InputError(message, field="function type")
 
 
 def channel_names(points: Sequence[Point]) -> dict[Point, str]:
@@ -109,33 +107,24 @@ def axis_unit(axis: Axis, point: Point, function: Function, role: str, hint: str
             by_type = Unit("N", 1 / function.force)
     if axis.unit:
         labelled = unit_of(axis.unit, field, ALLOWED[role])
-        scaled = by_type is not None and by_type.factor != 1.0
-        if (
-            scaled
-            and by_type is not None
-            and (labelled.si != by_type.si or abs(labelled.factor / by_type.factor - 1) > 1e-6)
-        ):
-            raise InputError(
-                f"by data set 164 it is {by_type.factor:g} {by_type.si}; state the right one with {role}_unit",
-                field=field,
-                value=axis.unit,
-            )
+        if by_type is None or by_type.factor == 1.0:  # not scaled by data set 164
+            return labelled
+        if labelled.si != by_type.si or abs(labelled.factor / by_type.factor - 1) > 1e-6:
+            message = f"by data set 164 it is {by_type.factor:g} {by_type.si}; state the right one with {role}_unit"
+            raise InputError(message, field=field, value=axis.unit)
         return labelled
     if by_type is None or by_type.si not in ALLOWED[role]:
-        raise InputError(
-            f"not stated (no label, specific data type {axis.kind}); pass {role}_unit, one of "
-            f"{', '.join(ALLOWED[role])}",
-            field=field,
-        )
+        allowed = ", ".join(ALLOWED[role])
+        message = f"not stated (no label, specific data type {axis.kind}); pass {role}_unit, one of {allowed}"
+        raise InputError(message, field=field)
     return by_type
 
 
 def _abscissa(function: Function, units: Mapping[str, float]) -> np.ndarray:
     unit = function.axes[0].unit
     if unit not in units:
-        raise InputError(
-            f"expected one of {', '.join(filter(None, units))}", field=f"{function.place}: abscissa unit", value=unit
-        )
+        field = f"{function.place}: abscissa unit"
+        raise InputError(f"expected one of {', '.join(filter(None, units))}", field=field, value=unit)
     return function.abscissa * units[unit]
 
 
@@ -175,23 +164,20 @@ def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig
     points = {name: point for point, name in names.items()}
     roles = _roles(takes, names, columns, hints)
     count = max(len(functions_) for functions_ in takes.values())
-    records, notes = [], []
-    for other in sorted({function.kind for function in found} - {TIME}):
-        notes.append(f"functions of type {other} beside the time responses were not read")
+    others = sorted({function.kind for function in found} - {TIME})
+    records, notes = [], [f"functions of type {other} beside the time responses were not read" for other in others]
     for k in range(count):
         chosen = {}
         for role, wanted in roles.items():
             for name in wanted:
                 if len(takes[points[name]]) <= k:
-                    raise InputError(
-                        f"missing in record {k:02d}; other channels have {count} records", field=f"channel {name}"
-                    )
+                    message = f"missing in record {k:02d}; other channels have {count} records"
+                    raise InputError(message, field=f"channel {name}")
             chosen[role] = [takes[points[name]][k] for name in wanted]
         record, assumed = _record(f"{k:02d}", chosen, roles, hints)
         records.append(record)
         notes += assumed
-    harmonised, assumed = one_clock(records)
-    return Campaign(rig or UNNAMED, harmonised, str(path), tuple([*notes, *assumed]))
+    return campaign_from(records, notes, rig or "", path)
 
 
 def _roles(
@@ -206,11 +192,11 @@ def _roles(
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(available) else []
         roles["y"] = [name for name in available if name not in roles["u"] and name not in roles["floor"]]
     if not roles["u"] and hints.excitation not in ("rest", "floor"):
-        raise InputError(
-            f"no channel is recognised as an input; the file has {', '.join(available)}; assign the "
-            "channels with columns (such as u=A1, y=S1), or state excitation rest or floor",
-            field="u",
+        message = (
+            f"no channel is recognised as an input; the file has {', '.join(available)}; assign the channels with "
+            "columns (such as u=A1, y=S1), or state excitation rest or floor"
         )
+        raise InputError(message, field="u")
     if not roles["y"]:
         raise InputError(f"expected at least one output; the file has {', '.join(available)}", field="y")
     return roles if roles["floor"] else {role: roles[role] for role in ("u", "y")}
@@ -220,30 +206,22 @@ def _record(
     name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str, list[str]], hints: Hints
 ) -> tuple[RecordSource, list[str]]:
     every = [function for some in chosen.values() for function in some]
-    rate, start, note = _clock(every[0])
+    (rate, start, note), first, samples = _clock(every[0]), every[0].response.channel(), len(every[0].value)
     for function in every[1:]:
-        if len(function.value) != len(every[0].value):
-            raise InputError(
-                f"expected {len(every[0].value)} samples, as {every[0].response.channel()} has",
-                field=f"record {name}, channel {function.response.channel()}",
-                value=len(function.value),
-            )
+        field = f"record {name}, channel {function.response.channel()}"
+        if len(function.value) != samples:
+            raise InputError(f"expected {samples} samples, as {first} has", field=field, value=len(function.value))
         if not np.allclose(function.abscissa, every[0].abscissa, rtol=0, atol=0.1 / rate):
-            raise InputError(
-                f"expected the times of {every[0].response.channel()}",
-                field=f"record {name}, channel {function.response.channel()}",
-            )
+            raise InputError(f"expected the times of {first}", field=field)
     parts = {}
     for role, some in chosen.items():
         hint = {"u": hints.u_unit, "y": hints.y_unit}.get(role)
         if any(np.iscomplexobj(function.value) for function in some):
             raise InputError("expected real samples of a time response", field=f"record {name}: {role}")
         units = [axis_unit(function.axes[1], function.response, function, role, hint) for function in some]
-        array = (
-            np.stack([function.value * unit.factor for function, unit in zip(some, units, strict=True)], axis=1)
-            if some
-            else np.zeros((len(every[0].value), 0))
-        )
+        array = np.zeros((samples, len(some)))
+        for column, function, unit in zip(array.T, some, units, strict=True):
+            column[:] = function.value * unit.factor
         parts[role] = Part(roles[role], [unit.si for unit in units], array)
     # The units have already been applied.
     hints = replace(hints, u_unit=None, y_unit=None)
@@ -267,10 +245,8 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
     output_names, input_names = channel_names(outputs), channel_names(inputs)
     missing = [f"{output_names[y]} from {input_names[u]}" for y in outputs for u in inputs if (y, u) not in entries]
     if missing:
-        raise InputError(
-            f"expected every output for every input; {len(missing)} are missing, the first is {missing[0]}",
-            field="frequency responses",
-        )
+        message = f"expected every output for every input; {len(missing)} are missing, the first is {missing[0]}"
+        raise InputError(message, field="frequency responses")
     first = next(iter(entries.values()))
     frequency = _abscissa(first, HERTZ)
     value = np.zeros((len(frequency), len(outputs), len(inputs)), complex)
@@ -311,11 +287,8 @@ def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Fun
         if function.kind in kinds:
             entry = (function.response, function.reference)
             if entry in entries:
-                raise InputError(
-                    "expected each pair of response and reference once",
-                    field=function.place,
-                    value=f"{entry[0].channel()} from {entry[1].channel()}",
-                )
+                pair = f"{entry[0].channel()} from {entry[1].channel()}"
+                raise InputError("expected each pair of response and reference once", field=function.place, value=pair)
             entries[entry] = function
     return entries
 
@@ -324,11 +297,9 @@ def _on(function: Function, frequency: np.ndarray) -> np.ndarray:
     """Values of the function, if it has the frequencies of the first frequency response."""
     own = _abscissa(function, HERTZ)
     if own.shape != frequency.shape or not np.allclose(own, frequency, rtol=1e-5, atol=1e-9):
-        raise InputError(
-            f"expected the {len(frequency)} frequencies of the first frequency response",
-            field=f"{function.place}, {function.response.channel()} from {function.reference.channel()}",
-            value=f"{len(own)} from {own[0]:g} to {own[-1]:g} Hz",
-        )
+        message = f"expected the {len(frequency)} frequencies of the first frequency response"
+        field = f"{function.place}, {function.response.channel()} from {function.reference.channel()}"
+        raise InputError(message, field=field, value=f"{len(own)} from {own[0]:g} to {own[-1]:g} Hz")
     return function.value
 
 
@@ -346,10 +317,7 @@ def _ratio_unit(function: Function, hints: Hints) -> tuple[float, tuple[str, str
 
 def _averages(found: Sequence[Function]) -> float | None:
     """Number of averages, if all ID lines that state it agree."""
-    counts = set()
-    for function in found:
-        for line in function.lines:
-            for pattern in AVERAGES:
-                if match := re.search(pattern, line, re.IGNORECASE):
-                    counts.add(int(match[1]))
+    lines = [line for function in found for line in function.lines]
+    matches = [re.search(pattern, line, re.IGNORECASE) for line in lines for pattern in AVERAGES]
+    counts = {int(match[1]) for match in matches if match}
     return float(counts.pop()) if len(counts) == 1 else None

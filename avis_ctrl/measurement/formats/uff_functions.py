@@ -87,9 +87,8 @@ def functions(path: Path) -> list[Function]:
         if after >= len(text) and not line.strip():
             return found
         if line.strip() != MARK:
-            raise InputError(
-                "expected a line '    -1' that opens a data set", field=f"byte {at}", value=line[:40].decode("latin-1")
-            )
+            shown = line[:40].decode("latin-1")
+            raise InputError("expected a line '    -1' that opens a data set", field=f"byte {at}", value=shown)
         title, body = _line(text, after)
         number += 1
         place, kind = f"data set {number} (byte {at})", title[:6].strip()
@@ -122,9 +121,8 @@ def _closing(text: bytes, at: int, place: str) -> int:
 
 def _units(body: bytes, place: str) -> tuple[float, float]:
     """Factors of length and force of data set 164."""
-    words = [
-        word.upper().replace("D", "E") for line in body.decode("latin-1").splitlines()[1:] for word in line.split()
-    ][:2]
+    text = "\n".join(body.decode("latin-1").splitlines()[1:])
+    words = text.upper().replace("D", "E").split()[:2]
     factors = [float(word) for word in words if is_number(word)]
     if len(factors) < 2 or not all(0 < factor < np.inf for factor in factors):
         raise InputError("expected positive factors of length and force in data set 164", field=place, value=words)
@@ -144,15 +142,13 @@ def _function(text: bytes, title: bytes, at: int, factors: tuple[float, float], 
         reference = Point(_used(dof[7]), int(dof[8] or 0), int(dof[9] or 0))
         kind, data_type, count, even = int(dof[0]), int(form[0]), int(form[1]), int(form[2]) == 1
         start, step = (_real(word) for word in form[3:5])
-        axes = tuple(_axis(line) for line in header[7:10])
+        axes = _axis(header[7]), _axis(header[8]), _axis(header[9])
     except (ValueError, IndexError):
-        raise InputError(
-            "expected the header of a data set 58; lines 6 to 10 cannot be read", field=place, value=header[6][:40]
-        ) from None
+        message = "expected the header of a data set 58; lines 6 to 10 cannot be read"
+        raise InputError(message, field=place, value=header[6][:40]) from None
     if data_type not in (2, 4, 5, 6) or count < 1:
-        raise InputError(
-            "expected ordinate data type 2, 4, 5 or 6 and a number of values", field=place, value=(data_type, count)
-        )
+        message = "expected ordinate data type 2, 4, 5 or 6 and a number of values"
+        raise InputError(message, field=place, value=(data_type, count))
     double, parts = data_type in (4, 6), 2 if data_type in (5, 6) else 1
     if b"b" in title[:7].lower():
         table, at = _binary(text, title, at, (count, even, double, parts), place)
@@ -165,18 +161,7 @@ def _function(text: bytes, title: bytes, at: int, factors: tuple[float, float], 
     if even and not (np.isfinite(start) and 0 < step < np.inf):
         raise InputError("expected a positive increment of the abscissa", field=place, value=step)
     lines = tuple(line.strip() for line in header[:5])
-    return Function(
-        lines,
-        kind,
-        response,
-        reference,
-        even,
-        abscissa,
-        value,
-        axes,  # type: ignore[arg-type]
-        *factors,
-        place,
-    ), at
+    return Function(lines, kind, response, reference, even, abscissa, value, axes, *factors, place), at
 
 
 _DOF = (5, 10, 5, 10, 11, 10, 4, 11, 10, 4)
@@ -213,11 +198,8 @@ def _binary(text: bytes, title: bytes, at: int, form: Form, place: str) -> tuple
     try:
         order, floats, _, size = (int(word) for word in words[:4])
     except ValueError:
-        raise InputError(
-            "expected byte order, float format, header lines and number of bytes after '58b'",
-            field=place,
-            value=title.decode("latin-1").strip()[:60],
-        ) from None
+        message = "expected byte order, float format, header lines and number of bytes after '58b'"
+        raise InputError(message, field=place, value=title.decode("latin-1").strip()[:60]) from None
     if order not in (1, 2) or floats != 2:
         raise InputError("expected byte order 1 or 2 and IEEE 754 floats (2)", field=place, value=(order, floats))
     width = 8 if double else 4

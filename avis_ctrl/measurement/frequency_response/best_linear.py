@@ -82,11 +82,11 @@ def best_linear_approximation(
     )
     if len(found) > 1:
         sets = "; ".join(f"{', '.join(r.inputs)} on {r.frequency_Hz.size} lines" for r in found)
-        raise InputError(
-            f"different lines excite different inputs ({sets}): use best_linear_approximations, which "
-            "gives one response for each set",
-            field="records",
+        message = (
+            f"different lines excite different inputs ({sets}): use best_linear_approximations, which gives one "
+            "response for each set"
         )
+        raise InputError(message, field="records")
     return found[0]
 
 
@@ -103,7 +103,7 @@ def best_linear_approximations(
     Parameters and errors as in `best_linear_approximation`.
     """
     records = periodic_records(campaign, level_V)
-    used = channels(campaign, records, False)
+    used = channels(records, False)
     n, rate = records[0].header.period_samples or 0, campaign.sample_rate_Hz
     keep = lines(n, rate, checked_band(band_Hz, rate))
     if keep.stop <= keep.start:
@@ -172,11 +172,11 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
     on = (power > SETTINGS.excited_power * power.max(axis=0)) & (power > SETTINGS.excited_over_noise * noise)
     if not np.any(on):
         if np.any(power > 0):
-            raise InputError(
-                "expected inputs that repeat in each period; these differ from period to period by as "
-                "much as their size: check the period",
-                field="period_s",
+            message = (
+                "expected inputs that repeat in each period; these differ from period to period by as much as their "
+                "size: check the period"
             )
+            raise InputError(message, field="period_s")
         raise InputError("expected at least one excited line in the band", field="inputs", value=used.inputs)
     sets: dict[tuple[int, ...], list[int]] = {}
     for line in np.flatnonzero(on.any(axis=1)):
@@ -205,39 +205,28 @@ def _response(
         both = np.concatenate([-G, np.broadcast_to(np.eye(n_y), (line.size, n_y, n_y))], axis=2)
         noise = both @ data.covariance[line][:, columns][:, :, columns] @ np.swapaxes(both.conj(), 1, 2)
     if dof == 0 and noise is None:
-        raise InputError(
-            f"expected repeated periods or more than {len(active)} experiments, to estimate the noise",
-            field="records",
-            value=len(data.U),
-        )
+        message = f"expected repeated periods or more than {len(active)} experiments, to estimate the noise"
+        raise InputError(message, field="records", value=len(data.U))
     per_line = dof or data.dof
     half = _smoothing(smooth_lines, per_line, n_y, line.size)
-    total = None
+    C = noise = None if noise is None else _running_mean(noise, half)
+    distortion = None
+    said = "; noise only, distortion not separated"
     if dof:
         E = Y - U @ np.swapaxes(G, 1, 2)
-        total = _running_mean(np.swapaxes(E, 1, 2) @ E.conj() / dof, half)
-    noise = None if noise is None else _running_mean(noise, half)
-    separated = total is not None and noise is not None
-    said = f"C over {2 * half + 1} lines" + (
-        ""
-        if separated
-        else "; noise only, distortion not separated"
-        if total is None
-        else "; noise and distortion together"
-    )
+        C = _running_mean(np.swapaxes(E, 1, 2) @ E.conj() / dof, half)
+        distortion = None if noise is None else C - noise
+        said = "; noise and distortion together" if noise is None else ""
     return FrequencyResponse(
         frequency_Hz[line],
         G,
-        total if total is not None else noise,
+        C,
         gram,
-        names,
-        used.outputs,
-        used.input_unit,
-        used.output_unit,
-        float(per_line * (2 * half + 1)),
-        noise,
-        total - noise if total is not None and noise is not None else None,
-        method=f"{words}, {said}",
+        **used.labels(names),
+        dof=float(per_line * (2 * half + 1)),
+        measurement_noise=noise,
+        distortion=distortion,
+        method=f"{words}, C over {2 * half + 1} lines{said}",
     )
 
 

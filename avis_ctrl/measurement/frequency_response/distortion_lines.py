@@ -63,11 +63,9 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
     header = source.header
     field = f"record {header.name}"
     if not header.period_samples or header.periods < 2:
-        raise InputError(
-            "expected a periodic record of at least two periods", field=f"{field}: period_s", value=header.period_s
-        )
+        raise header.error("period_s", "expected a periodic record of at least two periods")
     n, rate = header.period_samples, header.sample_rate_Hz
-    used = channels(campaign, (source,), False)
+    used = channels((source,), False)
     keep = lines(n, rate, checked_band(None, rate))
     drop, remove = chosen_treatment((source,), used, keep, transient)
     mean = average(source, used, keep, drop, remove)
@@ -77,10 +75,9 @@ def distortion_levels(campaign: Campaign, record: str, *, transient: Transient =
     if not np.any(on):
         raise InputError("expected an excited line in the band", field=field)
     if np.any(harmonic[on] % 2 == 0):
+        first_Hz = harmonic[on & (harmonic % 2 == 0)][0] * rate / n
         raise InputError(
-            "expected an odd multisine; it excites even harmonics, the first at "
-            f"{harmonic[on & (harmonic % 2 == 0)][0] * rate / n:g} Hz",
-            field=field,
+            f"expected an odd multisine; it excites even harmonics, the first at {first_Hz:g} Hz", field=field
         )
     between = (harmonic >= harmonic[on][0]) & (harmonic <= harmonic[on][-1])
     kind = np.where(on, "excited", np.where(harmonic % 2 == 1, "odd", "even"))

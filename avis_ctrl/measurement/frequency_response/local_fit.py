@@ -58,7 +58,6 @@ class LocalEstimate:
     noise: np.ndarray
     gram: np.ndarray
     dof: int
-    half_width: int
 
 
 def degrees_of_freedom(records: int, n_u: int, order: int, half_width: int) -> int:
@@ -100,11 +99,8 @@ class LocalFit:
         if order not in range(7):
             raise InputError("expected a whole order from 0 to 6", field="order", value=order)
         if 2 * half_width <= order:
-            raise InputError(
-                f"expected more than {order / 2:g} lines for polynomials of order {order}",
-                field="half_width",
-                value=half_width,
-            )
+            message = f"expected more than {order / 2:g} lines for polynomials of order {order}"
+            raise InputError(message, field="half_width", value=half_width)
         self.frequency_Hz = np.asarray(frequency_Hz, float)
         self.n_u, self.n_y, self.order, self.half_width, self.scale_Hz = n_u, n_y, order, half_width, scale_Hz
         # Columns: [U d^R .. U d], U, Y: the part needed for G(f) is in the lower right corner.
@@ -164,18 +160,14 @@ class LocalFit:
     def _check(self, U: np.ndarray, Y: np.ndarray, line_Hz: np.ndarray) -> None:
         shape = (U.shape[0], line_Hz.size)
         if U.shape != (*shape, self.n_u) or Y.shape != (*shape, self.n_y):
-            raise InputError(
-                f"expected {shape} records and lines with {self.n_u} inputs and {self.n_y} outputs",
-                field="U, Y",
-                value=(U.shape, Y.shape),
-            )
+            message = f"expected {shape} records and lines with {self.n_u} inputs and {self.n_y} outputs"
+            raise InputError(message, field="U, Y", value=(U.shape, Y.shape))
         if line_Hz.size < 2 * self.half_width + 1:
-            raise InputError(
-                f"expected at least {2 * self.half_width + 1} lines, the window of the local model: a "
-                "longer record, a wider band or fewer inputs",
-                field="lines in the band",
-                value=line_Hz.size,
+            message = (
+                f"expected at least {2 * self.half_width + 1} lines, the window of the local model: a longer record, a "
+                "wider band or fewer inputs"
             )
+            raise InputError(message, field="lines in the band", value=line_Hz.size)
 
     def estimate(self, names: tuple[str, ...] | None = None, partial: bool = False) -> LocalEstimate:
         """G, C and S on all lines.
@@ -189,18 +181,16 @@ class LocalFit:
         ComputationError : inputs that cannot be distinguished, with their names, unless `partial`.
         """
         if self.dof < 1 or self._unit is None:
-            raise InputError(
-                f"expected a wider window or more records: {self.dof} degrees of freedom remain on "
-                f"each line with {self.n_u} inputs, order {self.order}, {self.records} records",
-                field="half_width",
-                value=self.half_width,
+            message = (
+                f"expected a wider window or more records: {self.dof} degrees of freedom remain on each line with "
+                f"{self.n_u} inputs, order {self.order}, {self.records} records"
             )
+            raise InputError(message, field="half_width", value=self.half_width)
         lead, first = self._lead, self._lead + self.n_u
         slopes, own, outputs = self._factor[:, :, :lead], self._factor[:, :, lead:first], self._factor[:, :, first:]
         # Size of each input in the window, at least that of a silent input.
-        size = np.maximum(
-            np.linalg.norm(own, axis=1), SETTINGS.silent * np.sqrt(self.records * (2 * self.half_width - self.order))
-        )
+        rows = self.records * (2 * self.half_width - self.order)
+        size = np.maximum(np.linalg.norm(own, axis=1), SETTINGS.silent * np.sqrt(rows))
         # The rows of the triangular factor below the slopes are the part of the inputs that the slopes do not explain.
         # This is wrong if the slopes are linearly dependent; they are then projected out with an orthonormal basis of
         # their span.
@@ -219,18 +209,13 @@ class LocalFit:
         inverse = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
         along = np.swapaxes(left.conj(), 1, 2) @ outputs * known[:, :, None]
         value = np.swapaxes(right.conj(), 1, 2) @ (inverse[:, :, None] * along) / size[:, :, None]
-        dof = self.records * (2 * self.half_width - self.order) - spent - np.sum(known, axis=1)
+        dof = rows - spent - np.sum(known, axis=1)
         noise = _covariance(outputs - left @ along) / dof[:, None, None]
         gram = _covariance((s * known)[:, :, None] * right * size[:, None, :])
         unit_u, unit_y = self._unit
-        return LocalEstimate(
-            self.frequency_Hz,
-            np.swapaxes(value, 1, 2) * unit_y[:, None] / unit_u,
-            noise * unit_y[:, None] * unit_y,
-            gram * unit_u[:, None] * unit_u,
-            int(dof.min()),
-            self.half_width,
-        )
+        value = np.swapaxes(value, 1, 2) * unit_y[:, None] / unit_u
+        noise, gram = noise * unit_y[:, None] * unit_y, gram * unit_u[:, None] * unit_u
+        return LocalEstimate(self.frequency_Hz, value, noise, gram, int(dof.min()))
 
     def _refuse(self, bad: np.ndarray, s: np.ndarray, right: np.ndarray, names: tuple[str, ...] | None) -> None:
         """Raise the error for indistinguishable inputs; s, right : SVD of the part of each input that is not

@@ -76,30 +76,25 @@ def local_polynomial(
     InputError : bands, windows or records that do not allow an estimate.
     ComputationError : inputs that cannot be distinguished, unless `partial`.
     """
-    data = _Data.of(campaign, taking_part(campaign, floor), floor, band_Hz, longest_piece)
-    names = data.names
+    data = _Data.of(taking_part(campaign, floor), floor, band_Hz, longest_piece)
+    names, used = data.names, data.used
     if not names:
-        raise InputError(
-            "expected at least one input that is not zero in the band", field="inputs", value=data.used.inputs
-        )
+        message = "expected at least one input that is not zero in the band"
+        raise InputError(message, field="inputs", value=used.inputs)
     width = data.width(order) if half_width is None else half_width
     where = data.grid(frequency_Hz, width)
     fit = data.fit(where, order, width)
     found = fit.estimate(names, partial)
-    left_out = [name for name in data.used.inputs if name not in names]
-    method = f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces" + (
-        f"; not excited and left out: {', '.join(left_out)}" if left_out else ""
-    )
+    method = f"local polynomial method, order {order}, {2 * width + 1} lines, {fit.records} records or pieces"
+    if left_out := [name for name in used.inputs if name not in names]:
+        method += f"; not excited and left out: {', '.join(left_out)}"
     return FrequencyResponse(
         found.frequency_Hz,
         found.value,
         found.noise,
         found.gram,
-        names,
-        data.used.outputs,
-        data.used.input_unit,
-        data.used.output_unit,
-        float(found.dof),
+        **used.labels(names),
+        dof=float(found.dof),
         method=method,
         shared=_shared(where, width, order, data.step_Hz),
     )
@@ -148,7 +143,7 @@ def noise_covariance(
     records = tuple(r for r in campaign.records if r.header.excitation != "sine")
     if not records:
         raise InputError("expected a record other than a stepped sine", field="records")
-    data = _Data.of(campaign, records, floor, band_Hz, longest_piece)
+    data = _Data.of(records, floor, band_Hz, longest_piece)
     width = data.width(order) if half_width is None else half_width
     if smooth_Hz is not None and not smooth_Hz > 0:
         raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
@@ -166,22 +161,16 @@ def _smoothed(
     """Means over the centres near each frequency, at least `least` of them."""
     low = np.searchsorted(centres, frequency_Hz - smooth_Hz)
     high = np.searchsorted(centres, frequency_Hz + smooth_Hz, side="right")
-    middle = np.clip(
-        np.rint(np.interp(frequency_Hz, centres, np.arange(centres.size))).astype(int) - least // 2,
-        0,
-        centres.size - least,
-    )
+    nearest = np.rint(np.interp(frequency_Hz, centres, np.arange(centres.size))).astype(int)
+    middle = np.clip(nearest - least // 2, 0, centres.size - least)
     few = high - low < least
     low, high = np.where(few, middle, low), np.where(few, middle + least, high)
     count = high - low
     mean = np.stack([noise[a:b].mean(axis=0) for a, b in zip(low, high, strict=True)])
     mean = (mean + np.swapaxes(mean.conj(), 1, 2)) / 2
     if least * dof < noise.shape[1]:
-        raise InputError(
-            f"expected longer records: {least * dof} degrees of freedom are too few for the covariance of "
-            f"{noise.shape[1]} outputs",
-            field="records",
-        )
+        found = f"{least * dof} degrees of freedom are too few for the covariance of {noise.shape[1]} outputs"
+        raise InputError(f"expected longer records: {found}", field="records")
     return NoiseCovariance(mean, (count * dof).astype(float))
 
 
@@ -205,28 +194,16 @@ class _Data:
     rank: int
 
     @staticmethod
-    def of(
-        campaign: Campaign,
-        records: Sequence[RecordSource],
-        floor: bool | None,
-        band_Hz: Band | None,
-        longest: int | None,
-    ) -> _Data:
-        used, rate = channels(campaign, records, floor), campaign.sample_rate_Hz
+    def of(records: Sequence[RecordSource], floor: bool | None, band_Hz: Band | None, longest: int | None) -> _Data:
+        used, rate = channels(records, floor), records[0].header.sample_rate_Hz
         band = checked_band(band_Hz, rate)
         if longest is not None and longest < 16:
             raise InputError("expected at least 16 samples", field="longest_piece", value=longest)
         cuts = [equal_pieces(record, longest) for record in records]
         shortest = min(stop - start for (start, stop), *_ in cuts)
         firsts = (record.load(*some[0]) for record, some in zip(records, cuts, strict=True))
-        return _Data(
-            [(record, *one) for record, some in zip(records, cuts, strict=True) for one in some],
-            used,
-            band,
-            rate,
-            rate / shortest,
-            *_driven(firsts, used, band),
-        )
+        pieces = [(record, *one) for record, some in zip(records, cuts, strict=True) for one in some]
+        return _Data(pieces, used, band, rate, rate / shortest, *_driven(firsts, used, band))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -242,26 +219,19 @@ class _Data:
         keep = lines(round(self.rate / self.step_Hz), self.rate, self.band)
         every = np.arange(keep.start, keep.stop) * self.step_Hz
         if every.size < 2 * half_width + 1:
-            raise InputError(
-                f"expected at least {2 * half_width + 1} lines for the local models; the band "
-                f"{self.band[0]:g} to {self.band[1]:g} Hz has {every.size} at {self.step_Hz:g} Hz: longer "
-                "records, a wider band or fewer inputs",
-                field="band_Hz",
-                value=self.band,
+            message = (
+                f"expected at least {2 * half_width + 1} lines for the local models; the band {self.band[0]:g} to "
+                f"{self.band[1]:g} Hz has {every.size} at {self.step_Hz:g} Hz: longer records, a wider band or fewer "
+                "inputs"
             )
+            raise InputError(message, field="band_Hz", value=self.band)
         if frequency_Hz is None:
             return every
         asked = np.asarray(frequency_Hz, float)
-        if (
-            asked.ndim != 1
-            or not np.all(np.diff(asked) > 0)
-            or not (asked.size and every[0] * (1 - 1e-9) <= asked[0] and asked[-1] <= every[-1] * (1 + 1e-9))
-        ):
-            raise InputError(
-                f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band",
-                field="frequency_Hz",
-                value=asked if asked.size < 4 else f"{asked.size} values",
-            )
+        low, high = every[0] * (1 - 1e-9), every[-1] * (1 + 1e-9)
+        if asked.ndim != 1 or not asked.size or asked[0] < low or asked[-1] > high or not np.all(np.diff(asked) > 0):
+            message = f"expected increasing frequencies from {every[0]:g} to {every[-1]:g} Hz, lines in the band"
+            raise InputError(message, field="frequency_Hz", value=asked if asked.size < 4 else f"{asked.size} values")
         return asked
 
     def fit(self, where: np.ndarray, order: int, half_width: int) -> LocalFit:

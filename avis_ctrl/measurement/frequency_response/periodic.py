@@ -80,11 +80,8 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
     """
     found = [r for r in campaign.records if r.header.excitation == "multisine" and r.header.periods >= 1]
     if not found:
-        raise InputError(
-            "expected multisine records of at least one period; use local_polynomial for other records",
-            field="records",
-            value=[r.header.excitation for r in campaign.records],
-        )
+        message = "expected multisine records of at least one period; use local_polynomial for other records"
+        raise InputError(message, field="records", value=[r.header.excitation for r in campaign.records])
     if level_V is not None:
         levels = sorted({r.header.level_V for r in found})
         found = [r for r in found if abs(r.header.level_V - level_V) <= SETTINGS.same_level * abs(level_V)]
@@ -92,16 +89,14 @@ def periodic_records(campaign: Campaign, level_V: float | None) -> tuple[RecordS
             raise InputError(f"expected one of the levels {levels}", field="level_V", value=level_V)
     levels = sorted({r.header.level_V for r in found})
     if levels[-1] - levels[0] > SETTINGS.same_level * levels[-1]:
-        raise InputError(
-            "the records have several levels, and the response of a nonlinear rig depends on the level: choose one",
-            field="level_V",
-            value=levels,
+        message = (
+            "the records have several levels, and the response of a nonlinear rig depends on the level: choose one"
         )
+        raise InputError(message, field="level_V", value=levels)
     periods = sorted({r.header.period_s for r in found if r.header.period_s is not None})
     if len(periods) > 1:
-        raise InputError(
-            "expected records of one period; select them with Campaign.only", field="period_s", value=periods
-        )
+        message = "expected records of one period; select them with Campaign.only"
+        raise InputError(message, field="period_s", value=periods)
     return tuple(found)
 
 
@@ -148,12 +143,8 @@ def average(record: RecordSource, used: Channels, keep: slice, drop: int, remove
     x = periods_of(record, used)[drop:]
     count, n = x.shape[:2]
     if count < 1 or (remove and count < 2):
-        raise InputError(
-            f"expected at least {drop + 1 + remove} periods: {drop} are dropped"
-            + (" and the removal of a transient needs two" if remove else ""),
-            field=f"record {record.header.name}: periods",
-            value=record.header.periods,
-        )
+        also = " and the removal of a transient needs two" if remove else ""
+        raise record.header.error("periods", f"expected at least {drop + 1 + remove} periods: {drop} are dropped{also}")
     if remove:
         return _without_transient(x.reshape(count * n, -1), count, keep, len(used.inputs), record.header.name)
     X = fft.rfft(x, axis=1)[:, keep] / np.sqrt(n)
@@ -173,11 +164,8 @@ def _without_transient(x: np.ndarray, count: int, keep: slice, n_u: int, name: s
         side += 1
     harmonic = np.arange(keep.start, keep.stop)
     if 2 * side > last:
-        raise InputError(
-            f"expected at least {2 * side} harmonics of the period below half the sample rate",
-            field=f"record {name}: period_s",
-            value=last,
-        )
+        message = f"expected at least {2 * side} harmonics of the period below half the sample rate"
+        raise InputError(message, field=f"record {name}: period_s", value=last)
     base = np.clip(harmonic, side, last - side)
     offset = np.array([j for j in range(-side * count + 1, side * count) if j % count])
     span = offset / (side * count)

@@ -76,15 +76,14 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
     f = response.frequency_Hz
     reach = SETTINGS.search * near_Hz if width_Hz is None else width_Hz / 2
     inside = np.flatnonzero(np.abs(f - near_Hz) <= reach)
+    if not f.size:
+        raise InputError("expected lines", field="near_Hz", value=near_Hz)
     if not (np.isfinite(near_Hz) and near_Hz > 0) or inside.size < 3 or f.size < SETTINGS.fewest_lines:
-        raise InputError(
-            f"expected at least three lines within {reach:g} Hz and {SETTINGS.fewest_lines} in all; there "
-            f"are lines from {f[0]:g} to {f[-1]:g} Hz"
-            if f.size
-            else "expected lines",
-            field="near_Hz",
-            value=near_Hz,
+        message = (
+            f"expected at least three lines within {reach:g} Hz and {SETTINGS.fewest_lines} in all; there are lines "
+            f"from {f[0]:g} to {f[-1]:g} Hz"
         )
+        raise InputError(message, field="near_Hz", value=near_Hz)
     size = np.sum(np.abs(response.value) ** 2 / np.mean(np.abs(response.value[inside]) ** 2, axis=0), axis=(1, 2))
     peak = f[inside[np.argmax(size[inside])]]
     half = reach if width_Hz is not None else max(reach / 2, SETTINGS.fewest_lines / 2 * float(np.median(np.diff(f))))
@@ -92,9 +91,8 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
     for width in SETTINGS.reach if width_Hz is None else ():
         wider = found
         for _ in range(4):
-            again = _fit(
-                response, wider.frequency_Hz, width * 2 * wider.damping * wider.frequency_Hz, near_Hz, reach, wider
-            )
+            half = width * 2 * wider.damping * wider.frequency_Hz
+            again = _fit(response, wider.frequency_Hz, half, near_Hz, reach, wider)
             settled, wider = again.band_Hz == wider.band_Hz, again
             if settled:
                 break
@@ -143,24 +141,21 @@ def _fit(
     ]
     best = min(fits, key=lambda s: s.cost)
     free = 2 * (use.size - 3) * G.shape[1] - 2
-    _check_significant(best.cost, _without_pole(weight, G, w - w0), G.shape[1], free, near_Hz, f[use])
+    _require_pole(best.cost, free, weight, G, w - w0, near_Hz, f[use])
     # E|e|^2 counts real and imaginary parts, each of half the variance.
     misfit = 2 * 2 * best.cost / free
-    return _result(best, project(best.x)[1], misfit, scale, w0, f[use], response.value.shape[1:], near_Hz, reach)
+    residue = (scale * project(best.x)[1][:, 0]).reshape(response.value.shape[1:])
+    return _result(best.x, best.jac, residue, misfit, scale, w0, f[use], near_Hz, reach)
 
 
-def _without_pole(weight: np.ndarray, G: np.ndarray, d: np.ndarray) -> float:
-    """Half the weighted sum of squared residuals of the background alone."""
+def _require_pole(
+    with_pole: float, free: int, weight: np.ndarray, G: np.ndarray, d: np.ndarray, near_Hz: float, f: np.ndarray
+) -> None:
+    """F test of the pole against the background alone; with_pole : half the sum of squared residuals with it."""
     q, _ = np.linalg.qr(weight.T[:, :, None] * np.stack([np.ones(d.size), d / np.abs(d).max()], axis=1))
     right = (weight * G).T[:, :, None]
-    return float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
-
-
-def _check_significant(
-    with_pole: float, without: float, entries: int, free: int, near_Hz: float, f: np.ndarray
-) -> None:
-    """F test of the pole against the background alone."""
-    added = 2 * entries + 2
+    without = float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
+    added = 2 * G.shape[1] + 2
     ratio = (without - with_pole) / added / max(with_pole / free, np.finfo(float).tiny)
     limit = float(stats.f(added, free).isf(SETTINGS.false_alarm))
     if ratio < limit:
@@ -174,17 +169,17 @@ def _check_significant(
 
 
 def _result(
-    best: object,
-    coefficients: np.ndarray,
+    x: np.ndarray,
+    J: np.ndarray,
+    residue: np.ndarray,
     misfit: float,
     scale: float,
     w0: float,
     f: np.ndarray,
-    shape: tuple[int, ...],
     near_Hz: float,
     reach: float,
 ) -> Resonance:
-    x, J = np.asarray(best.x), np.asarray(best.jac)  # type: ignore[attr-defined]
+    """The mode, with standard deviations from the Jacobian J of the residuals with respect to x."""
     decay, turn = scale * np.exp(x[1]), w0 + scale * x[0]
     natural = np.hypot(decay, turn)
     if abs(natural / (2 * np.pi) - near_Hz) > 2 * reach or abs(x[0]) >= 1.5 or x[1] >= 3.0 or x[1] <= -14.0:
@@ -210,7 +205,7 @@ def _result(
         decay / natural,
         spread[0] / (2 * np.pi),
         spread[1],
-        scale * coefficients[:, 0].reshape(shape),
+        residue,
         float(misfit),
         (float(f[0]), float(f[-1])),
         f.size,

@@ -74,10 +74,8 @@ class FrequencyResponse:
                 raise InputError(f"expected finite numbers of shape {shape}", field=field, value=array.shape)
             object.__setattr__(self, field, array)
         if (self.noise is None or self.gram is None) == (self.entry_variance is None):
-            raise InputError(
-                "expected the noise covariance with the inputs' Gram matrix, or variances of the entries",
-                field="noise, gram, entry_variance",
-            )
+            message = "expected the noise covariance with the inputs' Gram matrix, or variances of the entries"
+            raise InputError(message, field="noise, gram, entry_variance")
         frequency = np.asarray(self.frequency_Hz, float)
         if not np.all(np.diff(frequency) > 0):
             raise InputError("expected increasing frequencies", field="frequency_Hz")

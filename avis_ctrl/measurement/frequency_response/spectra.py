@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft
@@ -31,12 +32,17 @@ class Channels:
     input_unit: str
     output_unit: str
 
+    def labels(self, inputs: tuple[str, ...]) -> dict[str, Any]:
+        """Names and units of a `FrequencyResponse` from some of the inputs."""
+        units = {"input_unit": self.input_unit, "output_unit": self.output_unit}
+        return {"inputs": inputs, "outputs": self.outputs, **units}
+
     def of(self, record: Record) -> tuple[np.ndarray, np.ndarray]:
         """Samples of the inputs (samples, n_u) and of the outputs (samples, n_y)."""
         return np.hstack([record.u, record.floor]) if self.floor and record.floor is not None else record.u, record.y
 
 
-def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | None) -> Channels:
+def channels(records: Sequence[RecordSource], floor: bool | None) -> Channels:
     """Inputs and outputs of an estimate.
 
     Parameters
@@ -55,15 +61,10 @@ def channels(campaign: Campaign, records: Sequence[RecordSource], floor: bool | 
     use = not lacking if floor is None else floor
     for record in records:
         if use and record.header.floor_names != first.floor_names:
-            raise InputError(
-                f"expected {first.floor_names} as in record {first.name}",
-                field=f"record {record.header.name}: floor_names",
-                value=record.header.floor_names,
-            )
+            raise record.header.error("floor_names", f"expected {first.floor_names} as in record {first.name}")
+    inputs = (*first.u_names, *first.floor_names) if use else first.u_names
     unit = f"{first.u_unit}; floor {first.floor_unit}" if use else first.u_unit
-    return Channels(
-        (*campaign.u_names, *(first.floor_names if use else ())), campaign.y_names, use, unit, campaign.y_unit
-    )
+    return Channels(inputs, first.y_names, use, unit, first.y_unit)
 
 
 def taking_part(campaign: Campaign, floor: bool | None) -> tuple[RecordSource, ...]:
@@ -78,11 +79,9 @@ def taking_part(campaign: Campaign, floor: bool | None) -> tuple[RecordSource, .
     quiet_count = floor is not False and bool(moving) and all(r.header.floor_names for r in moving)
     chosen = tuple(moving) if quiet_count else driven
     if not chosen:
-        raise InputError(
-            "expected at least one record with multisine or noise excitation, or with measured floor motion",
-            field="records",
-            value=[r.header.excitation for r in campaign.records],
-        )
+        found = [r.header.excitation for r in campaign.records]
+        words = "expected at least one record with multisine or noise excitation, or with measured floor motion"
+        raise InputError(words, field="records", value=found)
     return chosen
 
 
@@ -90,11 +89,8 @@ def checked_band(band_Hz: Band | None, sample_rate_Hz: float) -> Band:
     """A band within 0 .. f_s/2; the full range by default."""
     low, high = (0.0, sample_rate_Hz / 2) if band_Hz is None else band_Hz
     if not 0 <= low < high <= sample_rate_Hz / 2:
-        raise InputError(
-            f"expected 0 <= low < high <= {sample_rate_Hz / 2:g} Hz, half the sample rate",
-            field="band_Hz",
-            value=band_Hz,
-        )
+        words = f"expected 0 <= low < high <= {sample_rate_Hz / 2:g} Hz, half the sample rate"
+        raise InputError(words, field="band_Hz", value=band_Hz)
     return low, high
 
 

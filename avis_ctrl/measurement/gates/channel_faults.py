@@ -263,15 +263,10 @@ def _agreements(comparison: ModelComparison, order: dict[str, np.ndarray], sign:
 
 def _steps(n_y: int, n_u: int) -> list[tuple[str, int, int, tuple[float, float]]]:
     """All elementary faults (row or column, i, k, signs); flips have i = k."""
-    signs = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
-    steps = [(what, i, i, (-1.0, 1.0)) for what, n in (("row", n_y), ("column", n_u)) for i in range(n)]
-    return steps + [
-        (what, i, k, flips)
-        for what, n in (("row", n_y), ("column", n_u))
-        for i in range(n)
-        for k in range(i)
-        for flips in signs
-    ]
+    signs, sizes = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)), (("row", n_y), ("column", n_u))
+    flips = [(what, i, i, (-1.0, 1.0)) for what, n in sizes for i in range(n)]
+    pairs = [(what, i, k) for what, n in sizes for i in range(n) for k in range(i)]
+    return flips + [(*pair, two) for pair in pairs for two in signs]
 
 
 def _after(

@@ -79,35 +79,27 @@ class ChannelMap(Gate):
 
         copied, comparison = list(_copied(kept, campaign)), compare(_pairs(kept), response)
         if comparison is None:
-            known = expectation.response is not None
-            return _not_compared(
-                kept,
-                copied,
-                campaign,
-                "too few driven samples" if known else "no model was given",
-                "note" if known else "ok",
-            )
-        faults = explain(comparison)
-        exchanged = list(_exchanged(faults, campaign, comparison))
-        order = copied + exchanged or [_right(faults, campaign, comparison)]
-        return order + (list(_flipped(faults, campaign, comparison)) or [_signs_agree(faults, campaign, comparison)])
+            if expectation.response is None:
+                return _not_compared(kept, copied, campaign, "no model was given", "ok")
+            return _not_compared(kept, copied, campaign, "too few driven samples", "note")
+        faults, least = explain(comparison), comparison.settings.least_agreement
+        order_picture = _order_picture(faults, campaign, comparison)
+        sign_picture = _sign_picture(faults, campaign, least)
+        order = copied + list(_exchanged(faults, campaign, least, order_picture))
+        signs = list(_flipped(faults, campaign, comparison, sign_picture))
+        return [
+            *(order or [_right(faults, campaign, comparison, order_picture)]),
+            *(signs or [_signs_agree(faults, least, sign_picture)]),
+        ]
 
 
 def _not_compared(
     kept: list[_Kept], copied: list[Finding], campaign: Campaign, why: str, severity: Severity
 ) -> list[Finding]:
-    x = np.arange(len(campaign.y_names))
-    picture = Picture(
-        "Polarity of each sensor", "sensor number", "correlation [-]", (Series("not known", x, 0.0 * x, "points"),)
-    )
-    order = copied or [
-        Finding(
-            ORDER,
-            severity,
-            f"No channel is a copy of another; their order was not compared with a model ({why}).",
-            picture=_copy_picture(kept),
-        )
-    ]
+    none = Series("not known", np.arange(len(campaign.y_names)), np.zeros(len(campaign.y_names)), "points")
+    picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]", (none,))
+    sentence = f"No channel is a copy of another; their order was not compared with a model ({why})."
+    order = copied or [Finding(ORDER, severity, sentence, picture=_copy_picture(kept))]
     return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).", picture=picture)]
 
 
@@ -119,31 +111,26 @@ def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
         if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
             continue
         alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike for of in kept)
+        severity: Severity = "note" if alike else "stop"
         cause = (
             "the model expects that of these records, so they do not show whether one signal was recorded twice. "
             "Excite other axes, too."
             if alike
             else "one signal was recorded twice. Check the wiring and the channel list; leave one of them out."
         )
-        yield Finding(
-            ORDER,
-            "note" if alike else "stop",
-            f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. "
-            f"in every record: {cause}",
-            (names[i], names[k]),
-            tuple(h[0] for h in hits),
-            float(rest),
-            COPIES.different,
-            _copy_picture(kept),
+        sentence = (
+            f"Channel {names[k]!r} is {names[i]!r} times {scale:.6g} within {100 * rest:.2g} % of its r.m.s. in every "
+            f"record: {cause}"
         )
+        pair, records = (names[i], names[k]), tuple(record for record, _, _ in hits)
+        yield Finding(ORDER, severity, sentence, pair, records, rest, COPIES.different, _copy_picture(kept))
 
 
-def _exchanged(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
+def _exchanged(faults: Faults, campaign: Campaign, least: float, picture: Picture) -> Iterator[Finding]:
     sensors, drives = campaign.y_names, campaign.u_names
     for kind, what, p, names in (("row", "Sensor", faults.p, sensors), ("column", "Drive", faults.q, drives)):
-        for i in range(len(p)):
-            cycle = cycle_of(p, i)
-            if len(cycle) == 1 or i > min(cycle):
+        for cycle in (cycle_of(p, i) for i in range(len(p))):
+            if len(cycle) == 1 or cycle[0] > min(cycle):
                 continue
             if kind == "row":
                 gain = min(faults.other[j] - faults.own[j] for j in cycle)
@@ -153,27 +140,23 @@ def _exchanged(faults: Faults, campaign: Campaign, comparison: ModelComparison) 
                     for j in cycle
                 )
             else:
-                of, before, after = faults.columns[i]
+                of, before, after = faults.columns[cycle[0]]
                 gain = after - before
                 listed = f"exchanging them raises the correlation of {sensors[of]!r} from {before:.2f} to {after:.2f}"
             pair = tuple(names[j] for j in cycle)
             verb = "are exchanged" if len(pair) == 2 else "are mixed up"
-            yield Finding(
-                ORDER,
-                "stop",
-                f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are "
-                f"fitted; p-value at most "
-                f"{max(faults.p_value[kind, j] for j in cycle):.1g}). Exchange their names or their cables.",
-                pair,
-                value=float(gain),
-                limit=comparison.settings.least_agreement,
-                picture=_order_picture(faults, campaign, comparison),
+            p_value = max(faults.p_value[kind, j] for j in cycle)
+            sentence = (
+                f"{what}s {' and '.join(map(repr, pair))} {verb}: {listed} (1 is perfect; gain and delay are fitted; "
+                f"p-value at most {p_value:.1g}). Exchange their names or their cables."
             )
+            yield Finding(ORDER, "stop", sentence, pair, value=gain, limit=least, picture=picture)
 
 
-def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Finding:
+def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison, picture: Picture) -> Finding:
     worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
-    least = f"the lowest correlation is {faults.other[worst]:.2f}, of {campaign.y_names[worst]!r}"
+    lowest = float(faults.other[worst])
+    least = f"the lowest correlation is {lowest:.2f}, of {campaign.y_names[worst]!r}"
     alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
     severity: Severity = "ok"
     channels: tuple[str, ...] = ()
@@ -181,29 +164,21 @@ def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> F
         names = [(campaign.y_names if what == "row" else campaign.u_names)[k] for what, k in faults.doubtful]
         severity = "note"
         sentence = (
-            f"The agreement of model and records is too poor to check the order of the channels ({least}; "
-            f"another order or sign of {quoted(names)} would agree better, but an inaccurate model can cause "
-            "that, too). Check the channel list by hand."
+            f"The agreement of model and records is too poor to check the order of the channels ({least}; another "
+            f"order or sign of {quoted(names)} would agree better, but an inaccurate model can cause that, too). Check "
+            "the channel list by hand."
         )
     elif alone and 2 * len(alone) < len(faults.other):
         severity, channels = "warning", alone
         low, high = comparison.settings.delay_s
         sentence = (
-            f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as "
-            f"{faults.other[worst]:.2f}), while the others do. Its signal is more than {1000 * high:g} ms late "
-            f"or {-1000 * low:g} ms early, or the channel list is wrong, or the model lacks an effect there."
+            f"Sensor {quoted(alone)} agrees with no response of the model (correlation as low as {lowest:.2f}), while "
+            f"the others do. Its signal is more than {1000 * high:g} ms late or {-1000 * low:g} ms early, or the "
+            "channel list is wrong, or the model lacks an effect there."
         )
     else:
         sentence = f"No other order of the channels agrees better with the model ({least})."
-    return Finding(
-        ORDER,
-        severity,
-        sentence,
-        channels,
-        value=float(faults.other[worst]),
-        limit=enough,
-        picture=_order_picture(faults, campaign, comparison),
-    )
+    return Finding(ORDER, severity, sentence, channels, value=lowest, limit=enough, picture=picture)
 
 
 def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Picture:
@@ -220,70 +195,47 @@ def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparis
     )
 
 
-def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
+def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison, picture: Picture) -> Iterator[Finding]:
     rows, columns = ([int(k) for k in np.flatnonzero(signs < 0)] for signs in (faults.r, faults.c))
-    doubt = (
-        " It is equally possible that all other channels are reversed."
-        if 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving)
-        else ""
-    )
-    said = [
-        (
-            "Sensor",
-            campaign.y_names[k],
-            -float(faults.other[k]),
-            f"correlation {-faults.other[k]:.2f} where +1 is expected",
-            faults.p_value["row", k],
-        )
-        for k in rows
-    ]
+    either = 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving)
+    doubt = " It is equally possible that all other channels are reversed." if either else ""
+    said = []
+    for k in rows:
+        value = -float(faults.other[k])
+        how = f"correlation {value:.2f} where +1 is expected"
+        said.append(("Sensor", campaign.y_names[k], value, how, faults.p_value["row", k]))
     for k in columns:
         of, before, after = faults.columns[k]
-        said.append(
-            (
-                "Drive",
-                campaign.u_names[k],
-                before - after,
-                "reversing it raises the correlation of sensor "
-                f"{campaign.y_names[of]!r} from {before:.2f} to {after:.2f}",
-                faults.p_value["column", k],
-            )
-        )
+        how = f"reversing it raises the correlation of sensor {campaign.y_names[of]!r} from {before:.2f} to {after:.2f}"
+        said.append(("Drive", campaign.u_names[k], before - after, how, faults.p_value["column", k]))
     for what, name, value, how, p_value in said:
-        yield Finding(
-            POLARITY,
-            "stop",
-            f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {p_value:.1g}). Its "
-            "leads are exchanged, or the model's axis has the opposite direction. Exchange the leads or "
-            f"reverse the sign of the channel.{doubt}",
-            (name,),
-            value=value,
-            limit=-comparison.settings.least_agreement,
-            picture=_sign_picture(faults, campaign, comparison),
+        sentence = (
+            f"{what} {name!r} has the opposite sign of the model ({how}; p-value at most {p_value:.1g}). Its leads are "
+            "exchanged, or the model's axis has the opposite direction. Exchange the leads or reverse the sign of the "
+            f"channel.{doubt}"
         )
+        limit = -comparison.settings.least_agreement
+        yield Finding(POLARITY, "stop", sentence, (name,), value=value, limit=limit, picture=picture)
 
 
-def _signs_agree(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Finding:
+def _signs_agree(faults: Faults, least: float, picture: Picture) -> Finding:
     lowest = float(faults.other.min())
-    return Finding(
-        POLARITY,
-        "note" if faults.doubtful else "ok",
+    severity: Severity = "note" if faults.doubtful else "ok"
+    sentence = (
         "The signs could not be checked: the agreement of model and records is too poor."
         if faults.doubtful
-        else f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f}).",
-        value=lowest,
-        limit=comparison.settings.least_agreement,
-        picture=_sign_picture(faults, campaign, comparison),
+        else f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f})."
     )
+    return Finding(POLARITY, severity, sentence, value=lowest, limit=least, picture=picture)
 
 
-def _sign_picture(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Picture:
+def _sign_picture(faults: Faults, campaign: Campaign, least: float) -> Picture:
     return Picture(
         "Signed correlation with the model",
         "sensor",
         "correlation [-]",
         (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
-        (Limit("opposite sign", -comparison.settings.least_agreement),),
+        (Limit("opposite sign", -least),),
         x_names=campaign.y_names,
     )
 

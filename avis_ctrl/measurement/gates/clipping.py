@@ -10,7 +10,17 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    quoted,
+    samples_over_time,
+)
 
 # The top code of a noise-free sine occurs up to 2.42 times as often as the next code.
 SINE_TOP = 2.42
@@ -41,7 +51,7 @@ SETTINGS = ClippingSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Extremes of one channel of a record: `count` samples at `value`, the reason, and part of the signal."""
+    """Extremes of one channel of a record: `count` samples at `value`, the reason, and t [s] and x around the first."""
 
     record: str
     channel: str
@@ -52,8 +62,7 @@ class _Ends:
     why: str = ""
     p: float = 1.0
     bursts: int = 0
-    t: np.ndarray | None = None
-    x: np.ndarray | None = None
+    trace: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
     unit: bool = False
 
 
@@ -101,82 +110,49 @@ class Clipping(Gate):
         ]
         peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
         top = max(peaks, key=lambda n: peaks[n])
-        limits = () if expectation.y_range_V is None else (Limit("converter", expectation.y_range_V[1]),)
+        end = None if expectation.y_range_V is None else expectation.y_range_V[1]
         picture = Picture(
             "Largest absolute value of each channel",
             "channel",
             f"largest value [{campaign.y_unit}]",
             (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),),
-            limits,
+            () if end is None else (Limit("converter", end),),
             x_names=tuple(peaks),
         )
-        return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}.",
-                value=peaks[top],
-                limit=None if not limits else limits[0].value,
-                picture=picture,
-            )
-        ]
+        sentence = f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}."
+        return found or [Finding(self.name, "ok", sentence, value=peaks[top], limit=end, picture=picture)]
 
     def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
         """Finding for records with most samples at or beyond the range."""
-        row = max(rows, key=lambda r: r.count)
-        assert row.t is not None and row.x is not None and expectation.y_range_V is not None
-        return Finding(
-            self.name,
-            "stop",
-            f"{100 * row.count / row.samples:.0f} % of the samples of channel {row.channel!r} of record {row.record} "
-            f"are at or beyond the converter's range, which ends at {expectation.y_range_V[1]:.6g} {campaign.y_unit}; "
-            f"the largest is {row.peak:.6g}. Channels concerned: {quoted(names)}. The unit or scale is probably wrong "
-            f"(mV given as {campaign.y_unit}?), or the range in the rig file. Correct it first; only then can clipping "
-            "be checked.",
-            names,
-            tuple(dict.fromkeys(r.record for r in rows)),
-            row.count / row.samples,
-            SETTINGS.wrong_unit,
-            Picture(
-                f"Record {row.record}, {row.channel}",
-                "time [s]",
-                f"{row.channel} [{campaign.y_unit}]",
-                (Series(row.channel, row.t, row.x),),
-                (Limit("converter", expectation.y_range_V[1]),),
-            ),
+        row, unit = max(rows, key=lambda r: r.count), campaign.y_unit
+        assert expectation.y_range_V is not None
+        end, part = expectation.y_range_V[1], row.count / row.samples
+        sentence = (
+            f"{100 * part:.0f} % of the samples of channel {row.channel!r} of record {row.record} are at or beyond the "
+            f"converter's range, which ends at {end:.6g} {unit}; the largest is {row.peak:.6g}. Channels concerned: "
+            f"{quoted(names)}. The unit or scale is probably wrong (mV given as {unit}?), or the range in the rig "
+            "file. Correct it first; only then can clipping be checked."
         )
+        records = tuple(dict.fromkeys(r.record for r in rows))
+        picture = samples_over_time(row.record, row.channel, *row.trace, unit, (Limit("converter", end),))
+        return Finding(self.name, "stop", sentence, names, records, part, SETTINGS.wrong_unit, picture)
 
     def _finding(self, of: list[_Ends]) -> Finding:
         """Finding for the records in which one channel is clipped."""
         row = max(of, key=lambda r: r.count)
         part = row.count / row.samples
-        assert row.t is not None and row.x is not None
-        picture = Picture(
-            f"Record {row.record}, {row.channel}",
-            "time [s]",
-            row.channel,
-            (Series(row.channel, row.t, row.x),),
-            (Limit("clipped at", row.value),),
-        )
         bursts = f" in {row.bursts} bursts" if row.bursts > 1 else ""
         others = [f"{r.record} ({r.count} samples at {r.value:.4g})" for r in of if r is not row]
         also = f" Also in record {', '.join(others)}." if others else ""
         sentence = (
-            f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} "
-            f"%){bursts} at {row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the "
-            "record; until then leave the record out."
+            f"Channel {row.channel!r} of record {row.record} has {row.count} samples ({100 * part:.2g} %){bursts} at "
+            f"{row.value:.6g}: {row.why}.{also} Lower the level or the gain and repeat the record; until then leave "
+            "the record out."
         )
+        severity: Severity = "stop" if part > 1e-3 else "warning"
+        picture = samples_over_time(row.record, row.channel, *row.trace, limits=(Limit("clipped at", row.value),))
         records = tuple(r.record for r in of)
-        return Finding(
-            self.name,
-            "stop" if part > 1e-3 else "warning",
-            sentence,
-            (row.channel,),
-            records,
-            float(row.count),
-            0.0,
-            picture,
-        )
+        return Finding(self.name, severity, sentence, (row.channel,), records, row.count, 0.0, picture)
 
 
 def _ends(
@@ -199,7 +175,7 @@ def _ends(
         bursts = int(np.count_nonzero(np.diff(mask.astype(int)) == 1) + mask[0])
         middle = int(np.flatnonzero(mask)[0])
         part = slice(max(0, middle - 1000), middle + 1000)
-        return _Ends(record, channel, len(x), peak, int(mask.sum()), value, why, p, bursts, t[part], x[part])
+        return _Ends(record, channel, len(x), peak, int(mask.sum()), value, why, p, bursts, (t[part], x[part]))
 
     if bounds is not None:
         margin = (lsb if lsb is not None else 1e-6 * (bounds[1] - bounds[0])) / 2

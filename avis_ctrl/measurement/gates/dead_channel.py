@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
-from avis_ctrl.measurement.gates.h1 import h1, moving, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    curves,
+    quoted,
+    samples_over_time,
+)
+from avis_ctrl.measurement.gates.h1 import h1, moving, record_spectra, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
 
@@ -31,14 +40,15 @@ SETTINGS = DeadSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
+    """Data of one record; stuck : length and start of a stuck run, and t [s] and y around it, by channel."""
+
     record: str
     driven: bool
     rms: np.ndarray
     spread: np.ndarray
     codes: np.ndarray
-    stuck: dict[int, tuple[int, int]]
+    stuck: dict[int, tuple[int, int, np.ndarray, np.ndarray]]
     response: np.ndarray | None
-    traces: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
 class DeadChannel(Gate):
@@ -59,22 +69,14 @@ class DeadChannel(Gate):
         stuck = {}
         for k in range(y.shape[1]):
             runs = equal_runs(y[:, k])
-            longest, second = runs[0][0], runs[1][0] if len(runs) > 1 else 1
+            (longest, at), second = runs[0], runs[1][0] if len(runs) > 1 else 1
             if max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second) <= longest < len(y):
-                stuck[k] = runs[0]
-        traces = {k: (t[(part := slice(max(0, at - n), at + 2 * n))], y[part, k]) for k, (n, at) in stuck.items()}
+                part = slice(max(0, at - longest), at + 2 * longest)
+                stuck[k] = longest, at, t[part], y[part, k]
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
+        rms = np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0)
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
-        return _Kept(
-            seen.header.name,
-            seen.driven,
-            np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0),
-            spread,
-            codes,
-            stuck,
-            _excess(seen),
-            traces,
-        )
+        return _Kept(seen.header.name, seen.driven, rms, spread, codes, stuck, _excess(seen))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         rms = np.array([k.rms for k in kept])
@@ -82,101 +84,64 @@ class DeadChannel(Gate):
             "R.m.s. of each channel by record",
             "record number",
             f"r.m.s. [{campaign.y_unit}]",
-            tuple(Series(name, np.arange(len(kept)), rms[:, j], "points") for j, name in enumerate(campaign.y_names)),
+            curves(campaign.y_names, np.arange(len(kept)), rms, "points"),
             y_scale="log",
         )
         found = [*self._sensors(kept, campaign, rms, picture), *self._never_driven(kept, campaign, picture)]
         strongest = rms.max(axis=0)
-        quietest = int(np.argmin(strongest))
-        return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"All {len(strongest)} channels move; the quietest is "
-                f"{campaign.y_names[quietest]!r} with {strongest[quietest]:.3g} {campaign.y_unit} r.m.s. in its "
-                "strongest record.",
-                value=float(strongest[quietest]),
-                limit=0.0,
-                picture=picture,
-            )
-        ]
+        least, name = strongest.min(), campaign.y_names[int(np.argmin(strongest))]
+        sentence = (
+            f"All {len(strongest)} channels move; the quietest is {name!r} with {least:.3g} {campaign.y_unit} r.m.s. "
+            "in its strongest record."
+        )
+        return found or [Finding(self.name, "ok", sentence, value=least, limit=0.0, picture=picture)]
 
     def _sensors(self, kept: list[_Kept], campaign: Campaign, rms: np.ndarray, picture: Picture) -> Iterator[Finding]:
-        responses = [k.response for k in kept if k.response is not None]
+        driven = {k.record: k.response for k in kept if k.response is not None}
         # Drift looks like a slow sine: for sine records the median is used.
         sines = all(record.header.excitation == "sine" for record in campaign.records)
-        excess = (np.median if sines else np.max)(responses, axis=0) if responses else None
+        excess = (np.median if sines else np.max)(list(driven.values()), axis=0) if driven else None
         for j, name in enumerate(campaign.y_names):
             dead = tuple(k.record for k in kept if k.rms[j] == 0)
             if dead:
                 where = "every record" if len(dead) == len(kept) else f"record {', '.join(dead[:5])}"
-                yield Finding(
-                    self.name,
-                    "stop",
-                    f"Channel {name!r} is constant in {where}: the sensor is not connected or not recorded. "
-                    "Check its cable and input, or leave the channel out.",
-                    (name,),
-                    dead,
-                    0.0,
-                    0.0,
-                    picture,
+                sentence = (
+                    f"Channel {name!r} is constant in {where}: the sensor is not connected or not recorded. Check its "
+                    "cable and input, or leave the channel out."
                 )
+                yield Finding(self.name, "stop", sentence, (name,), dead, 0.0, 0.0, picture)
             for k in kept:
                 if j in k.stuck:
                     yield self._stuck(name, j, k, campaign)
             if not dead and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
-                yield Finding(
-                    self.name,
-                    "stop",
-                    f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} "
-                    f"r.m.s. ({int(np.median([k.codes[j] for k in kept]))} different values) in every driven "
-                    "record while the other channels respond (its ratio of response to noise is "
-                    f"{excess[j]:.2g} times the limit for noise alone; the median of all channels is "
-                    f"{np.median(excess):.3g} times it): not connected, or recorded under another name. "
-                    "Check its cable, or leave it out.",
-                    (name,),
-                    tuple(k.record for k in kept if k.response is not None),
-                    float(excess[j]),
-                    1.0,
-                    picture,
+                sentence = (
+                    f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s. "
+                    f"({int(np.median([k.codes[j] for k in kept]))} different values) in every driven record while the "
+                    f"other channels respond (its ratio of response to noise is {excess[j]:.2g} times the limit for "
+                    f"noise alone; the median of all channels is {np.median(excess):.3g} times it): not connected, or "
+                    "recorded under another name. Check its cable, or leave it out."
                 )
+                yield Finding(self.name, "stop", sentence, (name,), tuple(driven), excess[j], 1.0, picture)
 
     def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> Iterator[Finding]:
         driven = [k.spread for k in kept if k.driven]
         idle = tuple(n for j, n in enumerate(campaign.u_names) if not any(spread[j] > 0 for spread in driven))
         if driven and idle:
-            yield Finding(
-                self.name,
-                "note",
-                f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. "
-                "Drive it in a further record, or leave it out.",
-                idle,
-                picture=picture,
+            sentence = (
+                f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. Drive it "
+                "in a further record, or leave it out."
             )
+            yield Finding(self.name, "note", sentence, idle, picture=picture)
 
     def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
-        n, at = kept.stuck[j]
-        rate = campaign.sample_rate_Hz
-        t, x = kept.traces[j]
-        picture = Picture(
-            f"Record {kept.record}, {name}",
-            "time [s]",
-            f"{name} [{campaign.y_unit}]",
-            (Series(name, t, x),),
-            (Limit("stuck from", at / rate, "x"),),
+        (n, at, t, x), rate = kept.stuck[j], campaign.sample_rate_Hz
+        limit = Limit("stuck from", at / rate, "x")
+        picture = samples_over_time(kept.record, name, t, x, campaign.y_unit, (limit,))
+        sentence = (
+            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) from "
+            f"{at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or repeat the record."
         )
-        return Finding(
-            self.name,
-            "warning",
-            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) "
-            f"from {at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or "
-            "repeat the record.",
-            (name,),
-            (kept.record,),
-            float(n),
-            float(SETTINGS.stuck_samples),
-            picture,
-        )
+        return Finding(self.name, "warning", sentence, (name,), (kept.record,), n, SETTINGS.stuck_samples, picture)
 
 
 def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:
@@ -193,16 +158,9 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
         return None
     if seen.header.excitation == "sine":
         return _sine_excess(seen)
-    u, y, wrap = usable(seen)
-    if not moving(u):
+    if not moving(usable(seen)[0]) or (estimate := h1([record_spectra(seen)])) is None:
         return None
-    of = spectra(u, y, seen.header.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
-    estimate = h1([of])
-    if estimate is None:
-        return None
-    n_u = estimate.rank
-    level = FALSE_ALARM / estimate.coherence.size
-    limit = stats.beta.isf(level, n_u, estimate.dof)
+    limit = stats.beta.isf(FALSE_ALARM / estimate.coherence.size, estimate.rank, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)
     return np.max(ratio, axis=0) / (limit / max(1 - limit, 1e-12))
 

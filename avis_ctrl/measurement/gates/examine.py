@@ -102,12 +102,9 @@ def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Find
 
 def after_clipping(findings: list[Finding]) -> list[Finding]:
     """Turn consequences of clipping into notes: spikes at the corners of flat tops, and noise if the unit is wrong."""
-    clipped = {
-        (f.channels[0], r) for f in findings if f.gate == Clipping.name and f.severity == "stop" for r in f.records
-    }
-    scaled = {
-        name for f in findings if f.gate == Clipping.name and f.severity == "stop" and f.limit for name in f.channels
-    }
+    stops = [f for f in findings if f.gate == Clipping.name and f.severity == "stop"]
+    clipped = {(f.channels[0], record) for f in stops for record in f.records}
+    scaled = {name for f in stops if f.limit for name in f.channels}
     spikes = " The channel is clipped in this record: these are probably the corners of its flat tops."
     noise = " This is likely a consequence of the wrong unit or scale."
     made = []

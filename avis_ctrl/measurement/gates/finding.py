@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,14 +18,17 @@ FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True)
-class PictureSettings:
+class FindingSettings:
     """most_points : maximum number of points of a line: a panel is some hundred pixels wide, with two points
-    per pixel."""
+        per pixel.
+    most_names : channels that a sentence names; further channels are counted.
+    """
 
     most_points: int = 2000
+    most_names: int = 4
 
 
-SETTINGS = PictureSettings()
+SETTINGS = FindingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,26 @@ class Picture:
     x_names: tuple[str, ...] = ()
 
 
+def curves(names: Sequence[str], x: np.ndarray, y: np.ndarray, style: str = "line") -> tuple[Series, ...]:
+    """One curve for each channel, of x (n,) and y (n, channels)."""
+    return tuple(Series(name, x, column, style) for name, column in zip(names, y.T, strict=True))
+
+
+def over_frequency(
+    title: str, y_label: str, series: tuple[Series, ...], limits: tuple[Limit, ...], y_scale: str = "log"
+) -> Picture:
+    """Curves over frequency on a logarithmic axis."""
+    return Picture(title, "frequency [Hz]", y_label, series, limits, "log", y_scale)
+
+
+def samples_over_time(
+    record: str, channel: str, t: np.ndarray, x: np.ndarray, unit: str = "", limits: tuple[Limit, ...] = ()
+) -> Picture:
+    """Samples x (n,) of one channel at t (n,) s."""
+    label = f"{channel} [{unit}]" if unit else channel
+    return Picture(f"Record {record}, {channel}", "time [s]", label, (Series(channel, t, x),), limits)
+
+
 @dataclass(frozen=True, eq=False)
 class Finding:
     """One result of a gate.
@@ -96,6 +119,11 @@ class Finding:
     value: float | None = None
     limit: float | None = None
     picture: Picture | None = None
+
+    def __post_init__(self) -> None:
+        for field_ in ("value", "limit"):
+            if getattr(self, field_) is not None:
+                object.__setattr__(self, field_, float(getattr(self, field_)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,15 +169,15 @@ class Expectation:
                 raise InputError("expected a positive number", field=name, value=value)
 
 
-def quoted(names: tuple[str, ...] | list[str], most: int = 4) -> str:
+def quoted(names: Sequence[str]) -> str:
     """'a', 'b' and 3 more."""
-    shown = ", ".join(repr(name) for name in names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+    shown, more = ", ".join(map(repr, names[: SETTINGS.most_names])), len(names) - SETTINGS.most_names
+    return f"{shown} and {more} more" if more > 0 else shown
 
 
-def times(ratio: float, most: float = 1000.0) -> str:
+def times(ratio: float) -> str:
     """ "3.1 times", or "over 1000 times": larger numbers carry no more information."""
-    return f"over {most:g} times" if ratio > most else f"{ratio:.1f} times" if ratio < 100 else f"{ratio:.0f} times"
+    return "over 1000 times" if ratio > 1000 else f"{ratio:.1f} times" if ratio < 100 else f"{ratio:.0f} times"
 
 
 def percent(part: float) -> str:

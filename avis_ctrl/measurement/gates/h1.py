@@ -137,6 +137,12 @@ def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: boo
     return Spectra(np.fft.rfftfreq(length, 1 / rate_Hz), cut(u), cut(y))
 
 
+def record_spectra(seen: Excerpt) -> Spectra:
+    """Spectra of `usable`, in segments of `segment_length`."""
+    u, y, wrap = usable(seen)
+    return spectra(u, y, seen.header.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
+
+
 def directions(U: np.ndarray) -> np.ndarray:
     """(n_u, rank) orthonormal basis of the excited directions, in the real span of the voltages U (..., n_u)."""
     flat = U.reshape(-1, U.shape[-1])
@@ -205,3 +211,8 @@ def thirds(f: np.ndarray) -> list[np.ndarray]:
     """Masks of the third-octave bands that contain a line."""
     place = np.floor(3 * np.log2(f / f[0]) + 1e-9).astype(int)
     return [place == k for k in np.unique(place)]
+
+
+def centres(f: np.ndarray, bands: list[np.ndarray]) -> np.ndarray:
+    """(bands,) geometric mean of the lowest and the highest frequency [Hz] of each band."""
+    return np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,16 @@ from scipy import signal, stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    over_frequency,
+)
 from avis_ctrl.measurement.gates.h1 import driven_lines
 
 MAINS_HZ = (50.0, 60.0)
@@ -92,53 +102,35 @@ class Hum(Gate):
             for line in k.lines:
                 if line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio:
                     hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
-        found = [
-            self._finding(campaign.y_names[j], mains, some, campaign.y_unit)
-            for (j, mains), some in sorted(hits.items())
-        ]
+        found = [self._finding(campaign, mains, some) for (_, mains), some in sorted(hits.items())]
         note = f"; {passed} lines are excited by u and were not tested" if passed else ""
         what = "No mains hum was found" if tested else "No line of the mains could be tested"
-        return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note}).",
-                limit=FALSE_ALARM,
-                picture=self._picture(kept[-1], 0, campaign.y_names[0], campaign.y_unit, []),
-            )
-        ]
+        sentence = f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note})."
+        picture = self._picture(kept[-1], 0, campaign, MAINS_HZ)
+        return found or [Finding(self.name, "ok", sentence, limit=FALSE_ALARM, picture=picture)]
 
-    def _finding(self, name: str, mains: float, hits: list[tuple[_Kept, _Line]], unit: str) -> Finding:
+    def _finding(self, campaign: Campaign, mains: float, hits: list[tuple[_Kept, _Line]]) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)
+        name, unit = campaign.y_names[line.channel], campaign.y_unit
         part = max(hit.rms / max(k.rms[hit.channel], 1e-300) for k, hit in hits)
         records = tuple(dict.fromkeys(k.record for k, _ in hits))
-        at = sorted({round(hit.at_Hz / mains) for _, hit in hits})
-        harmonics = ", ".join(f"{k * mains:g}" for k in at)
-        picture = self._picture(record, line.channel, name, unit, [k * mains for k in at])
-        return Finding(
-            self.name,
-            "warning" if part > SETTINGS.large else "note",
-            f"Channel {name!r} carries mains hum at {harmonics} Hz: at {line.at_Hz:.4g} Hz {line.rms:.3g} "
-            f"{unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, {100 * part:.2g} % "
-            f"of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep these "
-            "lines out of the fit.",
-            (name,),
-            records,
-            float(line.ratio),
-            SETTINGS.least_ratio,
-            picture,
+        at_Hz = [k * mains for k in sorted({round(hit.at_Hz / mains) for _, hit in hits})]
+        sentence = (
+            f"Channel {name!r} carries mains hum at {', '.join(f'{f:g}' for f in at_Hz)} Hz: at {line.at_Hz:.4g} Hz "
+            f"{line.rms:.3g} {unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, "
+            f"{100 * part:.2g} % of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep "
+            "these lines out of the fit."
         )
+        severity: Severity = "warning" if part > SETTINGS.large else "note"
+        picture = self._picture(record, line.channel, campaign, at_Hz)
+        return Finding(self.name, severity, sentence, (name,), records, line.ratio, SETTINGS.least_ratio, picture)
 
-    def _picture(self, kept: _Kept, j: int, name: str, unit: str, at: list[float]) -> Picture:
-        return Picture(
-            f"Record {kept.record}, {name}",
-            "frequency [Hz]",
-            f"amplitude density [{unit}/√Hz]",
-            (Series(name, kept.f[1:], kept.asd[1:, j]),),
-            tuple(Limit(f"{x:g} Hz", x, "x") for x in at or MAINS_HZ),
-            "log",
-            "log",
-        )
+    def _picture(self, kept: _Kept, j: int, campaign: Campaign, at_Hz: Sequence[float]) -> Picture:
+        name = campaign.y_names[j]
+        label = f"amplitude density [{campaign.y_unit}/√Hz]"
+        series = Series(name, kept.f[1:], kept.asd[1:, j])
+        limits = tuple(Limit(f"{f:g} Hz", f, "x") for f in at_Hz)
+        return over_frequency(f"Record {kept.record}, {name}", label, (series,), limits)
 
 
 def _length(samples: int, rate: float) -> int:
@@ -158,19 +150,16 @@ def _tested(f: np.ndarray, P: np.ndarray, driven: np.ndarray, at: float, mains: 
     """The line at `at` Hz in each channel; empty beyond the band, None if u drives it."""
     df = f[1]
     width = max(1, int(np.ceil(SETTINGS.tolerance * at / df)))
-    middle = round(at / df)
-    low, high = middle - width, middle + width
-    if low - SETTINGS.guard - SETTINGS.reference < 1 or high + SETTINGS.guard + SETTINGS.reference >= len(f) - 1:
+    low, high = round(at / df) - width, round(at / df) + width
+    below = slice(low - SETTINGS.guard - SETTINGS.reference, low - SETTINGS.guard)
+    above = slice(high + SETTINGS.guard + 1, high + SETTINGS.guard + SETTINGS.reference + 1)
+    if below.start < 1 or above.stop >= len(f):
         return []
-    around = slice(low - SETTINGS.guard - SETTINGS.reference, high + SETTINGS.guard + SETTINGS.reference + 1)
-    if driven[around].any():
+    if driven[below.start : above.stop].any():
         return None
     lines = []
     for j in range(P.shape[1]):
-        floor = max(
-            P[low - SETTINGS.guard - SETTINGS.reference : low - SETTINGS.guard, j].mean(),
-            P[high + SETTINGS.guard + 1 : high + SETTINGS.guard + SETTINGS.reference + 1, j].mean(),
-        )
+        floor = max(P[below, j].mean(), P[above, j].mean())
         peak = low + int(np.argmax(P[low : high + 1, j]))
         if floor <= 0:
             continue

@@ -89,90 +89,57 @@ class MissingSamples(Gate):
         scatter = float(max((np.std(k.delay[0]) for k in comparable), default=np.nan))
         said = f"; the delay scatters by at most {scatter:.2g} samples r.m.s." if comparable else ""
         said += f"; in {vague} the correlation of y with u is too low for this check" if vague else ""
-        return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"No lost or repeated samples were found ({len(comparable)} of {len(kept)} "
-                f"records could be compared with a moving commanded voltage{said}).",
-                value=scatter if comparable else None,
-                limit=SETTINGS.jump_samples,
-                picture=_picture(longest),
-            )
-        ]
+        sentence = (
+            f"No lost or repeated samples were found ({len(comparable)} of {len(kept)} records could be compared with "
+            f"a moving commanded voltage{said})."
+        )
+        value, limit = scatter if comparable else None, SETTINGS.jump_samples
+        return found or [Finding(self.name, "ok", sentence, value=value, limit=limit, picture=_picture(longest))]
 
     def _faults(self, k: _Kept, level: float) -> Iterator[Finding]:
         """Findings on one record."""
         rate, name, picture = k.header.sample_rate_Hz, k.header.name, _picture(k)
         if k.block:
             at, back, n = k.block
-            yield Finding(
-                self.name,
-                "stop",
-                f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples "
-                "before: a buffer was written twice. Repeat the record.",
-                (),
-                (name,),
-                float(n),
-                float(SETTINGS.block_rows),
-                picture,
+            sentence = (
+                f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples before: a "
+                "buffer was written twice. Repeat the record."
             )
+            yield Finding(self.name, "stop", sentence, (), (name,), n, SETTINGS.block_rows, picture)
         if k.clock is not None and np.any(k.clock != 0):
             p = int(np.flatnonzero(k.clock)[0])
             # Within the period of the loss the correlation shows only part of the shift.
             shift = float(k.clock[-1] or k.clock[p])
-            yield Finding(
-                self.name,
-                "stop",
-                f"The commanded voltage of record {name} is {abs(shift):g} samples off "
-                f"its period of {k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, "
-                "or the stated period is wrong. Check period_s, or repeat the record.",
-                (),
-                (name,),
-                shift,
-                0.0,
-                picture,
+            sentence = (
+                f"The commanded voltage of record {name} is {abs(shift):g} samples off its period of "
+                f"{k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or the stated period is "
+                "wrong. Check period_s, or repeat the record."
             )
+            yield Finding(self.name, "stop", sentence, (), (name,), shift, 0.0, picture)
         steps = [step for one in k.stepped if (step := delay_step(one, level)) is not None]
         at, size = max(steps, key=lambda step: abs(step[1]), default=(0, 0.0))
         if abs(size) > SETTINGS.jump_samples:
-            fewer = size < 0
-            yield Finding(
-                self.name,
-                "stop",
+            change, what = ("shorter", "lost") if size < 0 else ("longer", "doubled")
+            sentence = (
                 f"In record {name} the delay of the measured channels after the commanded voltage becomes "
-                f"{abs(size):.1f} samples {'shorter' if fewer else 'longer'} at about "
-                f"{k.t[at] - k.header.start_s:.4g} s: about {max(1, round(abs(size)))} samples were "
-                f"{'lost' if fewer else 'doubled'}. Repeat the record, or use only the part before.",
-                (),
-                (name,),
-                float(size),
-                SETTINGS.jump_samples,
-                picture,
+                f"{abs(size):.1f} samples {change} at about {k.t[at] - k.header.start_s:.4g} s: about "
+                f"{max(1, round(abs(size)))} samples were {what}. Repeat the record, or use only the part before."
             )
+            yield Finding(self.name, "stop", sentence, (), (name,), size, SETTINGS.jump_samples, picture)
 
     def _overlaps(self, kept: list[_Kept]) -> list[Finding]:
-        if len(kept) < 2 or len({k.header.start_s for k in kept}) == 1:
+        if len({k.header.start_s for k in kept}) == 1:
             return []
-        ordered = sorted(kept, key=lambda k: k.header.start_s)
         found = []
-        for a, b in pairwise(ordered):
-            end = a.header.start_s + a.header.duration_s
-            if b.header.start_s < end - 1.5 / a.header.sample_rate_Hz:
-                found.append(
-                    Finding(
-                        self.name,
-                        "warning",
-                        f"Record {b.header.name} starts at {b.header.start_s:.6g} s, before record {a.header.name} "
-                        f"ends at {end:.6g} s: the clocks or the sample rate are wrong. Check start_s and "
-                        "sample_rate_Hz.",
-                        (),
-                        (a.header.name, b.header.name),
-                        float(b.header.start_s - end),
-                        0.0,
-                        _picture(a),
-                    )
+        for a, b in pairwise(sorted(kept, key=lambda k: k.header.start_s)):
+            end, start = a.header.start_s + a.header.duration_s, b.header.start_s
+            if start < end - 1.5 / a.header.sample_rate_Hz:
+                sentence = (
+                    f"Record {b.header.name} starts at {start:.6g} s, before record {a.header.name} ends at {end:.6g} "
+                    "s: the clocks or the sample rate are wrong. Check start_s and sample_rate_Hz."
                 )
+                records = a.header.name, b.header.name
+                found.append(Finding(self.name, "warning", sentence, (), records, start - end, 0.0, _picture(a)))
         return found[:3]
 
 
@@ -184,9 +151,8 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     """
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
-    rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
-    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
-    length = segment_length(len(u), n_u)
+    rate = seen.header.sample_rate_Hz
+    u, y, length = _beginning(seen)
     of = spectra(u, y, rate, length, wrap=False)
     half = len(of.U) // 2
     parts = [of, Spectra(of.f, of.U[:half], of.Y[:half]), Spectra(of.f, of.U[half:], of.Y[half:])]
@@ -195,6 +161,12 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros((1, 0))
     t = seen.first.header.start_s + (np.arange(len(of.U)) * (length // 2) + length / 2) / rate
     return t, np.array([_delay(of, estimate, rate) for estimate in estimates])
+
+
+def _beginning(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, int]:
+    """u and y of the beginning of the record, and the length of its segments."""
+    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
+    return u, y, segment_length(len(u), moving(seen.first.u))
 
 
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
@@ -222,9 +194,8 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     that are driven before and after it count (`both_sides` of the settings); if these are too few (`showing`), the
     result is -inf.
     """
-    rate, n_u = seen.header.sample_rate_Hz, moving(seen.first.u)
-    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
-    count, length = max(1, round(abs(size))), segment_length(len(u), n_u)
+    rate, count = seen.header.sample_rate_Hz, max(1, round(abs(size)))
+    u, y, length = _beginning(seen)
     of = spectra(u, y, rate, length, wrap=False)
     before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
     first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)

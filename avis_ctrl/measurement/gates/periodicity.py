@@ -15,7 +15,7 @@ from avis_ctrl.measurement.gates.finding import (
     Finding,
     Limit,
     Picture,
-    Series,
+    curves,
     percent,
     quoted,
     times,
@@ -65,27 +65,15 @@ class Periodicity(Gate):
         if not seen.periodic or not seen.driven or len(y := seen.periods("y")) < 4:
             return None
         T, relative, lines, R = compared(y)
-        return _Kept(
-            seen.header.name,
-            seen.header.period_s or 0.0,
-            T,
-            relative,
-            lines,
-            R - 1,
-            trend(y[len(y) - R :]) if R > 2 else None,
-        )
+        drift = trend(y[len(y) - R :]) if R > 2 else None
+        return _Kept(seen.header.name, seen.header.period_s or 0.0, T, relative, lines, R - 1, drift)
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         judged = [k for k in kept if k is not None]
         if not judged:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "Periodicity was not tested: no record is periodic with four periods or more.",
-                    picture=Picture("Periods against the last ones", "period", "ratio to noise [-]", ()),
-                )
-            ]
+            sentence = "Periodicity was not tested: no record is periodic with four periods or more."
+            picture = Picture("Periods against the last ones", "period", "ratio to noise [-]", ())
+            return [Finding(self.name, "ok", sentence, picture=picture)]
         level = FALSE_ALARM / sum(k.T.size for k in judged)
         found: list[Finding] = []
         drops: list[tuple[int, _Kept, float, Picture]] = []
@@ -95,17 +83,14 @@ class Periodicity(Gate):
                 f"Record {k.record}: periods against the last {len(k.T) // 2}",
                 "period",
                 "difference by noise, power [-]",
-                tuple(
-                    Series(n, np.arange(1, len(k.T) + 1), k.T[:, j], "points") for j, n in enumerate(campaign.y_names)
-                ),
+                curves(campaign.y_names, np.arange(1, len(k.T) + 1), k.T, "points"),
                 (Limit("1 % limit for noise", limit),),
                 y_scale="log",
             )
             failed = np.flatnonzero((limit < k.T).any(axis=1))
             drop = int(failed[-1]) + 1 if len(failed) else 0
-            warned = self._drifting(k, level, campaign, picture)
-            warned = warned or self._unsettled(k, drop, limit, campaign, picture)
-            if warned:
+            drifting = self._drifting(k, level, campaign, picture)
+            if warned := drifting or self._unsettled(k, drop, limit, campaign, picture):
                 found.append(warned)
             else:
                 drops.append((drop, k, limit, picture))
@@ -114,32 +99,19 @@ class Periodicity(Gate):
         most, k, limit, picture = max(drops, key=lambda d: d[0])
         if most:
             periods = f"{most} period{'s' if most > 1 else ''}"
-            found.append(
-                Finding(
-                    self.name,
-                    "note",
-                    f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first "
-                    f"differs from the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that "
-                    "includes the transient, as in avis identify, needs no change; otherwise leave out the "
-                    f"beginning of each record, {periods}.",
-                    (),
-                    tuple(d[1].record for d in drops if d[0]),
-                    float(most),
-                    0.0,
-                    picture,
-                )
+            sentence = (
+                f"The initial transient lasts {periods} of {k.period_s:g} s (record {k.record}: the first differs from "
+                f"the last ones by {100 * k.relative[0].max():.2g} % of the signal). A fit that includes the "
+                "transient, as in avis identify, needs no change; otherwise leave out the beginning of each record, "
+                f"{periods}."
             )
-        return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"All periods repeat within the noise (largest ratio {k.T.max():.2f}, limit for "
-                f"noise alone {limit:.2f}).",
-                value=float(k.T.max()),
-                limit=limit,
-                picture=picture,
-            )
-        ]
+            records = tuple(d[1].record for d in drops if d[0])
+            found.append(Finding(self.name, "note", sentence, (), records, most, 0.0, picture))
+        largest = k.T.max()
+        sentence = (
+            f"All periods repeat within the noise (largest ratio {largest:.2f}, limit for noise alone {limit:.2f})."
+        )
+        return found or [Finding(self.name, "ok", sentence, value=largest, limit=limit, picture=picture)]
 
     def _unsettled(self, k: _Kept, drop: int, limit: float, campaign: Campaign, picture: Picture) -> Finding | None:
         """Finding if periods of the reference itself differ."""
@@ -148,19 +120,14 @@ class Periodicity(Gate):
         if drop <= reference:
             return None
         bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference:, j] > limit).any())
-        return Finding(
-            self.name,
-            "warning",
-            f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: "
-            f"{quoted(bad)} still differ by {times(float(np.sqrt(k.T[drop - 1].max())))} the noise, "
-            f"{percent(k.relative[drop - 1].max())} of the signal. The rig drifts, or the transient is "
-            "longer than the record. Wait longer before recording, or look for drift.",
-            bad,
-            (k.record,),
-            float(k.T[drop - 1].max()),
-            limit,
-            picture,
+        largest = k.T[drop - 1].max()
+        sentence = (
+            f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: {quoted(bad)} still "
+            f"differ by {times(float(np.sqrt(largest)))} the noise, {percent(k.relative[drop - 1].max())} of the "
+            "signal. The rig drifts, or the transient is longer than the record. Wait longer before recording, or look "
+            "for drift."
         )
+        return Finding(self.name, "warning", sentence, bad, (k.record,), largest, limit, picture)
 
     def _drifting(self, k: _Kept, level: float, campaign: Campaign, picture: Picture) -> Finding | None:
         if k.drift is None:
@@ -171,20 +138,13 @@ class Periodicity(Gate):
         if not bad.any():
             return None
         names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-        return Finding(
-            self.name,
-            "warning",
-            f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s "
-            f"{quoted(names)} change steadily by {percent(drift[bad].max())} of the signal "
-            f"({times(float(T[bad].max()))} the noise power; limit for noise alone {limit:.2f}). The rig "
-            "drifts, or the transient is longer than the record. Wait longer before recording, or find the "
-            "cause of the drift.",
-            names,
-            (k.record,),
-            float(T[bad].max()),
-            limit,
-            picture,
+        sentence = (
+            f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)} "
+            f"change steadily by {percent(drift[bad].max())} of the signal ({times(float(T[bad].max()))} the noise "
+            f"power; limit for noise alone {limit:.2f}). The rig drifts, or the transient is longer than the record. "
+            "Wait longer before recording, or find the cause of the drift."
         )
+        return Finding(self.name, "warning", sentence, names, (k.record,), T[bad].max(), limit, picture)
 
 
 def windowed(difference: np.ndarray) -> np.ndarray:

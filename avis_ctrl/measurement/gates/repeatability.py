@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -17,11 +17,13 @@ from avis_ctrl.measurement.gates.finding import (
     Finding,
     Limit,
     Picture,
-    Series,
+    Severity,
+    curves,
+    over_frequency,
     percent,
     quoted,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, moving, octaves, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, octaves, record_spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -78,7 +80,7 @@ class _Kept:
 class Difference:
     """Difference of two records (or levels): T (n_y,) mean |difference|^2 / variance in the most significant octave,
     divided by its 1 % limit for noise alone; relative (n_y,) difference there, noise subtracted; band_Hz (n_y, 2) of
-    this octave.
+    this octave; noise : relative to the response, in the octave where it is largest.
     """
 
     a: str
@@ -111,13 +113,13 @@ class Comparison(Gate):
         h = seen.header
         if not seen.driven or h.excitation == "sine":
             return None
+        kept = _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, record_spectra(seen))
         u, y, wrap = usable(seen)
-        of = spectra(u, y, h.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
-            return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
+            return kept
         P = len(periods)
         variance = smoothed(np.sum(np.abs(windowed(periods - y)) ** 2, axis=0) / (P - 1)) / P
-        return _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of, _Mean(u, y, variance, P - 1))
+        return replace(kept, mean=_Mean(u, y, variance, P - 1))
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
@@ -128,25 +130,14 @@ class Comparison(Gate):
         level = FALSE_ALARM / max(1, len(apart) * n_y)
         levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
-        return [
-            *_judged(
-                self.name,
-                repeats,
-                campaign,
-                _drifted,
-                agreed,
-                "Repeatability was not tested: no two driven records of one level and enough length.",
-            ),
-            *_judged(
-                LEVEL_DEPENDENCE,
-                levels,
-                campaign,
-                _nonlinear,
-                "The responses at all levels agree",
-                "Dependence on the level was not tested: no driven records of one kind and enough length at "
-                f"two levels, at least a factor {SETTINGS.apart:g} apart.",
-            ),
-        ]
+        untested = "Repeatability was not tested: no two driven records of one level and enough length."
+        found = _judged(self.name, repeats, campaign, _drifted, agreed, untested)
+        untested = (
+            "Dependence on the level was not tested: no driven records of one kind and enough length at two levels, at "
+            f"least a factor {SETTINGS.apart:g} apart."
+        )
+        agreed = "The responses at all levels agree"
+        return found + _judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, agreed, untested)
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
@@ -178,33 +169,17 @@ def _judged(
 ) -> list[Finding]:
     """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
-        return [
-            Finding(
-                gate,
-                "ok",
-                untested,
-                picture=Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ()),
-            )
-        ]
+        picture = Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ())
+        return [Finding(gate, "ok", untested, picture=picture)]
     found = []
     for d in differences:
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
         if bad.any():
             names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-            large = d.relative[bad].max() > SETTINGS.large
+            severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
             sentence, records = described(d, bad, names)
-            found.append(
-                Finding(
-                    gate,
-                    "warning" if large else "note",
-                    sentence,
-                    names,
-                    records,
-                    float(d.T[bad].max()),
-                    1.0,
-                    _picture(d, campaign.y_names),
-                )
-            )
+            picture = _picture(d, campaign.y_names)
+            found.append(Finding(gate, severity, sentence, names, records, d.T[bad].max(), 1.0, picture))
     if found:
         return found
     d = max(differences, key=lambda d: d.noise)
@@ -215,29 +190,17 @@ def _judged(
         if blind
         else ""
     )
-    return [
-        Finding(
-            gate,
-            "note" if blind else "ok",
-            f"{agreed} within their noise, which is up to {100 * d.noise:.2g} "
-            f"% of the response in an octave ({d.a} against {d.b}), or within 1 %.{hint}",
-            value=float(d.T.max()),
-            limit=1.0,
-            picture=_picture(d, campaign.y_names),
-        )
-    ]
+    sentence = (
+        f"{agreed} within their noise, which is up to {100 * d.noise:.2g} % of the response in an octave ({d.a} "
+        f"against {d.b}), or within 1 %.{hint}"
+    )
+    picture = _picture(d, campaign.y_names)
+    return [Finding(gate, "note" if blind else "ok", sentence, value=d.T.max(), limit=1.0, picture=picture)]
 
 
 def _picture(d: Difference, names: tuple[str, ...]) -> Picture:
-    return Picture(
-        f"{d.a} against {d.b}",
-        "frequency [Hz]",
-        "relative difference [-]",
-        tuple(Series(n, d.f, d.by_line[:, j]) for j, n in enumerate(names)),
-        (Limit("large", SETTINGS.large),),
-        "log",
-        "log",
-    )
+    series, limits = curves(names, d.f, d.by_line), (Limit("large", SETTINGS.large),)
+    return over_frequency(f"{d.a} against {d.b}", "relative difference [-]", series, limits)
 
 
 def _by_kind_and_level(kept: list[_Kept | None]) -> dict[tuple[str, float], list[_Kept]]:
@@ -289,39 +252,38 @@ def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Dif
     driven = np.sum(np.abs(windowed(second.u)) ** 2, axis=1)
     keep = driven_lines(driven)
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
-    power = np.abs(D) ** 2
-    by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    T, relative, band = _by_band(
-        f[keep], (power / variance)[keep], (power - variance)[keep], size[keep], 1, min(first.dof, second.dof), level
-    )
-    noise = _noise(f[keep], variance[keep], size[keep])
-    return Difference(*names, T, relative, band, f[keep], by_line[keep], noise)
+    f, power, variance, size = f[keep], np.abs(D[keep]) ** 2, variance[keep], size[keep]
+    return _in_octaves(names, f, power / variance, power, variance, size, 1, min(first.dof, second.dof), level)
 
 
-def _noise(f: np.ndarray, spread: np.ndarray, size: np.ndarray) -> float:
-    """Noise of the difference relative to the response, r.m.s. in the octave where it is largest."""
-    return max(
-        float(np.sqrt(np.max(spread[b].sum(axis=0) / np.maximum(size[b].sum(axis=0), 1e-300)))) for b in octaves(f)
-    )
-
-
-def _by_band(
-    f: np.ndarray, ratio: np.ndarray, excess: np.ndarray, size: np.ndarray, n_u: int, dof: int, level: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n_y,) in the most significant octave: mean ratio over the limit of F(n_u L, dof L), relative excess, ends (n_y,
-    2).
+def _in_octaves(
+    names: tuple[str, str],
+    f: np.ndarray,
+    ratio: np.ndarray,
+    power: np.ndarray,
+    noise: np.ndarray,
+    size: np.ndarray,
+    n_u: int,
+    dof: int,
+    level: float,
+) -> Difference:
+    """The difference with this power (n, n_y) on the lines f (n,) Hz, where noise gives `noise` and the response is
+    `size`; ratio : power over the variance of the noise, whose mean over L lines is F(n_u L, dof L) distributed.
     """
     bands = octaves(f)
-    T, relative, ends = (np.zeros((ratio.shape[1], *more)) for more in ((), (), (2,)))
+    T, relative, blur = np.zeros((3, ratio.shape[1]))
+    ends = np.zeros((ratio.shape[1], 2))
     for band in bands:
-        lines = int(band.sum())
+        lines, response = int(band.sum()), np.maximum(size[band].sum(axis=0), 1e-300)
         limit = float(stats.f.isf(level / len(bands), n_u * lines, dof * lines))
         here = ratio[band].mean(axis=0) / limit
-        part = np.sqrt(np.maximum(excess[band].sum(axis=0), 0) / np.maximum(size[band].sum(axis=0), 1e-300))
+        part = np.sqrt(np.maximum((power - noise)[band].sum(axis=0), 0) / response)
         relative = np.where(here > T, part, relative)
         ends[here > T] = f[band][[0, -1]]
         T = np.maximum(T, here)
-    return T, relative, ends
+        blur = np.maximum(blur, np.sqrt(noise[band].sum(axis=0) / response))
+    by_line = np.sqrt(power / np.maximum(size, 1e-300))
+    return Difference(*names, T, relative, ends, f, by_line, float(blur.max()))
 
 
 def _compared(first: list[Spectra], second: list[Spectra], level: float, names: tuple[str, str]) -> Difference | None:
@@ -346,9 +308,7 @@ def _compared(first: list[Spectra], second: list[Spectra], level: float, names: 
     ratio = np.real(np.einsum("fyi,fyi->fy", D.conj(), np.linalg.solve(V, D[..., None])[..., 0])) / rank
     spread = np.trace(V, axis1=2, axis2=3).real
     size, power = np.sum(np.abs(Ga) ** 2, axis=2), np.sum(np.abs(D) ** 2, axis=2)
-    T, relative, band = _by_band(f, ratio, power - spread, size, rank, min(a.dof, b.dof), level)
-    by_line = np.sqrt(power / np.maximum(size, 1e-300))
-    return Difference(*names, T, relative, band, f, by_line, _noise(f, spread, size))
+    return _in_octaves(names, f, ratio, power, spread, size, rank, min(a.dof, b.dof), level)
 
 
 def _common(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -10,14 +10,24 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series, quoted
+from avis_ctrl.measurement.gates.finding import (
+    FALSE_ALARM,
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    Severity,
+    curves,
+    over_frequency,
+)
 from avis_ctrl.measurement.gates.h1 import (
     H1,
+    centres,
     driven_lines,
     h1,
-    moving,
     octaves,
-    segment_length,
+    record_spectra,
     spectra,
     thirds,
     usable,
@@ -75,40 +85,23 @@ class SignalToNoise(Gate):
         noisy = list(self._noisy(kept, campaign, expectation))
         measured = [k for k in kept if k.snr is not None and len(k.f)]
         if not measured:
-            return noisy or [
-                Finding(
-                    self.name,
-                    "ok",
-                    "No driven record is long enough to separate signal and noise.",
-                    picture=Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ()),
-                )
-            ]
+            sentence = "No driven record is long enough to separate signal and noise."
+            picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
+            return noisy or [Finding(self.name, "ok", sentence, picture=picture)]
         best = max(measured, key=lambda k: float(np.median(np.asarray(k.snr))))
         f, snr = best.f, np.asarray(best.snr)
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
-        middle = np.array([np.sqrt(f[band][0] * f[band][-1]) for band in bands])
-        picture = Picture(
-            "Signal to noise of the best record",
-            "frequency [Hz]",
-            "ratio [dB]",
-            tuple(Series(n, middle, dB[:, j], "points") for j, n in enumerate(campaign.y_names)),
-            (Limit("low", SETTINGS.low_dB),),
-            "log",
-        )
+        middle = centres(f, bands)
+        series, low = curves(campaign.y_names, middle, dB, "points"), Limit("low", SETTINGS.low_dB)
+        picture = over_frequency("Signal to noise of the best record", "ratio [dB]", series, (low,), "linear")
         found = noisy + list(self._weak(campaign.y_names, middle, dB, best.segment_s, picture))
         b, j = divmod(int(np.argmin(dB)), dB.shape[1])
-        return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest "
-                f"{campaign.y_names[j]!r} around {middle[b]:.3g} Hz).",
-                value=float(dB[b, j]),
-                limit=SETTINGS.low_dB,
-                picture=picture,
-            )
-        ]
+        sentence = (
+            f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r} around "
+            f"{middle[b]:.3g} Hz)."
+        )
+        return found or [Finding(self.name, "ok", sentence, value=dB[b, j], limit=SETTINGS.low_dB, picture=picture)]
 
     def _weak(
         self, names: tuple[str, ...], middle: np.ndarray, dB: np.ndarray, segment_s: float, picture: Picture
@@ -120,29 +113,17 @@ class SignalToNoise(Gate):
             else ". Such bands have little weight in a fit; excite them more if they are important."
         )
         for name, levels in zip(names, dB.T, strict=True):
-            weak = np.flatnonzero(levels < SETTINGS.low_dB)
-            if levels.max() < SETTINGS.poor_dB:
-                yield Finding(
-                    self.name,
-                    "warning",
-                    f"Channel {name!r} has more noise than signal in every band (at best {levels.max():.1f} "
-                    f"dB at {middle[np.argmax(levels)]:.3g} Hz). Raise the level, or average longer.",
-                    (name,),
-                    value=float(levels.max()),
-                    limit=SETTINGS.poor_dB,
-                    picture=picture,
+            weak, best = np.flatnonzero(levels < SETTINGS.low_dB), levels.max()
+            if best < SETTINGS.poor_dB:
+                sentence = (
+                    f"Channel {name!r} has more noise than signal in every band (at best {best:.1f} dB at "
+                    f"{middle[np.argmax(levels)]:.3g} Hz). Raise the level, or average longer."
                 )
+                yield Finding(self.name, "warning", sentence, (name,), (), best, SETTINGS.poor_dB, picture)
             elif weak.size:
                 low = ", ".join(f"{round(float(levels[b]))} dB at {middle[b]:.3g} Hz" for b in weak)
-                yield Finding(
-                    self.name,
-                    "note",
-                    f"Channel {name!r} has little signal: {low}{advice}",
-                    (name,),
-                    value=float(levels.min()),
-                    limit=SETTINGS.low_dB,
-                    picture=picture,
-                )
+                sentence = f"Channel {name!r} has little signal: {low}{advice}"
+                yield Finding(self.name, "note", sentence, (name,), (), levels.min(), SETTINGS.low_dB, picture)
 
     def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> Iterator[Finding]:
         stated = expectation.sensor_noise_rms_V
@@ -160,18 +141,12 @@ class SignalToNoise(Gate):
             x_names=campaign.y_names,
         )
         for name, one in zip(campaign.y_names, rms, strict=True):
-            if one > SETTINGS.noise_factor * stated:
-                yield Finding(
-                    self.name,
-                    "warning",
-                    f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., "
-                    f"{one / stated:.1f} times what the rig file states. Check its preamplifier and cable, "
-                    "or correct the rig file.",
-                    (name,),
-                    value=float(one),
-                    limit=SETTINGS.noise_factor * stated,
-                    picture=picture,
+            if one > (limit := SETTINGS.noise_factor * stated):
+                sentence = (
+                    f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., {one / stated:.1f} "
+                    "times what the rig file states. Check its preamplifier and cable, or correct the rig file."
                 )
+                yield Finding(self.name, "warning", sentence, (name,), (), one, limit, picture)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,30 +184,20 @@ class Coherence(Gate):
         chosen = [k for k in driven if k.level * SETTINGS.same_level >= top]
         best, seconds = _pooled(chosen)
         if best is None:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    "No driven record is long enough for a coherence of all inputs together.",
-                    picture=Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ()),
-                )
-            ]
+            sentence = "No driven record is long enough for a coherence of all inputs together."
+            picture = Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ())
+            return [Finding(self.name, "ok", sentence, picture=picture)]
         free = best.unbiased_coherence()
         bands = thirds(best.f)
-        middle = np.array([np.sqrt(best.f[b][0] * best.f[b][-1]) for b in bands])
+        middle = centres(best.f, bands)
         mean = np.array([free[b].mean(axis=0) for b in bands])
         # Standard deviation of an estimate of 0.5: (1 - g) sqrt(2 g / K), Bendat and Piersol table 9.6.
         z = stats.norm.isf(FALSE_ALARM / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
-        picture = Picture(
-            f"Multiple coherence at {top:.3g} V, third octaves",
-            "frequency [Hz]",
-            "coherence [-]",
-            tuple(Series(n, middle, mean[:, j]) for j, n in enumerate(campaign.y_names)),
-            (Limit("low", SETTINGS.low_coherence),),
-            "log",
-        )
+        series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence
+        title = f"Multiple coherence at {top:.3g} V, third octaves"
+        picture = over_frequency(title, "coherence [-]", series, (Limit("low", limit),), "linear")
         below, excited = "", _lowest_driven(chosen)
         if best.f[0] > 1.5 * excited:
             below = (
@@ -246,21 +211,13 @@ class Coherence(Gate):
             for group in groups
             if group
         ]
-        if found:
-            return found
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
-        return [
-            Finding(
-                self.name,
-                "ok",
-                f"Multiple coherence is at least {mean[b, j]:.2f} in every third-octave band from {best.f[0]:.3g} "
-                f"to {best.f[-1]:.3g} Hz (lowest {quoted((campaign.y_names[j],))} around {middle[b]:.3g} "
-                f"Hz).{below}",
-                value=float(mean[b, j]),
-                limit=SETTINGS.low_coherence,
-                picture=picture,
-            )
-        ]
+        lowest = mean[b, j]
+        sentence = (
+            f"Multiple coherence is at least {lowest:.2f} in every third-octave band from {best.f[0]:.3g} to "
+            f"{best.f[-1]:.3g} Hz (lowest {campaign.y_names[j]!r} around {middle[b]:.3g} Hz).{below}"
+        )
+        return found or [Finding(self.name, "ok", sentence, value=lowest, limit=limit, picture=picture)]
 
     def _low(
         self,
@@ -284,19 +241,17 @@ class Coherence(Gate):
                 f"{count} band{'s' * (count > 1)})"
             )
         more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
-        return Finding(
-            self.name,
-            "warning" if surely else "note",
-            f"Multiple coherence is below {SETTINGS.low_coherence:g} in {'all' if surely else 'some'} of "
-            f"the {len(middle)} third-octave bands: {'; '.join(said)}{more}. Causes are noise, an input "
-            "that is not recorded, nonlinearity, or, if the signal to noise is high, leakage of a mode that "
-            f"decays more slowly than the segments of {seconds:.3g} s. Longer records distinguish "
-            f"leakage from the other causes; a higher level reduces the influence of noise.{below}",
-            tuple(names[j] for j in ordered),
-            value=float(mean[:, group].min()),
-            limit=SETTINGS.low_coherence,
-            picture=picture,
+        severity: Severity = "warning" if surely else "note"
+        part = "all" if surely else "some"
+        sentence = (
+            f"Multiple coherence is below {SETTINGS.low_coherence:g} in {part} of the {len(middle)} third-octave "
+            f"bands: {'; '.join(said)}{more}. Causes are noise, an input that is not recorded, nonlinearity, or, if "
+            "the signal to noise is high, leakage of a mode that decays more slowly than the segments of "
+            f"{seconds:.3g} s. Longer records distinguish leakage from the other causes; a higher level reduces the "
+            f"influence of noise.{below}"
         )
+        channels, lowest = tuple(names[j] for j in ordered), mean[:, group].min()
+        return Finding(self.name, severity, sentence, channels, (), lowest, SETTINGS.low_coherence, picture)
 
 
 def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
@@ -343,13 +298,11 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
-    u, y, wrap = usable(seen)
-    length = segment_length(len(u), moving(u))
-    estimate = h1([spectra(u, y, rate, length, wrap)])
-    if estimate is None:
+    of = record_spectra(seen)
+    if (estimate := h1([of])) is None:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.unbiased_coherence(), 0.0)
-    return estimate.f, free / np.maximum(1 - free, 1e-12), length / rate
+    return estimate.f, free / np.maximum(1 - free, 1e-12), 1 / float(of.f[1])
 
 
 def _high_noise(seen: Excerpt) -> np.ndarray | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, times
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, samples_over_time, times
 
 # Departure from the cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6. These are
 # also the five departures around a spike of height 1.
@@ -74,20 +74,9 @@ class Spikes(Gate):
                     k = int(where[np.argmax(ratio)])
                     part = slice(max(0, k - 100), k + 100)
                     expected = float(x[k] - departure(x[k - 2 : k + 3])[0])
-                    found.append(
-                        _Kept(
-                            seen.header.name,
-                            name,
-                            len(where),
-                            k + round(float(t[0]) * seen.header.sample_rate_Hz),
-                            float(t[k]),
-                            float(x[k]),
-                            expected,
-                            float(ratio.max()),
-                            t[part],
-                            x[part],
-                        )
-                    )
+                    sample = k + round(float(t[0]) * seen.header.sample_rate_Hz)
+                    spike = sample, float(t[k]), float(x[k]), expected, float(ratio.max())
+                    found.append(_Kept(seen.header.name, name, len(where), *spike, t[part], x[part]))
         return found, least
 
     def conclude(
@@ -97,45 +86,30 @@ class Spikes(Gate):
         if found:
             return found
         least = np.array([SETTINGS.factor * one for _, one in kept])
-        return [
-            Finding(
-                self.name,
-                "ok",
-                f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
-                f"{campaign.y_unit} would be found in every record.",
-                value=float(least.max()),
-                picture=Picture(
-                    "Smallest spike that would be found",
-                    "record",
-                    f"spike [{campaign.y_unit}]",
-                    (Series("least spike", np.arange(len(least)), least, "bars"),),
-                    x_names=tuple(r.header.name for r in campaign.records),
-                ),
-            )
-        ]
+        sentence = (
+            f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} {campaign.y_unit} "
+            "would be found in every record."
+        )
+        picture = Picture(
+            "Smallest spike that would be found",
+            "record",
+            f"spike [{campaign.y_unit}]",
+            (Series("least spike", np.arange(len(least)), least, "bars"),),
+            x_names=tuple(r.header.name for r in campaign.records),
+        )
+        return [Finding(self.name, "ok", sentence, value=least.max(), picture=picture)]
 
     def _finding(self, k: _Kept, unit: str) -> Finding:
         many = f"{k.count} single samples, the worst" if k.count > 1 else "a single sample"
-        return Finding(
-            self.name,
-            "warning",
-            f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at "
-            f"{k.at_s:.6g} s (sample {k.sample}): {k.value:.4g} {unit}, while interpolation gives "
-            f"{k.expected:.4g}. The deviation is {times(k.ratio)} the usual one (limit {SETTINGS.factor:g}):"
-            " an electrical disturbance or a faulty conversion. Check cables and grounding; repeat the "
-            "record, or replace the sample by the interpolated value.",
-            (k.channel,),
-            (k.record,),
-            k.ratio,
-            SETTINGS.factor,
-            Picture(
-                f"Record {k.record}, {k.channel}",
-                "time [s]",
-                f"{k.channel} [{unit}]",
-                (Series(k.channel, k.t, k.x),),
-                (Limit("spike", k.at_s, "x"),),
-            ),
+        sentence = (
+            f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at {k.at_s:.6g} s (sample "
+            f"{k.sample}): {k.value:.4g} {unit}, while interpolation gives {k.expected:.4g}. The deviation is "
+            f"{times(k.ratio)} the usual one (limit {SETTINGS.factor:g}): an electrical disturbance or a faulty "
+            "conversion. Check cables and grounding; repeat the record, or replace the sample by the interpolated "
+            "value."
         )
+        picture = samples_over_time(k.record, k.channel, k.t, k.x, unit, (Limit("spike", k.at_s, "x"),))
+        return Finding(self.name, "warning", sentence, (k.channel,), (k.record,), k.ratio, SETTINGS.factor, picture)
 
 
 def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

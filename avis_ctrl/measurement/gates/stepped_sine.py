@@ -15,7 +15,15 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.finding import (
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Series,
+    over_frequency,
+    samples_over_time,
+)
 from avis_ctrl.measurement.gates.sine_fit import KINDS, SineFit, fit_sine, second_order
 
 
@@ -42,6 +50,34 @@ class SteppedSineSettings:
 SETTINGS = SteppedSineSettings()
 
 
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Sine records in the order of their frequencies f (n,) Hz.
+
+    names : of all channels, u before y; X (n, channels) amplitudes; rest (n, channels) residuals relative to them;
+    live : indices of the channels with a sine; drive : index of the reference drive.
+    """
+
+    fits: list[SineFit]
+    names: tuple[str, ...]
+    f: np.ndarray
+    X: np.ndarray
+    rest: np.ndarray
+    live: list[int]
+    drive: int
+
+    def ratio(self, j: int) -> np.ndarray:
+        """(n,) ratio of channel j to the drive."""
+        return self.X[:, j] / self.X[:, self.drive]
+
+    def picture(self) -> Picture:
+        """Amplitude of each channel relative to the drive."""
+        title = f"Amplitude of each channel by {self.names[self.drive]}"
+        others = (j for j in self.live if j != self.drive)
+        series = tuple(Series(self.names[j], self.f, np.abs(self.ratio(j)), "points") for j in others)
+        return over_frequency(title, "ratio [-]", series, (Limit("proportional", 1.0),))
+
+
 class SteppedSine(Gate):
     """Bad records and wrong labels of a stepped-sine campaign.
 
@@ -63,51 +99,35 @@ class SteppedSine(Gate):
 
     def conclude(self, kept: list[SineFit | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         fits = sorted((k for k in kept if k is not None), key=lambda k: k.f)
-        names = (*campaign.u_names, *campaign.y_names)
+        names, n_u = (*campaign.u_names, *campaign.y_names), len(campaign.u_names)
         if len(fits) < SETTINGS.fewest:
-            return [
-                Finding(
-                    self.name,
-                    "ok",
-                    f"No stepped-sine campaign: {len(fits)} sine records, {SETTINGS.fewest} are needed to compare "
-                    "neighbours.",
-                    picture=Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ()),
-                )
-            ]
-        f, X = np.array([k.f for k in fits]), np.array([k.X for k in fits])
+            sentence = (
+                f"No stepped-sine campaign: {len(fits)} sine records, {SETTINGS.fewest} are needed to compare "
+                "neighbours."
+            )
+            picture = Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ())
+            return [Finding(self.name, "ok", sentence, picture=picture)]
+        X = np.array([k.X for k in fits])
         rest = np.array([k.residual_rms for k in fits]) / np.maximum(np.abs(X), 1e-300) * np.sqrt(2)
         silent = [j for j in range(len(names)) if np.median(rest[:, j]) > 10]
         live = [j for j in range(len(names)) if j not in silent]
-        drive = _drive(rest, live, len(campaign.u_names))
-        found = [
-            *self._labels(f, X, names, live, drive, len(campaign.u_names), silent),
-            *self._bad_records(fits, f, X, rest, names, live, drive),
-        ]
-        largest = float(rest[:, live].max())
+        steps = _Steps(fits, names, np.array([k.f for k in fits]), X, rest, live, _drive(rest, live, n_u))
+        lost = [names[k] for k in silent if k >= n_u]
+        found = [*self._labels(steps, n_u, lost), *self._bad_records(steps)]
+        largest = rest[:, live].max()
+        sentence = (
+            f"{len(fits)} sine records from {fits[0].f:.3g} to {fits[-1].f:.3g} Hz are smooth in frequency; the "
+            f"largest residual is {100 * largest:.2g} % of its sine."
+        )
         return found or [
-            Finding(
-                self.name,
-                "ok",
-                f"{len(fits)} sine records from {f[0]:.3g} to {f[-1]:.3g} Hz are smooth in "
-                f"frequency; the largest residual is {100 * largest:.2g} % of its sine.",
-                value=largest,
-                limit=SETTINGS.residual,
-                picture=_bode(f, X, names, live, drive),
-            )
+            Finding(self.name, "ok", sentence, value=largest, limit=SETTINGS.residual, picture=steps.picture())
         ]
 
-    def _labels(
-        self,
-        f: np.ndarray,
-        X: np.ndarray,
-        names: tuple[str, ...],
-        live: list[int],
-        drive: int,
-        n_u: int,
-        silent: list[int],
-    ) -> Iterator[Finding]:
-        for j in (j for j in live if j < n_u and j != drive):
-            H = X[:, j] / X[:, drive]
+    def _labels(self, steps: _Steps, n_u: int, lost: list[str]) -> Iterator[Finding]:
+        """Findings on drives that are sensors' outputs; lost : the names of silent sensors."""
+        f, names = steps.f, steps.names
+        for j in (j for j in steps.live if j < n_u and j != steps.drive):
+            H = steps.ratio(j)
             spread = float(np.exp(np.std(np.log(np.abs(H)))) - 1)
             turned = float(np.ptp(np.degrees(np.unwrap(np.angle(H)))))
             if spread < SETTINGS.constant and turned < 45:
@@ -115,75 +135,52 @@ class SteppedSine(Gate):
             model = second_order(f, H)
             if model.misfit > SETTINGS.second_order:
                 continue
-            lost = [names[k] for k in silent if k >= n_u]
             likely = (
                 f"; the sensor channel {lost[0]!r} is silent: their names or cables are probably exchanged"
                 if lost
                 else ""
             )
-            yield Finding(
-                self.name,
-                "stop",
+            sentence = (
                 f"Channel {names[j]!r} is recorded as a drive but is a sensor's output: its ratio to "
-                f"{names[drive]!r} is not constant (it varies from {np.abs(H).min():.3g} to "
-                f"{np.abs(H).max():.3g} and turns by {turned:.0f} degrees from {f[0]:.3g} to {f[-1]:.3g} Hz) "
-                f"but follows a second-order {KINDS[model.k]} response with corner {model.corner_Hz:.3f} Hz "
-                f"and damping {model.damping:.3f} within {100 * model.misfit:.1f} %{likely}. Record it as an "
-                "output, and find the channel that measures the drive.",
-                (names[j], *lost),
-                value=spread,
-                limit=SETTINGS.constant,
-                picture=_bode(f, X, names, live, drive),
+                f"{names[steps.drive]!r} is not constant (it varies from {np.abs(H).min():.3g} to "
+                f"{np.abs(H).max():.3g} and turns by {turned:.0f} degrees from {f[0]:.3g} to {f[-1]:.3g} Hz) but "
+                f"follows a second-order {KINDS[model.k]} response with corner {model.corner_Hz:.3f} Hz and damping "
+                f"{model.damping:.3f} within {100 * model.misfit:.1f} %{likely}. Record it as an output, and find the "
+                "channel that measures the drive."
             )
+            channels, picture = (names[j], *lost), steps.picture()
+            yield Finding(self.name, "stop", sentence, channels, (), spread, SETTINGS.constant, picture)
 
-    def _bad_records(
-        self,
-        fits: list[SineFit],
-        f: np.ndarray,
-        X: np.ndarray,
-        rest: np.ndarray,
-        names: tuple[str, ...],
-        live: list[int],
-        drive: int,
-    ) -> Iterator[Finding]:
-        for j in live:
-            H = np.abs(X[:, j] / X[:, drive])
-            off = _departure(np.log(f), np.log(H)) if j != drive else np.zeros(len(f))
+    def _bad_records(self, steps: _Steps) -> Iterator[Finding]:
+        f, n = steps.f, len(steps.f)
+        for j in steps.live:
+            name, rest, H = steps.names[j], steps.rest[:, j], np.abs(steps.ratio(j))
+            off = _departure(np.log(f), np.log(H)) if j != steps.drive else np.zeros(n)
             usual = float(np.median(np.abs(off[1:-1])))
-            for k, fit in enumerate(fits):
-                around = [i for i in range(max(0, k - 2), min(len(f), k + 3)) if i != k]
-                near = float(np.median(rest[around, j]))
-                noisy = rest[k, j] > max(SETTINGS.residual, SETTINGS.residual_factor * near)
+            for k, fit in enumerate(steps.fits):
+                around = [i for i in range(max(0, k - 2), min(n, k + 3)) if i != k]
+                near = float(np.median(rest[around]))
+                limit = max(SETTINGS.residual, SETTINGS.residual_factor * near)
                 # A bad record makes its neighbours depart too: only the largest departure around counts.
                 astray = abs(off[k]) > max(SETTINGS.ratio, SETTINGS.ratio_factor * usual) and abs(off[k]) >= np.max(
                     np.abs(off[max(0, k - 1) : k + 2])
                 )
-                if not noisy and not (astray and rest[k, j] > 2 * near):
+                if rest[k] <= limit and not (astray and rest[k] > 2 * near):
                     continue
                 ratio = (
-                    f"; its ratio to {names[drive]!r} is {H[k]:.3g}, while its neighbours suggest "
+                    f"; its ratio to {steps.names[steps.drive]!r} is {H[k]:.3g}, while its neighbours suggest "
                     f"{H[k] * np.exp(-off[k]):.3g}"
                     if off[k]
                     else ""
                 )
-                yield Finding(
-                    self.name,
-                    "stop",
-                    f"Record {fit.record} is bad in channel {names[j]!r}: the residual after removing the "
-                    f"sine of {f[k]:.4g} Hz is {100 * rest[k, j]:.3g} % of the sine, in neighbouring records "
-                    f"{100 * near:.2g} %{ratio}. The signal is distorted, clipped or out of range there (see "
-                    "its figure); leave the record out.",
-                    (names[j],),
-                    (fit.record,),
-                    float(rest[k, j]),
-                    float(max(SETTINGS.residual, SETTINGS.residual_factor * near)),
-                    Picture(
-                        f"Record {fit.record}, {names[j]}",
-                        "time [s]",
-                        names[j],
-                        (Series(names[j], fit.t, fit.traces[:, j]),),
-                    ),
+                sentence = (
+                    f"Record {fit.record} is bad in channel {name!r}: the residual after removing the sine of "
+                    f"{f[k]:.4g} Hz is {100 * rest[k]:.3g} % of the sine, in neighbouring records {100 * near:.2g} "
+                    f"%{ratio}. The signal is distorted, clipped or out of range there (see its figure); leave the "
+                    "record out."
                 )
+                picture = samples_over_time(fit.record, name, fit.t, fit.traces[:, j])
+                yield Finding(self.name, "stop", sentence, (name,), (fit.record,), rest[k], limit, picture)
 
 
 def _drive(rest: np.ndarray, live: list[int], n_u: int) -> int:
@@ -198,15 +195,3 @@ def _departure(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     share = (x[1:-1] - x[:-2]) / (x[2:] - x[:-2])
     d[1:-1] = y[1:-1] - (y[:-2] + share * (y[2:] - y[:-2]))
     return d
-
-
-def _bode(f: np.ndarray, X: np.ndarray, names: tuple[str, ...], live: list[int], drive: int) -> Picture:
-    return Picture(
-        f"Amplitude of each channel by {names[drive]}",
-        "frequency [Hz]",
-        "ratio [-]",
-        tuple(Series(names[j], f, np.abs(X[:, j] / X[:, drive]), "points") for j in live if j != drive),
-        (Limit("proportional", 1.0),),
-        "log",
-        "log",
-    )
