@@ -37,6 +37,7 @@ class BlockDiagram:
         self.signals = self.families.signals
         self.kind = {p.name: (p.kind, p.count) for p in self.families.parts}
         self.chain = ["K", *self._longest_way()]
+        self.driven = {reader for s in self.signals if s.role == "w_delta" for reader in s.readers}
         self.nodes: dict[str, Node] = {}
         self.rows = {name: row for row, name in enumerate(self.chain)}
         self._place()
@@ -83,16 +84,23 @@ class BlockDiagram:
                 self._beside(name, taken)
 
     def _beside(self, name: str, taken: set[tuple[float, int]]) -> None:
-        """Place a part: to the right, one row below its source in the chain, or else to the left of its reader."""
+        """Place a part: to the right, one row below its source in the chain; or else to the left of its reader; or else
+        below its source outside the chain."""
         feeding = ["K" if s.role == "u" else s.source for s in self.signals if name in s.readers]
         reading = [r for s in self.signals if s.source == name for r in s.readers]
         before = [self.rows[n] for n in feeding if n in self.nodes and n in self.chain]
         after = [self.rows[n] for n in reading if n in self.nodes]
+        beside = [n for n in feeding if n in self.nodes and n not in self.chain]
         if before:
             x, row, step = FAR, max(before) + 1, 1
         elif after:
             x = LEFT
-            row, step = min(after) - (0 if reading[0] in self.chain else 1), -1
+            # Below its reader where Delta drives it, which has to come past the chain.
+            row, step = (
+                (max(after) + 1, 1) if name in self.driven else (min(after) - (reading[0] not in self.chain), -1)
+            )
+        elif beside:
+            x, row, step = self.nodes[beside[0]][0], self.rows[beside[0]] + 1, 1
         else:
             return
         while (x, row) in taken:
@@ -155,9 +163,13 @@ class BlockDiagram:
         elif x2 > MIDDLE:
             lane, level = NEAR + 50, y + self._height(source) / 2 - 12
             self.canvas.line([(x + width / 2, level), (lane, level), (lane, y2), (x2 - width2 / 2, y2)], arrow=True)
-        else:
+        elif y == y2:
             self.canvas.line([(x + width / 2, y), (x2 - width2 / 2, y2)], arrow=True)
             self.canvas.text(((x + width / 2 + x2 - width2 / 2) / 2, y - 7), s.name, 11)
+        else:
+            lane, begin, end = x + width / 2 + 40, y - BOX_HEIGHT / 4, y2 + BOX_HEIGHT / 4
+            self.canvas.line([(x + width / 2, begin), (lane, begin), (lane, end), (x2 - width2 / 2, end)], arrow=True)
+            self.canvas.text((lane + 6, begin - 4), s.name, 11, anchor="start")
 
     def _branch(self, begin: Point, end: Point) -> None:
         """Branch from the chain to the top of a box on the right."""
@@ -203,9 +215,10 @@ class BlockDiagram:
             else:
                 self._box("delta", "Δ", count, (NEAR, y2), 52.0)
                 self.canvas.line([(x2 - width2 / 2, y2), (NEAR + 26, y2)], arrow=True)
-                self.canvas.line([(NEAR - 26, y), (x + width / 2 + 4, y)], arrow=True)
                 self.canvas.text(((x2 - width2 / 2 + NEAR + 26) / 2, y2 - 6), "z", 11)
-                self.canvas.text(((x + width / 2 + NEAR - 26) / 2, y2 - 6), "w", 11)
+                lane = NEAR - 52
+                self.canvas.line([(NEAR - 26, y2), (lane, y2), (lane, y), (x + width / 2 + 4, y)], arrow=True)
+                self.canvas.text(((x + width / 2 + NEAR - 26) / 2, y - 6), "w", 11)
 
     def _boxes(self) -> None:
         for name, (x, y, width) in self.nodes.items():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
-from avis_ctrl.report.block_diagram import BlockDiagram
+from avis_ctrl.report.block_diagram import FILLS, BlockDiagram
 from avis_ctrl.report.canvas import Canvas
 from avis_ctrl.report.families import Families
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, ticks_log
@@ -19,7 +19,9 @@ from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.study.plant import DesignPlant, build_plant
 
 
 @pytest.mark.parametrize(
@@ -102,9 +104,40 @@ def test_block_diagram_shows_every_part_and_signal(fabricated: DesignResult) -> 
             assert s.name in drawn
 
 
-def test_boxes_of_the_block_diagram_do_not_overlap(fabricated: DesignResult) -> None:
-    diagram = BlockDiagram(fabricated.plant)
+def with_sensor_chains() -> DesignPlant:
+    """Parameters, actuators and sensors uncertain: Delta stands in three places."""
+    chains = {"low_percent": 10.0, "crossover_Hz": 60.0, "high_percent": 400.0}
+    table = {
+        "title": "all kinds of uncertainty",
+        "rig": "avis",
+        "keep": ["z", "phi_x"],
+        "uncertainty": {"parameters_percent": {"mass": 10.0}, "actuator_chains": chains, "sensor_chains": chains},
+        "transmissibility": {"peak_dB": 6.0, "band_dB": -3.0, "band_Hz": [2.0, 6.0]},
+        "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+    }
+    return build_plant(design_from_table(table), load_rig("avis"))
+
+
+@pytest.mark.parametrize("sensor_chains", [False, True])
+def test_boxes_of_the_block_diagram_do_not_overlap(fabricated: DesignResult, sensor_chains: bool) -> None:
+    plant = with_sensor_chains() if sensor_chains else fabricated.plant
+    diagram = BlockDiagram(plant)
+    assert {diagram.families.of(part.name) for part in plant.full.parts} <= set(diagram.nodes)
+    drawn = ElementTree.fromstring(diagram.svg())
+    # The boxes of Delta are no parts; a shadow stands behind the box of several.
+    delta = [one.attrib for one in drawn.iter("{http://www.w3.org/2000/svg}rect") if one.get("fill") == FILLS["delta"]]
+    delta = [one for one in delta if one["stroke"] != "#777777"]
+    assert len(delta) == (3 if sensor_chains else len({s.source for s in diagram.signals if s.role == "z_delta"}))
     boxes = [
+        (
+            float(one["x"]),
+            float(one["x"]) + float(one["width"]),
+            float(one["y"]),
+            float(one["y"]) + float(one["height"]),
+        )
+        for one in delta
+    ]
+    boxes += [
         (x - w / 2, x + w / 2, y - diagram._height(n) / 2, y + diagram._height(n) / 2)
         for n, (x, y, w) in diagram.nodes.items()
     ]
