@@ -212,7 +212,7 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
     r_w, r_z = robust.n_w, robust.n_z
     if not r_w:
         return upper_bound(M, structure, tolerance)
-    batch, performance = M.shape[0], np.arange(structure.n_w) >= r_w
+    batch = M.shape[0]
     shapes = ((structure.n_z,) * 2, (structure.n_w,) * 2, (structure.n_w, structure.n_z))
     found = UpperBound(np.full(batch, np.inf), LmiScalings(*(np.zeros((batch, *shape), complex) for shape in shapes)))
     if not batch:
@@ -231,7 +231,7 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
         scaled = M[left].copy()
         scaled[:, :, r_z:] /= g[:, None, None, None]
         bound = bound_for_goal(scaled, structure, tolerance, 1.0)
-        gain = g * np.sqrt(np.maximum(least_level(scaled, bound.scalings, performance), 0.0))
+        gain = g * np.sqrt(np.maximum(_level_of_performance(scaled, structure, bound.scalings), 0.0))
         better = gain < most[left]
         for scaling, side in ((bound.scalings.X_z, r_z), (bound.scalings.X_w, r_w)):
             scaling[:, side:, side:] /= g[:, None, None] ** 2
@@ -242,3 +242,19 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
         bounded = np.isfinite(most[left])
         trial[left] = np.where(bounded, np.sqrt(least[left] * most[left]), 10 * trial[left])
     return found
+
+
+def _level_of_performance(M: Array, structure: BlockStructure, scalings: LmiScalings) -> Array:
+    """`least_level` (B,) of the last block at level 1 of the others, in coordinates in which X is near the identity:
+    round-off must not hide that the other blocks are robustly stable."""
+    d = np.stack(
+        [
+            np.sqrt(np.trace(scalings.X_w[:, w, w], axis1=1, axis2=2).real / (w.stop - w.start))
+            for _, w, _ in structure.slices()
+        ],
+        axis=1,
+    )
+    d_z, d_w = expand(structure, d)
+    unit = M * d_z[:, None, :, None] / d_w[:, None, None, :]
+    performance = np.arange(structure.n_w) >= structure.n_w - structure.blocks[-1].rows
+    return least_level(unit, rescaled(scalings, 1 / d_z, 1 / d_w, np.ones(len(M))), performance)

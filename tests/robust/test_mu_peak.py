@@ -567,6 +567,17 @@ def test_the_worst_case_gain_does_not_depend_on_the_units_of_its_output(units):
     assert np.all(least > -1e-9 * np.linalg.norm(scalings.X_w, axis=(1, 2)))
 
 
+def test_the_worst_case_gain_does_not_depend_on_the_units_inside():
+    """Between the blocks, a table has metres and newtons: entries of 1e6 and 1e-7 beside each other."""
+    rng = np.random.default_rng(4)
+    M = rng.standard_normal((3, 1, 6, 6)) + 1j * rng.standard_normal((3, 1, 6, 6))
+    M[:, :, :5, :5] *= 0.1
+    whole = BlockStructure.of([RealScalar()] * 3 + [ComplexScalar()] * 2).with_performance(1, 1)
+    units = np.array([1e7, 1.0, 1e-7, 1e4, 1e-5, 1.0])
+    found = skewed_upper_bound(M * units[:, None] / units, whole).beta
+    np.testing.assert_allclose(found, skewed_upper_bound(M, whole).beta, rtol=1e-4)
+
+
 def test_worst_gain_of_a_matrix_that_a_perturbation_makes_singular():
     """1 + delta/(1 - delta): infinite at delta = 1; the other matrix of the stack has 1 + 1/(1 - 0.5) = 3."""
     M = np.array([[[1.0, 1.0], [1.0, 1.0]], [[0.5, 1.0], [1.0, 1.0]]], complex)
