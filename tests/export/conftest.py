@@ -92,7 +92,7 @@ def shipped(shipped_dir):
     return open_design(shipped_dir)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def gcc() -> str:
     found = compiler()
     if found is None:

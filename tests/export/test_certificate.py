@@ -191,25 +191,27 @@ def test_offset_at_the_inputs_costs_the_voltage_that_is_certified(shipped, packa
     assert found["percent_of_limit"] <= shipped.design.control_effort.offset_percent
 
 
-def test_the_worst_plant_replayed_through_the_code(package, gcc):
-    """On the nonlinear table with six axes, in time: below the bound, and near what the frequency domain says."""
+@pytest.fixture(scope="module")
+def louder(shipped, package, gcc):
+    """The replay with ten times the floor motion, beside which the same noise is a tenth as large."""
+    files = {name: data.decode() for name, data in package.contents.items() if name.startswith("avis_controller.")}
+    settings = ReplaySettings(velocity_rms=10 * ReplaySettings().velocity_rms)
+    return replay_worst_plant(shipped, package.certificate, package.controller, files, settings)
+
+
+def test_the_worst_plant_replayed_through_the_code(package, louder, gcc):
+    """On the nonlinear table with six axes, in time: near what the frequency domain says, and below the bound, which
+    excludes the rounding of single precision: it changes the gain by less than a thousandth at ten times the floor
+    motion."""
     assert not package.replay.record.diverged
     assert package.replay.gain == pytest.approx(package.certificate.worst.gain, rel=0.02)
-    assert package.replay.gain <= ratio(package.certificate.content["worst_case_peak_transmissibility_dB"])
+    assert louder.gain <= 1.001 * ratio(package.certificate.content["worst_case_peak_transmissibility_dB"])
 
 
-def test_the_replay_does_not_measure_noise(shipped, package, gcc):
-    """With a tenth of the floor motion, beside which the same noise is ten times as large, the gain is the same. The
-    rounding of single precision is not subtracted; it changes the gain by less than 1 %."""
-    files = {name: data.decode() for name, data in package.contents.items() if name.startswith("avis_controller.")}
-    weaker = replay_worst_plant(
-        shipped,
-        package.certificate,
-        package.controller,
-        files,
-        ReplaySettings(velocity_rms=0.1 * ReplaySettings().velocity_rms),
-    )
-    assert weaker.gain == pytest.approx(package.replay.gain, rel=1e-2)
+def test_the_replay_does_not_measure_noise(package, louder, gcc):
+    """With ten times the floor motion, the gain is the same. The rounding of single precision is not subtracted; it
+    changes the gain by less than 1 %."""
+    assert louder.gain == pytest.approx(package.replay.gain, rel=1e-2)
 
 
 def test_rounding_stays_below_its_bound(shipped, package, gcc):
