@@ -117,7 +117,7 @@ def _picture(orders: Sequence[tuple[int, float]]) -> bytes:
 
 
 def _orders(terminal: Terminal, orders: Sequence[tuple[int, float]]) -> None:
-    ends = {0: "of the folder", len(orders) - 1: "exported"}
+    ends = {len(orders) - 1: "exported", 0: "of the folder"}
     rows = [(str(states), f"{mu:.4g}", ends.get(k, "")) for k, (states, mu) in enumerate(orders)]
     terminal.table(("states", "mu at most, design's model", ""), rows, title="order against mu")
 

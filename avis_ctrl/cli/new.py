@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 from collections.abc import Callable
@@ -97,7 +98,7 @@ def rig(
     from avis_ctrl.files import write_whole
     from avis_ctrl.study.new_files import NewRig, rig_of, rig_text
 
-    new = NewRig(**_rig_fields({field: ctx.params[field] for field in vars(NewRig())}))
+    new = NewRig(**_rig_fields({one.name: ctx.params[one.name] for one in dataclasses.fields(NewRig)}))
     try:
         modes = rig_of(new).equations_of_motion().natural_frequencies().frequencies_Hz
     except InputError as error:
@@ -150,9 +151,6 @@ def _doubt(field: str, value: float) -> None:
         print(f"avis: {what} known to within {value:g} %: unusually small; {meant}", file=sys.stderr)
 
 
-DESIGN = ("title", "keep", "band_Hz", "band_dB", "peak_dB", "mass_percent", "stiffness_percent", "damping_percent")
-
-
 def _design_fields(given: dict[str, Any]) -> dict[str, Any]:
     """Answers as fields of NewDesign."""
     fields = {"title": "My design", **given}
@@ -190,7 +188,8 @@ def design(
 
     # In a design file, the path of the rig file is relative to the design file.
     named = os.path.relpath(rig, out.resolve().parent) if _is_file(rig) else rig
-    made = new_design(NewDesign(**_design_fields({key: ctx.params[key] for key in DESIGN})), load_rig(rig), named)
+    given = _design_fields({one.name: ctx.params[one.name] for one in dataclasses.fields(NewDesign)})
+    made = new_design(NewDesign(**given), load_rig(rig), named)
     write_whole(out, design_text(made).encode())
     read_study(out)
     print(

@@ -123,7 +123,8 @@ def with_noise(
     ------
     InputError : the noise cannot be estimated from the records.
     """
-    quiet = _silent(campaign, model, band_Hz)
+    rest, between = _silent(campaign, model, band_Hz)
+    quiet = [*rest, *between]
     kinds = {one.block.kind for one in quiet}
     known: dict[tuple[str, bytes], SpectralBlock] = {}
     made = []
@@ -140,10 +141,9 @@ def with_noise(
         made.append(block.with_noise(like.noise, like.dof))
     dof, better = f"{made[0].dof:.0f} degrees of freedom per line", "; a record at rest gives a better estimate"
     if kinds:
-        at_rest = {not driven_inputs(campaign.named(one.block.name)) for one in quiet}
-        words = ["in records at rest"] * (True in at_rest)
-        words += ["between the harmonics of periodic records"] * (False in at_rest)
-        return made, f"noise measured {' and '.join(words)}: {dof}{'' if True in at_rest else better}"
+        places = (("in records at rest", rest), ("between the harmonics of periodic records", between))
+        where = " and ".join(words for words, found in places if found)
+        return made, f"noise measured {where}: {dof}{'' if rest else better}"
     return made, f"noise estimated with a local polynomial model: {dof}{better}"
 
 
@@ -179,18 +179,21 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
         ) from None
 
 
-def _silent(campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]) -> list[Residual]:
-    """Residuals of the model on lines without drive: at rest, if the records at rest are long enough."""
-    longest = max((r.header.duration_s for r in campaign.records if driven_inputs(r)), default=0.0)
-    found = []
+def _silent(
+    campaign: Campaign, model: TableModel, band_Hz: tuple[float, float]
+) -> tuple[list[Residual], list[Residual]]:
+    """Residuals of the model on lines without drive: at rest; and, if these records are short, between harmonics."""
+    driven = [(record, bool(driven_inputs(record))) for record in campaign.records]
+    longest = max((record.header.duration_s for record, moves in driven if moves), default=0.0)
+    at_rest, between = [], []
     for floor in (False, True):
-        alike = [record for record in campaign.records if bool(record.header.floor_names) == floor]
-        rest = [record for record in alike if not driven_inputs(record)]
-        found += [_residual(record_block(record.load(), model.base, band_Hz), model) for record in rest]
+        alike = [(record, moves) for record, moves in driven if bool(record.header.floor_names) == floor]
+        rest = [record for record, moves in alike if not moves]
+        at_rest += [_residual(record_block(record.load(), model.base, band_Hz), model) for record in rest]
         if sum(record.header.duration_s for record in rest) < SETTINGS.rest * longest:
-            periodic = (record for record in alike if record not in rest and _is_periodic(record))
-            found += [_between_harmonics(record, model, band_Hz) for record in periodic]
-    return found
+            periodic = (record for record, moves in alike if moves and _is_periodic(record))
+            between += [_between_harmonics(record, model, band_Hz) for record in periodic]
+    return at_rest, between
 
 
 def _is_periodic(record: RecordSource) -> bool:

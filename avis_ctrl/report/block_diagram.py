@@ -84,8 +84,8 @@ class BlockDiagram:
                 self._beside(name, taken)
 
     def _beside(self, name: str, taken: set[tuple[float, int]]) -> None:
-        """Place a part: to the right, one row below its source in the chain; or else to the left of its reader; or else
-        below its source outside the chain."""
+        """Place a part: to the right, one row below its source in the chain; or else to the left of its reader (below
+        it, if Delta drives the part); or else below its source outside the chain."""
         feeding = ["K" if s.role == "u" else s.source for s in self.signals if name in s.readers]
         reading = [r for s in self.signals if s.source == name for r in s.readers]
         before = [self.rows[n] for n in feeding if n in self.nodes and n in self.chain]
@@ -93,12 +93,10 @@ class BlockDiagram:
         beside = [n for n in feeding if n in self.nodes and n not in self.chain]
         if before:
             x, row, step = FAR, max(before) + 1, 1
+        elif after and name in self.driven:  # below the reader, where Delta has a way past the chain
+            x, row, step = LEFT, max(after) + 1, 1
         elif after:
-            x = LEFT
-            # Below its reader where Delta drives it, which has to come past the chain.
-            row, step = (
-                (max(after) + 1, 1) if name in self.driven else (min(after) - (reading[0] not in self.chain), -1)
-            )
+            x, row, step = LEFT, min(after) - (reading[0] not in self.chain), -1
         elif beside:
             x, row, step = self.nodes[beside[0]][0], self.rows[beside[0]] + 1, 1
         else:

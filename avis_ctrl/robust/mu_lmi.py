@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.robust.mu_kernel import SETTINGS, Entries, PathSettings, follow_path
+from avis_ctrl.robust.mu_kernel import SETTINGS, Entries, follow_path
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Array = np.ndarray
@@ -167,13 +167,7 @@ def least_level(M: Array, scalings: LmiScalings, level: Array) -> Array:
 
 
 def follow(
-    space: ScalingSpace,
-    M: Array,
-    theta: Array,
-    lam: Array,
-    goal: Array | float = 0.0,
-    tolerance: float = 1e-5,
-    path: PathSettings = SETTINGS,
+    space: ScalingSpace, M: Array, theta: Array, lam: Array, goal: Array | float = 0.0, tolerance: float = 1e-5
 ) -> tuple[Array, Array]:
     """Follow the analytic centres from a feasible (theta, lam) down to the minimum lambda, or to `goal`.
 
@@ -192,6 +186,6 @@ def follow(
         space.trace,
         space.is_g,
         tolerance,
-        path,
+        SETTINGS,
     )
     return theta, lam

@@ -205,8 +205,8 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
     other blocks is not below 1).
 
     The gain is below g if and only if mu of M with the performance rows divided by g is below 1 (main loop theorem). g
-    is found by bisection: scalings that prove mu < 1 prove the smallest gain that they allow, and where mu is beta > 1,
-    the bound of the gain is at least beta g.
+    is found by bisection. Scalings that prove mu < 1 also prove a bound of the gain. Where the bound of mu is
+    beta > 1, the bound of the gain is at least beta g.
     """
     robust = BlockStructure(structure.blocks[:-1])
     r_w, r_z = robust.n_w, robust.n_z

@@ -21,7 +21,6 @@ from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
-from avis_ctrl.study.files import values_of
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -152,8 +151,8 @@ def _by_slicot(system: StateSpace) -> float | None:
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
     """A mu or worst-case result, with its perturbation in words."""
     words = describe(plant, blocks, found.delta) if found.delta is not None else ()
-    curves = values_of(found, "frequencies", "upper_curve", "lower_curve")
-    return Bound(**values_of(found, "upper", "lower", "omega", "guaranteed", "delta"), words=words, **curves)
+    curves = (found.frequencies, found.upper_curve, found.lower_curve)
+    return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, *curves)
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:

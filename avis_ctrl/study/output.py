@@ -116,10 +116,12 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """Row of a controller that could not be analysed; the note has the reason."""
-    figures = ("gamma", "mu_upper", "mu_lower", "mu_peak_Hz")
-    in_dB = ("peak_transmissibility_dB", "worst_case_peak_transmissibility_dB")
-    known = {**values_of(c, "name", "kind"), "file": None, "order": None, "stable": False}
-    return {**known, **dict.fromkeys((*figures, *in_dB, "at_rest")), "note": c.reason}
+    unknown = (
+        *("gamma", "mu_upper", "mu_lower", "mu_peak_Hz"),
+        *("peak_transmissibility_dB", "worst_case_peak_transmissibility_dB", "at_rest"),
+    )
+    known = {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False}
+    return {**known, **dict.fromkeys(unknown), "note": c.reason}
 
 
 def _all_axes(loop: Simulated | None) -> dict[str, Any]:

@@ -532,7 +532,7 @@ def least_skewed_level(M, structure, unit):
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @pytest.mark.parametrize(("seed", "omega"), [(1, 5.13), (8, 5.4), (17, 2.26)])
 def test_upper_bound_of_the_worst_case_gain_is_that_of_another_solver(seed, omega):
-    """A path of analytic centres of the performance level alone ended at 5 to 140 times it."""
+    """The path of analytic centres that was used before ended at 5 to 140 times this bound."""
     N, structure = oscillators(seed).lft()
     M, whole = N.frequency_response([omega]), structure.with_performance(1, 1)
     ours = skewed_upper_bound(M[:, None], whole, 1e-4).beta[0]

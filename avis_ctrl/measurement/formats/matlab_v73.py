@@ -109,20 +109,20 @@ class Tree:
             for i in range(count)
         ]
 
-    def _matrix(self, item: h5py.Dataset, reverse: tuple[int, ...], dtype: np.dtype) -> Matrix:
+    def _matrix(self, item: h5py.Dataset, file_shape: tuple[int, ...], dtype: np.dtype) -> Matrix:
         name, path = stored.full_name(item), self.path
         complex_parts = dtype.names == ("real", "imag")
 
         def read() -> np.ndarray:
             with reading(path, printable(name)):
-                require_small(path, math.prod(reverse) * dtype.itemsize)
+                require_small(path, math.prod(file_shape) * dtype.itemsize)
                 array = stored.values_in(path, name).T
-            if array.shape == reverse[::-1] and array.dtype == dtype:
+            if array.shape == file_shape[::-1] and array.dtype == dtype:
                 if not complex_parts:
                     return array
                 if array["real"].dtype.kind in "fiu" and array["imag"].dtype.kind in "fiu":
                     return array["real"] + 1j * array["imag"]
             raise InputError("changed since it was opened, or holds no numbers", file=path, field=printable(name))
 
-        shape = reverse[::-1] if len(reverse) != 1 else (reverse[0], 1)
+        shape = file_shape[::-1] if len(file_shape) != 1 else (file_shape[0], 1)
         return Matrix(shape, "c" if complex_parts else dtype.kind, read, None if complex_parts else name)

@@ -158,7 +158,8 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
         return None
     if seen.header.excitation == "sine":
         return _sine_excess(seen)
-    if not moving(usable(seen)[0]) or (estimate := h1([record_spectra(seen)])) is None:
+    u, y, wrap = usable(seen)
+    if not moving(u) or (estimate := h1([record_spectra(u, y, wrap, seen.header.sample_rate_Hz)])) is None:
         return None
     limit = stats.beta.isf(FALSE_ALARM / estimate.coherence.size, estimate.rank, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)

@@ -137,10 +137,9 @@ def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: boo
     return Spectra(np.fft.rfftfreq(length, 1 / rate_Hz), cut(u), cut(y))
 
 
-def record_spectra(seen: Excerpt) -> Spectra:
-    """Spectra of `usable`, in segments of `segment_length`."""
-    u, y, wrap = usable(seen)
-    return spectra(u, y, seen.header.sample_rate_Hz, segment_length(len(u), moving(u)), wrap)
+def record_spectra(u: np.ndarray, y: np.ndarray, wrap: bool, rate_Hz: float) -> Spectra:
+    """Spectra of the samples from `usable`, in segments of `segment_length`."""
+    return spectra(u, y, rate_Hz, segment_length(len(u), moving(u)), wrap)
 
 
 def directions(U: np.ndarray) -> np.ndarray:

@@ -113,8 +113,9 @@ class Comparison(Gate):
         h = seen.header
         if not seen.driven or h.excitation == "sine":
             return None
-        kept = _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, record_spectra(seen))
         u, y, wrap = usable(seen)
+        of = record_spectra(u, y, wrap, h.sample_rate_Hz)
+        kept = _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
         if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
             return kept
         P = len(periods)

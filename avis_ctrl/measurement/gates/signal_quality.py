@@ -298,7 +298,7 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
-    of = record_spectra(seen)
+    of = record_spectra(*usable(seen), rate)
     if (estimate := h1([of])) is None:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.unbiased_coherence(), 0.0)
