@@ -36,7 +36,7 @@ from avis_ctrl.gap.search import (
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.tolerances import BEYOND, credible, moved, of_effect, tolerances_behind, with_tolerance
+from avis_ctrl.gap.tolerances import credible, has_tolerance, moved, of_effect, tolerances_behind, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
@@ -186,7 +186,12 @@ def _without_weak(
     """Remove weak effects (`is_weak`) that the evidence does not require; the remaining steps and the fit. Values
     beyond their tolerance are kept: their evidence lies in how far other values had to move, or in narrower priors
     (`outliers`)."""
-    weak = [step for step in steps if name_of(step.label)[0] not in BEYOND and is_weak(best, step.label, settings)]
+    stated = tolerances_of(best.model.rig)
+    weak = [
+        step
+        for step in steps
+        if not has_tolerance(best.model.effect(step.label), stated) and is_weak(best, step.label, settings)
+    ]
     kept, best = backward_elimination(weak, best, data, settings)
     return tuple(step for step in steps if step in kept or step not in weak), best
 

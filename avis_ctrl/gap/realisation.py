@@ -171,23 +171,14 @@ def _additions(table: ReducedTable, names: list[str]) -> StateSpace:
 
 
 def _drives(model: TableModel) -> list[StateSpace]:
-    """Commanded to acting volts, one system per actuator; the first lag and all delay are part of the loop."""
-    factors = dict.fromkeys(model.actuators, 1.0)
-    first = model.amplifier_corner_Hz is None
-    found = [gain([[1.0]])] * len(model.actuators)
+    """Commanded to acting volts, one system per actuator; the mean lag and all delay are part of the loop."""
+    factors, lags = dict.fromkeys(model.actuators, 1.0), [gain([[1.0]])] * len(model.actuators)
     for one in model.effects:
         if one.effect.name == "actuator_gain":
             factors[one.place] *= one.by_name["gain"]
-        if one.effect.name == "actuator_lag" and (tau := one.by_name["time_constant_s"]) > 1e-9:
-            each = np.broadcast_to(time_constants(one.by_name), len(found))
-            common = [-1 / tau] if first else []
-            if len(one.values) > 1 or not first:
-                found = [
-                    cascade(common, [-1 / own], (tau if first else 1.0) / own) @ before
-                    for own, before in zip(each, found, strict=True)
-                ]
-            first = False
-    return [lag.scaled(factors[name]) for lag, name in zip(found, model.actuators, strict=True)]
+        if one.effect.name == "actuator_lag" and len(one.values) > 1 and (tau := one.by_name["time_constant_s"]) > 1e-9:
+            lags = [cascade([-1 / tau], [-1 / own], tau / own) for own in time_constants(one.by_name)]
+    return [lag.scaled(factors[name]) for lag, name in zip(lags, model.actuators, strict=True)]
 
 
 def _sensors(table: ReducedTable, names: list[str]) -> StateSpace:
@@ -305,7 +296,7 @@ def sufficient_order(delay_s: float, omega: float, tolerance: float, largest: in
 
 
 def loop_lag(model: TableModel) -> tuple[float, float | None]:
-    """Delay [s] and first amplifier corner [Hz] of a model, including its effects."""
+    """Delay [s] and (mean) amplifier corner [Hz] of a model, including its effects."""
     ops = _changed_by(model, "actuator_lag", "loop_delay")
     return ops.delay_s, ops.amplifier_corner_Hz
 

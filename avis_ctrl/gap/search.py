@@ -25,7 +25,7 @@ from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
-from avis_ctrl.gap.tolerances import BEYOND, of_effect, rescaled, spread, tolerances_behind, within_tolerance
+from avis_ctrl.gap.tolerances import of_effect, of_values, rescaled, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
@@ -198,7 +198,7 @@ def search(
             break
         more(effects, enough)
     if steps:
-        more([one for one in effects if one.name in BEYOND], lambda step: False)
+        more(of_values(effects, base.model), lambda step: False)
     return steps
 
 
@@ -220,7 +220,7 @@ def outliers(
         return [], now
     progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
-    narrow, beyond = _with_spread(now, rows, size, data, settings), [one for one in effects if one.name in BEYOND]
+    narrow, beyond = _with_spread(now, rows, size, data, settings), of_values(effects, now.model)
     while (
         len(narrow.labels) < settings.longest
         and (step := next_effect(narrow, data, beyond, settings, each)) is not None

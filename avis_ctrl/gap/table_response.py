@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.operators import Assembled
-from avis_ctrl.identification.response import N_Q, Matrices, Operands, ResponseModel
+from avis_ctrl.identification.response import AMPLIFIERS, N_Q, Matrices, Operands, ResponseModel
 
 # Parameter names of mount stiffnesses and dampings.
 MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
@@ -118,6 +118,15 @@ class TableResponse(DrivenTable):
             self.Y,
         )
         dY = operands.derivative(model.names, d, more)
+        if AMPLIFIERS in model.names and self.is_driven and ops.amplifier_corner_Hz is not None:
+            # The effect actuator_lag adds to the time constant.
+            slope, folded = replace(model, amplifier_corner_Hz=ops.amplifier_corner_Hz).drive_slopes(
+                ops.omega, AMPLIFIERS
+            )
+            mat = model.matrices
+            dY[model.names.index(AMPLIFIERS)] = per_force @ (made.T @ (slope * self.folded)) + self.gain * folded * (
+                mat.R @ np.linalg.inv(mat.M) @ mat.T @ self.folded
+            )
         moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.acting.inner)
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         for kind in "kc":

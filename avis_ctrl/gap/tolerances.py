@@ -8,34 +8,49 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.effects.payload import PRODUCTS
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.table_model import ActiveEffect
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.priors import Priors, Tolerance, re_identified
+from avis_ctrl.identification.response import AMPLIFIERS
 from avis_ctrl.rigs.instruments import Tolerances
 
+Stated = Callable[[Tolerances, Sequence[EffectParameter]], tuple[float, ...]]
 # Effects that represent one value of the rig file beyond its tolerance: the tolerance of each of their parameters, in
-# its unit (relative for a geophone's corner and damping ratio), and the prefixes of the names of these tolerances.
-BEYOND: Mapping[str, tuple[Callable[[Tolerances], tuple[float, ...]], tuple[str, ...]]] = {
-    "sensor_gain": (lambda t: (t.sensor_gain_percent / 100,), ("sensor.{place}",)),
-    "actuator_gain": (lambda t: (t.actuator_gain_percent / 100,), ("actuator.{place}",)),
-    "sensor_misalignment": (lambda t: (float(np.degrees(t.direction_rad)),) * 2, ("direction.{place}.",)),
-    "com_offset": (lambda t: (t.centre_of_mass_m,) * 3, ("com_",)),
-    "product_of_inertia": (lambda t: (t.product_of_inertia_kgm2,), ("{product}",)),
+# its unit, and the prefixes of the names of these tolerances.
+BEYOND: Mapping[str, tuple[Stated, tuple[str, ...]]] = {
+    "sensor_gain": (lambda t, p: (t.sensor_gain_percent / 100,), ("sensor.{place}",)),
+    "actuator_gain": (lambda t, p: (t.actuator_gain_percent / 100,), ("actuator.{place}",)),
+    "sensor_misalignment": (lambda t, p: (float(np.degrees(t.direction_rad)),) * 2, ("direction.{place}.",)),
+    "com_offset": (lambda t, p: (t.centre_of_mass_m,) * 3, ("com_",)),
+    "product_of_inertia": (lambda t, p: (t.product_of_inertia_kgm2,), ("{product}",)),
     "geophone_corner": (
-        lambda t: (t.sensor_corner_percent / 100, t.sensor_damping_percent / 100),
+        lambda t, p: (t.sensor_corner_percent / 100 * p[0].none, t.sensor_damping_percent / 100 * p[1].none),
         ("corner.{place}", "damping.{place}"),
     ),
+    # The lower limit is the difference between no lag and the expected one.
+    "actuator_lag": (lambda t, p: (SETTINGS.lag_percent / 100 * -p[0].low,), (AMPLIFIERS,)),
 }
+
+
+def of_values(effects: Sequence[Effect], model: TableModel) -> list[Effect]:
+    """Effects that represent a value of a model beyond its tolerance. The lag of the amplifiers is such a value if the
+    model has one."""
+    none = {"actuator_lag"} if model.amplifier_corner_Hz is None else set()
+    return [one for one in effects if one.name in BEYOND.keys() - none]
+
+
+def has_tolerance(effect: ActiveEffect, tolerances: Tolerances) -> bool:
+    """Whether an effect represents a value with a tolerance."""
+    return effect.effect.name in BEYOND and bool(np.any(tolerance_of(effect, tolerances)))
 
 
 def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
     """(n,) tolerances of the parameters of an effect of `BEYOND`, in their units."""
-    relative = np.array(BEYOND[effect.effect.name][0](tolerances))
-    of = np.array([p.none for p in effect.parameters]) if effect.effect.name == "geophone_corner" else 1.0
-    return relative * of
+    return np.array(BEYOND[effect.effect.name][0](tolerances, effect.parameters))
 
 
 def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
@@ -122,7 +137,7 @@ def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings
 
 def within_tolerance(effect: ActiveEffect, tolerances: Tolerances, settings: GapSettings) -> bool:
     """Whether an effect of `BEYOND` has a value that is not beyond its tolerance."""
-    if effect.effect.name not in BEYOND:
+    if not has_tolerance(effect, tolerances):
         return False
     away = np.array([value - p.none for value, p in zip(effect.values, effect.parameters, strict=True)])
     return bool(np.all(np.abs(away) < settings.beyond_least * tolerance_of(effect, tolerances)))
@@ -142,7 +157,7 @@ def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSetting
             for p, v in zip(effect.parameters, effect.values, strict=True)
         ]
     )
-    if effect.effect.name in BEYOND:
+    if has_tolerance(effect, tolerances):
         sigma = settings.beyond_tolerance * tolerance_of(effect, tolerances)
     low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))
     return Priors(effect.names, mean, sigma, np.zeros(len(mean), bool), low, high)

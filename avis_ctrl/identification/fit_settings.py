@@ -15,6 +15,9 @@ class FitSettings:
     unknown_percent : standard deviation [%] about the start of a fit, for parameters without a stated prior: much
         larger than the uncertainty of what the data determine, and small enough that the rest stays where it was
         (Levenberg-Marquardt damping, as a prior).
+    lag_percent : standard deviation of the amplifiers' time constant [%], which no rig file states: amplifiers without
+        a lag are within three standard deviations, and a lag of more than twice the expected one is beyond them.
+    shortest_lag : time constant below which amplifiers have no lag, relative to the expected one [1].
     lines : spectral lines per record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         twice as many give a precise estimate of the unexplained part.
     residual_lines : lines per record from whose residuals an identification estimates the noise. Not all of them are
@@ -50,6 +53,8 @@ class FitSettings:
     stiffness_percent: float = 5.0
     damping_percent: float = 20.0
     unknown_percent: float = 10.0
+    lag_percent: float = 35.0
+    shortest_lag: float = 1e-3
     lines: int = 200
     residual_lines: int = 800
     final_rounds: int = 3

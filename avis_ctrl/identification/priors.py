@@ -11,7 +11,7 @@ import numpy as np
 
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.parameter_sets import default_parameters
-from avis_ctrl.identification.response import ResponseModel, positive
+from avis_ctrl.identification.response import AMPLIFIERS, ResponseModel, positive
 from avis_ctrl.rigs.instruments import Tolerances
 from avis_ctrl.rigs.rig import Rig
 
@@ -96,16 +96,24 @@ def re_identified(rig: Rig, settings: FitSettings = SETTINGS) -> Priors:
 def with_tolerances(model: ResponseModel, tolerances: Tolerances, settings: FitSettings = SETTINGS) -> Priors:
     """`re_identified`, and every value of the rig file that has a tolerance; the model has separate channels."""
     first = re_identified(model.rig, settings)
-    return first.followed_by(beside(model, first.names, tolerances))
+    return first.followed_by(beside(model, first.names, tolerances, settings))
 
 
-def beside(model: ResponseModel, names: Sequence[str], tolerances: Tolerances) -> Priors:
-    """Priors of every value of the rig file that has a tolerance, except `names`; the model has separate channels."""
+def beside(
+    model: ResponseModel, names: Sequence[str], tolerances: Tolerances, settings: FitSettings = SETTINGS
+) -> Priors:
+    """Priors of every value of the rig file that has a tolerance, except `names`, and of the lag of the amplifiers, if
+    any, which no rig file states; the model has separate channels."""
     known = model.all_parameters()
     rest = {name: sigma for name in known if name not in names and (sigma := _sigma(name, tolerances))}
     mean = np.array([known[name].value for name in rest])
     relative = np.array([name.partition(".")[0] in _RELATIVE for name in rest], bool)
-    return Priors(tuple(rest), mean, np.array(list(rest.values())), relative)
+    found = Priors(tuple(rest), mean, np.array(list(rest.values())), relative)
+    if AMPLIFIERS not in known or AMPLIFIERS in names:
+        return found
+    tau, no = np.array([known[AMPLIFIERS].value]), np.zeros(1, bool)
+    lag = Priors((AMPLIFIERS,), tau, settings.lag_percent / 100 * tau, no, settings.shortest_lag * tau)
+    return found.followed_by(lag)
 
 
 def identified(

@@ -256,6 +256,11 @@ def sensor_model(rig: Rig, unit: str = "V", names: Sequence[str] | None = None) 
     )
 
 
+# Names of the parameters of the drives that are no rig's.
+AMPLIFIERS = "amplifier_time_constant_s"
+OF_DRIVES = ("loop_delay_s", AMPLIFIERS)
+
+
 class Matrices(NamedTuple):
     """Equations of motion and sensor rows; derivatives have a leading axis of parameters."""
 
@@ -437,7 +442,8 @@ class ResponseModel:
     Parameters
     ----------
     rig : structure, and the values of the fixed parameters.
-    names : free parameters: of `rig.parameters()`, "sensor.NAME" (its sensitivity), "loop_delay_s".
+    names : free parameters: of `rig.parameters()`, "sensor.NAME" (its sensitivity), "loop_delay_s", and
+        "amplifier_time_constant_s" if the amplifiers have a lag.
     sensors : from `sensor_model`. actuators : inputs that records drive, by default all.
     period_s, delay_s : hold and loop delay; period_s = 0 for responses measured relative to the voltage itself.
     amplifier_corner_Hz : first-order lag of the amplifiers, None for none.
@@ -501,6 +507,9 @@ class ResponseModel:
                 found[f"corner.{name}"] = Parameter(own[0], "Hz", f"corner of the suspension of {name}")
                 found[f"damping.{name}"] = Parameter(own[1], "", f"damping ratio of the suspension of {name}")
         found["loop_delay_s"] = Parameter(self.delay_s, "s", "delay from the sample to the actuator voltage")
+        if self.amplifier_corner_Hz:
+            tau = 1 / (2 * np.pi * self.amplifier_corner_Hz)
+            found[AMPLIFIERS] = Parameter(tau, "s", "time constant of the amplifiers")
         return found
 
     @cached_property
@@ -557,10 +566,15 @@ class ResponseModel:
         delay = values.get("loop_delay_s", self.delay_s)
         if not 0 <= delay < 1:
             raise InputError("expected a delay from 0 to 1 s", field="loop_delay_s", value=delay)
+        corner = self.amplifier_corner_Hz
+        if AMPLIFIERS in values:
+            if values[AMPLIFIERS] <= 0:
+                raise InputError("expected a time constant above zero", field=AMPLIFIERS, value=values[AMPLIFIERS])
+            corner = 1 / (2 * np.pi * values[AMPLIFIERS])
         of_rig = {
             name: value
             for name, value in values.items()
-            if not name.startswith(("sensor.", "corner.", "damping.")) and name != "loop_delay_s"
+            if not name.startswith(("sensor.", "corner.", "damping.")) and name not in OF_DRIVES
         }
         own = tuple(
             old and (values.get(f"corner.{name}", old[0]), values.get(f"damping.{name}", old[1]))
@@ -570,6 +584,7 @@ class ResponseModel:
             self,
             rig=self.rig.with_parameters(of_rig),
             delay_s=delay,
+            amplifier_corner_Hz=corner,
             sensors=replace(self.sensors, sensitivity=sensitivity, suspensions=own),
         )
 
@@ -701,29 +716,29 @@ class ResponseModel:
         left, w = S * out * (mat.R @ inverse), floor / s
         operands = Operands(self.sensors, mat, s, left, left, S * out, S * alias, a, volts, q, w, w, Y)
         dY = operands.derivative(self.names, self.derivative_matrices)
-        if "loop_delay_s" in self.names:
-            dY[self.names.index("loop_delay_s")] = self._delay_derivative(omega, volts, mat, inverse, out, Minv)
+        for name in OF_DRIVES:
+            if name in self.names:
+                slope, folded = self.drive_slopes(omega, name)
+                moved = out * (mat.R @ inverse @ mat.T @ (slope * volts)) + folded * (mat.R @ Minv @ mat.T @ volts)
+                dY[self.names.index(name)] = S * moved
         return Driven(Y, dY)
 
-    def _delay_derivative(
-        self,
-        omega: np.ndarray,
-        volts: np.ndarray,
-        mat: Matrices,
-        inverse: np.ndarray,
-        out: np.ndarray,
-        Minv: np.ndarray,
-    ) -> np.ndarray:
-        """Exact for the continuous term; a difference for the aliases, which are small and have a kink at whole
-        samples."""
-        s, step = 1j * omega[:, None, None], 1e-4 * (self.period_s or 1e-3)
-        a, _ = self.drive(omega)
-        earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
-        slope = (replace(self, delay_s=later).drive(omega)[1] - replace(self, delay_s=earlier).drive(omega)[1]) / (
-            later - earlier
-        )
-        moved = out * (mat.R @ inverse @ mat.T @ (-s * a * volts)) + slope * (mat.R @ Minv @ mat.T @ volts)
-        return self.sensors.sensitivity[:, None] * moved
+    def drive_slopes(self, omega: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of `drive` by a parameter of `OF_DRIVES`: exact for the continuous term; a difference for the
+        aliases, which are small and, as a function of the delay, have a kink at whole samples."""
+        s, (a, _) = 1j * omega[:, None, None], self.drive(omega)
+        if name == AMPLIFIERS:
+            corner = 2 * np.pi * self.amplifier_corner_Hz  # type: ignore[operator]
+            tau, step = 1 / corner, 1e-4 / corner
+            ends = [replace(self, amplifier_corner_Hz=1 / (2 * np.pi * end)) for end in (tau - step, tau + step)]
+            slope, width = -s / (1 + s * tau) * a, 2 * step
+        else:
+            step = 1e-4 * (self.period_s or 1e-3)
+            earlier, later = max(self.delay_s - step, 0.0), self.delay_s + step
+            ends = [replace(self, delay_s=end) for end in (earlier, later)]
+            slope, width = -s * a, later - earlier
+        low, high = (end.drive(omega)[1] for end in ends)
+        return slope, (high - low) / width
 
     @kept_lines
     def _lines(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -770,6 +785,6 @@ def positive(name: str) -> bool:
     if "@" in name:
         return False
     last = name.rpartition(".")[2]
-    if name.startswith(("sensor.", "actuator.")) or name in INERTIAL:
+    if name.startswith(("sensor.", "actuator.")) or name in INERTIAL or name == AMPLIFIERS:
         return True
     return last.startswith(("k_", "c_")) or (len(last) == 2 and last[0] in "de" and last[1].isdigit())

@@ -55,7 +55,7 @@ def begin(
     """
     assert isinstance(model.rig, AvisTable)  # each channel at its own position
     rig = model.rig.with_channels_apart()
-    rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
+    rest = beside(replace(model, rig=rig, names=()), model.names, tolerances, settings)
     priors = identified(model, stated, settings).followed_by(rest)
     apart = replace(model, rig=rig, names=priors.names)
     data = Data.of(blocks, levels, settings.lines)

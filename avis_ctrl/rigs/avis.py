@@ -6,7 +6,7 @@ An example is the air-mount AVIS (Rademakers, TU/e 2005), with eight linear moto
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -163,7 +163,7 @@ class AvisTable(Rig):
         for one in (*self.drives, *self.instruments):
             for axis, place in zip(AXES, one.position, strict=True):
                 found[f"place.{one.name}.{axis}"] = Parameter(place, "m", f"position of {one.name} along {axis}")
-            for k in _across(one.direction):
+            for k in one.across:
                 found[f"direction.{one.name}.{AXES[k]}"] = Parameter(
                     one.direction[k], "", f"component of the unit direction of {one.name} along {AXES[k]}"
                 )
@@ -195,7 +195,7 @@ class AvisTable(Rig):
         if kind == "place":
             slope = _ARM[k].T @ one.direction
         else:
-            along = ({0, 1, 2} - set(_across(one.direction))).pop()
+            along = ({0, 1, 2} - set(one.across)).pop()
             turn = np.eye(3)[k] - np.eye(3)[along] * one.direction[k] / one.direction[along]
             slope = point_map(one.position).T @ turn
         drive = isinstance(one, Drive)
@@ -251,6 +251,17 @@ class AvisTable(Rig):
         return replace(
             self, motors=(), drives=self.all_drives, geophones=None, instruments=(*self._attached(), *self.instruments)
         )
+
+    def with_directions_by(self, names: Collection[str]) -> AvisTable:
+        """The same table, with the direction of each channel given by the two components that are among these names of
+        parameters, if two are."""
+
+        def named(one: Any) -> Any:
+            free = {k for k in range(3) if f"direction.{one.name}.{AXES[k]}" in names}
+            return replace(one, dependent=({0, 1, 2} - free).pop()) if len(free) == 2 else one
+
+        drives, instruments = (tuple(map(named, some)) for some in (self.drives, self.instruments))
+        return replace(self, drives=drives, instruments=instruments)
 
     def _with_values(self, values: dict[str, float]) -> AvisTable:
         get = values.get
@@ -373,26 +384,14 @@ class AvisTable(Rig):
         return triple(self.isolators[isolator - 1].position)
 
 
-def _across(direction: Triple) -> tuple[int, int]:
-    """Indices of the two smallest components of a unit vector; they determine the third."""
-    first, second, _ = (int(k) for k in np.argsort(np.abs(direction), kind="stable"))
-    return min(first, second), max(first, second)
-
-
 def _moved(one: Any, values: Mapping[str, float]) -> Any:
     """A drive or instrument with its position and direction changed."""
     place = tuple(values.get(f"place.{one.name}.{axis}", old) for axis, old in zip(AXES, one.position, strict=True))
-    across = _across(one.direction)
-    if not any(f"direction.{one.name}.{AXES[k]}" in values for k in across):
-        return one if place == one.position else replace(one, position=place)
-    n = np.array(one.direction)
-    n[list(across)] = [values.get(f"direction.{one.name}.{AXES[k]}", n[k]) for k in across]
-    along = ({0, 1, 2} - set(across)).pop()
-    rest = 1 - float(np.sum(n[list(across)] ** 2))
-    if rest <= 0:
-        raise InputError("expected components of a unit vector", field=f"direction.{one.name}", value=n.tolist())
-    n[along] = np.copysign(np.sqrt(rest), n[along])
-    return replace(one, position=place, direction=triple(n))
+    if place != one.position:
+        one = replace(one, position=place)
+    names = {k: f"direction.{one.name}.{AXES[k]}" for k in one.across}
+    turns = {k: values[name] for k, name in names.items() if name in values}
+    return one.turned(turns) if turns else one
 
 
 def _unit(axis: str) -> Triple:

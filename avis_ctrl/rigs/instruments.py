@@ -8,8 +8,9 @@ displacement of the payload relative to the chassis.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -41,11 +42,37 @@ def unit_vector(direction: Triple, field: str) -> Triple:
 
 @dataclass(frozen=True)
 class Channel:
-    """A drive or sensor at a position [m] with a direction (unit vector with sign)."""
+    """A drive or sensor at a position [m] with a direction (unit vector with sign).
+
+    dependent : index of the component of the direction that follows from the other two, by the unit length; by default
+        the largest. It does not change while a fit turns the direction, even if another component becomes the largest.
+    """
 
     name: str
     position: Triple
     direction: Triple
+    dependent: int | None = field(default=None, kw_only=True, compare=False, repr=False)
+
+    @property
+    def across(self) -> tuple[int, int]:
+        """Indices of the other two components, which are free."""
+        largest = int(np.argsort(np.abs(self.direction), kind="stable")[-1])
+        first, second = sorted({0, 1, 2} - {largest if self.dependent is None else self.dependent})
+        return first, second
+
+    def turned(self, components: Mapping[int, float]) -> Self:
+        """The channel with other values of some of these two components; the sign of the dependent one is kept.
+
+        Raises InputError for components of no unit vector.
+        """
+        free, n = list(self.across), np.array(self.direction)
+        along = ({0, 1, 2} - set(free)).pop()
+        n[free] = [components.get(k, n[k]) for k in free]
+        rest = 1 - float(np.sum(n[free] ** 2))
+        if rest <= 0:
+            raise InputError("expected components of a unit vector", field=f"direction.{self.name}", value=n.tolist())
+        n[along] = np.copysign(np.sqrt(rest), n[along])
+        return replace(self, direction=triple(n), dependent=along)
 
 
 @dataclass(frozen=True)

@@ -192,6 +192,7 @@ def _at_place(thing: Drive | Instrument) -> list[_Line]:
     return [
         replace(line, key="position_m" if line.key == "position" else line.key, parameters=held.get(line.key, ()))
         for line in _all(thing)
+        if line.key != "dependent"  # how a fit turns the direction; no property of the channel
     ]
 
 

@@ -218,20 +218,13 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
 
     inside: list[str] = []
     outside: list[str] = []
-    lag_known = model.amplifier_corner_Hz is not None
     factors = dict.fromkeys(model.sensors.names, 1.0)
     for one in model.effects:
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
-        fits = (
-            name in DESCRIBED_IN
-            and not (name == "actuator_lag" and lag_known)
-            and not (name == "sensor_gain" and isinstance(rig, Halcyonics))
-        )
+        fits = name in DESCRIBED_IN and not (name == "sensor_gain" and isinstance(rig, Halcyonics))
         (inside if own or fits else outside).append(one.label)
-        if name == "actuator_lag":
-            lag_known = True
-        elif name == "actuator_gain":
+        if name == "actuator_gain":
             key = f"actuator.{one.place}"
             changes[key] = changes.get(key, known[key].value) * values["gain"]
         elif name == "sensor_gain":

@@ -26,6 +26,7 @@ from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS
 from avis_ctrl.identification.excited_space import excited_space
 from avis_ctrl.identification.experiment_plan import needed_experiment
 from avis_ctrl.identification.experiments import Drive, campaign_noise
+from avis_ctrl.identification.fit_settings import SETTINGS as FIT
 from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.maximum_likelihood import Prior
@@ -36,6 +37,7 @@ from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Finding
+from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
 from avis_ctrl.study.plausible_fit import far_from_file
@@ -143,7 +145,8 @@ def identify(
         if unplayed:
             progress(unplayed)
         if model.amplifier_corner_Hz:
-            progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz))
+            fits = isinstance(measured, Campaign) and isinstance(rig, AvisTable)
+            progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz, fits))
         progress(
             f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
             + (f"; {split.how}" if split else "")
@@ -219,11 +222,12 @@ def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
     return stated_Hz
 
 
-def amplifier_words(corner_Hz: float, stated_Hz: float | None) -> str:
-    """The corner in words, and whether it was stated."""
-    return f"amplifiers with a first-order lag of {corner_Hz:g} Hz" + (
-        "" if stated_Hz else ", the default for tables with accelerometers; --amplifier-corner sets another corner"
-    )
+def amplifier_words(corner_Hz: float, stated_Hz: float | None, fitted: bool) -> str:
+    """The corner in words, and whether it was stated and is fitted."""
+    found = f"amplifiers with a first-order lag of {corner_Hz:g} Hz"
+    if not stated_Hz:
+        found += ", the default for tables with accelerometers (--amplifier-corner sets another corner)"
+    return found + (f"; their time constant is fitted, with a tolerance of {FIT.lag_percent:g} %" if fitted else "")
 
 
 def start_model(measured: Campaign | FrequencyResponse, rig: Rig, options: IdentifyOptions) -> ResponseModel:

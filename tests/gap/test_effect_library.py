@@ -13,10 +13,13 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import drifted
 from avis_ctrl.gap.motion_estimate import mount_rows
 from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.settings import SETTINGS
 from avis_ctrl.gap.table_model import TableModel, active
+from avis_ctrl.gap.tolerances import has_tolerance, of_values, within_tolerance
 from avis_ctrl.identification.maximum_likelihood import block_residual, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.priors import tolerances_of
+from avis_ctrl.identification.response import AMPLIFIERS, ResponseModel
 from avis_ctrl.identification.spectra import record_block
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Record, RecordHeader
@@ -257,13 +260,43 @@ def test_lag_and_delay_of_held_volts(name, place, value, delay_s, tau):
     np.testing.assert_allclose(np.angle(ratio.reshape(2, -1)[[0, 1], loudest]), phase, atol=1e-3)
 
 
-def test_two_lags_in_series():
+def test_time_constants_of_amplifiers_add_up():
     known = replace(BARE, base=replace(BARE.base, amplifier_corner_Hz=200.0))
     f = np.array([3.0, 30.0])
-    ratio = with_effect("actuator_lag", "actuators", [2e-3], known).response(2 * np.pi * f) / known.response(
-        2 * np.pi * f
-    )
-    np.testing.assert_allclose(ratio[:, 1, 1], 1 / (1 + 2j * np.pi * f * 2e-3), rtol=2e-3)
+    slow = with_effect("actuator_lag", "actuators", [2e-3], known)
+    ratio = slow.response(2 * np.pi * f) / known.response(2 * np.pi * f)
+    total = 2e-3 + 1 / (2 * np.pi * 200)
+    np.testing.assert_allclose(ratio[:, 1, 1], (1 + 1j * f / 200) / (1 + 2j * np.pi * f * total), rtol=2e-3)
+    one = slow.effects[0]
+    told = one.effect.reported(slow, one.place, one.by_name, np.array([[1e-10]]))
+    assert told["time_constant_s"].value == pytest.approx(total)
+    assert told["corner_Hz"].value == pytest.approx(1 / (2 * np.pi * total))
+
+
+def test_derivative_by_the_time_constant_of_amplifiers_with_an_added_lag(rng):
+    base = replace(BARE.base, amplifier_corner_Hz=200.0, names=("mass", AMPLIFIERS))
+    model = with_effect("actuator_lag", "actuators", [1.2e-3], TableModel(base))
+    omega = 2 * np.pi * np.array([3.0, 30.0, 90.0])
+    U = rng.normal(size=(3, len(model.inputs), 1)) + 0j
+    step = 1e-8
+    ends = [model.at(model.values + np.array([0, sign * step, 0])).driven(omega, U, False).Y for sign in (1, -1)]
+    slope = (ends[0] - ends[1]) / (2 * step)
+    found = model.driven(omega, U).dY
+    np.testing.assert_allclose(found[1], slope, atol=1e-5 * np.abs(slope).max())
+    np.testing.assert_allclose(found[2], slope, atol=1e-5 * np.abs(slope).max())  # the two time constants add up
+
+
+def test_a_lag_is_a_value_with_a_tolerance_only_if_the_model_has_one():
+    known = replace(BARE, base=replace(BARE.base, amplifier_corner_Hz=300.0))
+    effects, stated = list(library().values()), tolerances_of(RIG)
+    assert "actuator_lag" in {one.name for one in of_values(effects, known)}
+    assert "actuator_lag" not in {one.name for one in of_values(effects, BARE)}
+    expected = 1 / (2 * np.pi * 300.0)
+    for corner, within in ((1e9, True), (160.0, True), (140.0, False)):
+        difference = 1 / (2 * np.pi * corner) - expected
+        lag = active(library()["actuator_lag"], known, "actuators", [difference])
+        assert has_tolerance(lag, stated) and within_tolerance(lag, stated, SETTINGS) == within
+    assert not has_tolerance(active(library()["actuator_lag"], BARE, "actuators", [1e-3]), stated)
 
 
 # --- amplitude and time

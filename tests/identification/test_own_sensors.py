@@ -35,6 +35,7 @@ def model_of(name, *parameters):
         f"actuator.{rig.all_drives[0].name}",
         f"sensor.{first}",
         f"sensor.{last}",
+        "amplifier_time_constant_s",
         *parameters,
     )
     return ResponseModel.of(rig, free, amplifier_corner_Hz=300.0)

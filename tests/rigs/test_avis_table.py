@@ -1,12 +1,16 @@
 """The linear AVIS against Newton's laws recomputed from positions (Rademakers, eqs. 2.8-2.21)."""
 
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
+from avis_ctrl.rigs.rig_file import rig_from
+from avis_ctrl.rigs.rig_writer import rig_toml
 
 PX, PY, PZ = 0.475, 0.375, 0.175  # Table 3.1
 PLACES = [(-PX, -PY, -PZ), (PX, -PY, -PZ), (PX, PY, -PZ), (-PX, PY, -PZ)]
@@ -143,6 +147,24 @@ def test_geophones_see_along_their_axes_at_their_isolators(rig):
 def test_points_for_the_drawing(rig):
     kinds = {name: place.kind for name, place in rig.points().items()}
     assert kinds["isolator3"] == "isolator" and kinds["Az4"] == "actuator" and kinds["Sx2"] == "sensor"
+
+
+def test_a_direction_turns_past_the_point_where_another_component_is_the_largest():
+    """A leg at about 45 degrees: which component follows from the other two must not change during a fit."""
+    rig = load_rig(Path(__file__).parents[2] / "designs" / "rigs" / "skewed.toml")
+    leg = "direction.L5."
+    assert {name for name in rig.parameters() if name.startswith(leg)} == {leg + "x", leg + "y"}
+    turned = rig.with_parameters({leg + "x": 0.75, leg + "y": -0.1})
+    assert turned.parameters().keys() == rig.parameters().keys()
+    back = turned.with_parameters({leg + "x": 0.6964, leg + "y": -0.1228})
+    force = np.array([drive.direction for drive in back.all_drives])
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(force, [drive.direction for drive in rig.all_drives], atol=1e-4)
+    assert turned.all_drives[4].direction[2] == pytest.approx(np.sqrt(1 - 0.75**2 - 0.1**2))
+    # The file has the direction only; a model file names the two components that were free.
+    read = rig_from(tomllib.loads(rig_toml(turned)))
+    assert leg + "z" in read.parameters()
+    assert read.with_directions_by(turned.parameters()).parameters().keys() == rig.parameters().keys()
 
 
 @pytest.mark.parametrize("apart", [False, True])

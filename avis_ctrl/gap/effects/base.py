@@ -64,12 +64,16 @@ Values = Mapping[str, float]
 class Table(Protocol):
     """What an effect uses of the table that it acts on: the model without the effect (`gap.table_model.TableModel`).
 
-    base : the rig and its free parameters. effective : the same, with the rig parameters as other effects set them.
+    base : the rig and its free parameters. nominal : the same as in the rig file, None for the base itself.
+    effective : the base with the rig parameters as other effects set them.
     motion : records in time, by name.
     """
 
     @property
     def base(self) -> ResponseModel: ...
+
+    @property
+    def nominal(self) -> ResponseModel | None: ...
 
     @property
     def effective(self) -> ResponseModel: ...
@@ -88,6 +92,9 @@ class Table(Protocol):
 
     @property
     def delay_s(self) -> float: ...
+
+    @property
+    def amplifier_corner_Hz(self) -> float | None: ...
 
 
 @dataclass(frozen=True)

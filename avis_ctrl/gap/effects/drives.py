@@ -7,6 +7,7 @@ import numpy as np
 from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Reported, Table, Values, register, shares, uneven
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.identification.response import ResponseModel
 
 
 @register
@@ -30,7 +31,7 @@ class ActuatorGain(Effect):
 @register
 class ActuatorLag(Effect):
     """First-order lag 1/(1 + s tau) of every amplifier, corner 1/(2 pi tau): one tau for all, or different ones about
-    their mean.
+    their mean. If the model already has a lag, tau is the difference from its time constant.
 
     Aliased components pass the mean corner. With corners that differ by a factor of two, the error is 0.1 % of the
     response at a tenth of the sample rate, and 1 % at a fifth.
@@ -41,26 +42,32 @@ class ActuatorLag(Effect):
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
     at = ("actuators", "actuators/each")
 
+    def places(self, model: Table) -> tuple[str, ...]:
+        return self.at if model.amplifier_corner_Hz is None else self.at[:1]
+
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         own = uneven(model.actuators[:-1], "that of drive {} over the mean, less one") if "/" in place else ()
-        return (EffectParameter("time_constant_s", "s", "time constant of the amplifiers", 0.0, 0.0, 0.3, 1e-3), *own)
+        known = expected_lag(model.nominal or model.base)
+        words = "time constant of the amplifiers" + (f" beyond the expected {1e3 * known:.3g} ms" if known else "")
+        return (EffectParameter("time_constant_s", "s", words, 0.0, -known, 0.3, 1e-3), *own)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        tau, each = values["time_constant_s"], time_constants(values)
-        if tau <= 1e-9:
-            return
-        common: np.ndarray | float = 1.0
-        if ops.amplifier_corner_Hz is None:  # otherwise in series with the lag that the model already has
-            ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau)
-            common = 1 + ops.s[:, None] * tau
-        ops.drive = ops.drive * common / (1 + ops.s[:, None] * each)
+        tau, each = values["time_constant_s"] + expected_lag(ops.base), time_constants(values)
+        ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau) if tau > 1e-9 else None
+        if len(each) > 1:
+            ops.drive = ops.drive * (1 + ops.s[:, None] * tau) / (1 + ops.s[:, None] * each)
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        tau, std = values["time_constant_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
-        found = super().reported(model, place, values, covariance)
+        tau, std = values["time_constant_s"] + expected_lag(model.base), float(np.sqrt(max(covariance[0, 0], 0.0)))
+        found = super().reported(model, place, values, covariance) | {"time_constant_s": Reported(tau, std, "s")}
         if tau <= 1e-9:  # at its bound there is no corner
             return found
         return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau**2), "Hz"), **found}
+
+
+def expected_lag(model: ResponseModel) -> float:
+    """Time constant [s] of the amplifiers of a model without effects."""
+    return 1 / (2 * np.pi * model.amplifier_corner_Hz) if model.amplifier_corner_Hz else 0.0
 
 
 def time_constants(values: Values) -> np.ndarray:
