@@ -83,7 +83,7 @@ class StopRequest:
         signal.signal(signal.SIGINT, self.usual)
         self.say(
             "Ctrl-C: after this iteration the design continues with the best controller so far; "
-            "again Ctrl-C to end without results"
+            "press Ctrl-C again to end without results"
         )
 
     def __exit__(self, *error: object) -> None:

@@ -17,15 +17,15 @@ MEASUREMENT: a record; for a seismometer a folder with one CSV per frequency; fo
 --columns ROLE=NAME,..: drive: force, position, reference; oscillator: u, y; seismometer: drive, coil and/or
     displacement; each also t; by name, or in CSV by number from 1; levels: none
 --scale ROLE=FACTOR,..: factors to SI units
---band LOW HIGH: Hz, of what is fitted; around one mode of a structure
---cutoff HZ: low-pass of the motion of which a drive's friction is formed; the fit itself runs as far up as force and
-    motion are coherent
---output KIND: what the column of y or position holds: position, velocity or acceleration
---range START END: s, part of each record
+--band LOW HIGH: fitted band [Hz]; for levels, a band around one mode
+--cutoff HZ: cutoff of the low-pass filter for the motion from which a drive's friction is computed; by default the
+    upper end of the fitted band. Without --band, this band ends where force and motion are no longer coherent
+--output KIND: quantity in the column y or position: position, velocity or acceleration
+--range START END: use only this part of each record [s]
 --resample HZ: new sample rate
---also RECORD: another record of the same axis; of several, whole ones are held out
+--also RECORD: another record of the same axis (repeatable); with several records, whole records are held out
 --out DIR: folder for gap.json, reports and the model that avis predict reads
---seed: has no influence any more
+--seed: ignored; accepted for older scripts
 """)
 
 

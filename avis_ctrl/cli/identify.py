@@ -129,7 +129,8 @@ def predict(
     out: Annotated[Path, PREDICT("--out")],
     effects: Annotated[Path | None, PREDICT("--effects")] = None,
 ) -> None:
-    """Predict the sensor signals of another campaign from its voltages and floor motion, and compare them with its y.
+    """Predict the sensor signals of another campaign from its voltages and floor motion, and compare them with the
+    measured ones.
 
     Writes /records/NN/y for an identified rig, or /records/NN/y_baseline and /records/NN/y_updated for the models of
     avis gap.

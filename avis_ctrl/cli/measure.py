@@ -23,7 +23,7 @@ EXCITE = Options("""
 --out FILE: signals.h5, .csv or .mat
 --kind: multisine or noise
 --band LOW HIGH: Hz
---period: period of a multisine, of noise its length, s
+--period: period of a multisine, or length of a noise record [s]
 --periods: number of periods of a multisine; the first one contains the transient
 --rms: r.m.s. voltage of each drive [V]; by default half of the largest level at which neither the drives nor the
     converter clip, computed for the rig file
@@ -90,7 +90,8 @@ SIMULATE_CAMPAIGN = Options("""
 --plan PLAN.toml: records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor
 --write-plan FILE: also write the plan used, as a starting point
 --truth FILE: also write the rig that was simulated, with its perturbed values
---perturbed: default plan with stiffness, mass and inertia up to 5 % off, damping up to 20 %
+--perturbed: default plan; stiffness, mass and inertia differ from the rig file by up to 5 %, damping by up to 20 %, and
+    values listed under [tolerances] within their standard deviations
 --orthogonal: default plan with orthogonal multisines
 --duration: length of each record of the default plan in seconds
 --effects FILE.py: Python file with effects of your own that the plan names (docs/own_effect.md)
@@ -158,7 +159,7 @@ def simulate_campaign(
 
 CONVERT = Options("""
 MEASUREMENT: HDF5, .mat, UFF 58, CSV or a folder of CSV
-CAMPAIGN.h5: file to write; the same as --out
+CAMPAIGN.h5: file to write (or give --out)
 --out CAMPAIGN.h5: file to write
 --columns ROLE=NAME,..: which variable is what, such as u=vir,y=qm,t=t; names of the channels: y_names=Sy1+Sz1
 --rig: name of the rig, if the file has none
@@ -186,7 +187,7 @@ def convert(
     if target is None:
         raise InputError("missing; expected the file to write", field="--out")
     if file is not None and out is not None:
-        raise InputError(f"expected one file to write; {file} is named, too", field="--out", value=str(out))
+        raise InputError(f"give the output file once; {file} and --out were both given", field="--out", value=str(out))
     require_output(target, source)
     terminal = Terminal()
     measured = read_measurements(

@@ -42,7 +42,7 @@ def sweep(
     from avis_ctrl.sweep.run import POINTS, plan_sweep, run_sweep
 
     if sum(one is not None for one in (scheduler, workers, jobs)) > 1:
-        raise InputError("expected one of --scheduler, --workers and --jobs at most", field="options")
+        raise InputError("give at most one of --scheduler, --workers and --jobs", field="options")
     if scheduler is not None or workers is not None:
         require_distributed()
         backend = partial(on_cluster, address=scheduler, workers=workers or 0)

@@ -49,8 +49,8 @@ def with_std(value: float, std: float) -> tuple[str, str]:
 
 
 def bound(value: float, digits: int = 3) -> str:
-    """A bound of mu or of a gain; infinite if the set contains an unstable plant."""
-    return "unstable" if np.isinf(value) else number(value, digits)
+    """A bound of mu or of a gain; it is infinite if stability is not proved."""
+    return "no bound" if np.isinf(value) else number(value, digits)
 
 
 def percent(share: float, digits: int = 3) -> str:
@@ -65,7 +65,7 @@ def decibel(gain: float) -> str:
     if np.isnan(gain):
         return "not computed"
     if np.isinf(gain):
-        return "unstable"
+        return "no bound"
     return f"{20 * np.log10(gain):+.1f} dB".replace("-", "−") if gain > 0 else "none"
 
 
@@ -74,7 +74,7 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     if unit == "plants":
         return f"{value:.0f} plants"
     if unit == "dB" and not np.isnan(value):
-        return "unstable" if np.isposinf(value) else f"{value:+.1f} dB".replace("-", "−")
+        return "no bound" if np.isposinf(value) else f"{value:+.1f} dB".replace("-", "−")
     return f"{bound(value, digits)} {unit}".strip()
 
 

@@ -50,7 +50,7 @@ def test_number_keeps_three_digits(value: float) -> None:
 
 
 def test_what_is_not_finite_is_said_in_words() -> None:
-    assert words.decibel(np.inf) == words.bound(np.inf) == words.quantity(np.inf, "dB") == "unstable"
+    assert words.decibel(np.inf) == words.bound(np.inf) == words.quantity(np.inf, "dB") == "no bound"
     assert words.number(np.nan) == "not computed"
     assert words.decibel(0.5) == "−6.0 dB" and words.decibel(2.0) == "+6.0 dB"
     assert np.isnan(in_dB([0.0, np.inf, np.nan])).all()

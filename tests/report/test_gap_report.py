@@ -388,7 +388,7 @@ def test_controller_only_where_there_is_one(found):
     assert part.pieces[0] == Paragraph(found.design.sentences[0])
     rows = tables(part)[0].rows
     assert [row[4] for row in rows] == [Mark("0.950", True), Mark("1.32", False), Mark("0.970", True)]
-    assert [row[7] for row in rows] == ["+5.2 dB", "unstable", "+5.4 dB"]
+    assert [row[7] for row in rows] == ["+5.2 dB", "no bound", "+5.4 dB"]
     lost = replace(
         found.design.before,
         stable=False,
@@ -396,10 +396,10 @@ def test_controller_only_where_there_is_one(found):
     )
     part = section(replace(found, design=replace(found.design, before=lost, after=None, new=None)), "controller")
     assert tables(part)[0].rows == (
-        ("previous", "re-identified", Mark("no", False), Mark("yes", True), Mark("unstable", False), *["unstable"] * 4),
+        ("previous", "re-identified", Mark("no", False), Mark("yes", True), Mark("no bound", False), *["no bound"] * 4),
     )
     drawn = figures(part)["gap_mu"]
-    assert "not stable" in drawn.caption and svg(drawn).startswith("<?xml")
+    assert "not proved" in drawn.caption and svg(drawn).startswith("<?xml")
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

@@ -34,7 +34,7 @@ def _table(caption: str, some: list[Considered]) -> Table:
         {
             "candidate": wording.candidate,
             "chi-square / dof": lambda one: words.number(one.chi2_per_dof, 4),
-            "odds": lambda one: wording.probability(one.probability),
+            "probability": lambda one: wording.probability(one.probability),
             "best size": lambda one: wording.quantities(one.parameters, MOST) or "not stated",
             "why it was not named": lambda one: one.reason,
         },

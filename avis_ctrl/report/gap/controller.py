@@ -24,15 +24,15 @@ def controller(found: GapFinding) -> Section | None:
     judged = listed(
         "An upper bound of mu below 1 guarantees the specified performance for every table of the design's "
         "uncertainty set. Decibels are those of the largest singular value from floor to payload. Worst cases are "
-        'upper bounds over the whole set; "unstable" means that the controller is not proved to stabilise every '
-        "table of the set. Six: the nominal loop with all six coordinates, where the coordinates outside the "
+        'upper bounds over the whole set; "no bound" means that the controller is not proved to stabilise every '
+        "table of the set. All axes: the nominal loop with all six coordinates, where the coordinates outside the "
         "design are not controlled.",
         loops(effect),
         {
             "controller": lambda loop: loop.controller,
             "on model": lambda loop: loop.model,
             "stable": lambda loop: yes_or_no(loop.figures.stable),
-            "stable in six": lambda loop: yes_or_no(loop.figures.stable_in_six),
+            "stable, all axes": lambda loop: yes_or_no(loop.figures.stable_in_six),
             "mu, upper bound": lambda loop: Mark(words.bound(loop.figures.mu_upper), bool(loop.figures.mu_upper < 1)),
             "mu, lower bound": lambda loop: words.bound(loop.figures.mu_lower),
             "peak": lambda loop: words.quantity(loop.figures.peak_dB, "dB"),
@@ -68,7 +68,11 @@ def _bounds(effect: DesignEffect) -> Figure:
     drawn = loops(effect)
     mu = np.array([one.figures.mu_upper for one in drawn])
     place, axis = places([f"{one.controller} on\n{one.model}" for one in drawn])
-    lost = " A loop without a bar is not stable." if not np.isfinite(mu).all() else ""
+    lost = (
+        " A loop without a bar has no finite bound: its stability is not proved for the whole set."
+        if not np.isfinite(mu).all()
+        else ""
+    )
     top = 1.15 * max(1.0, float(np.max(mu[np.isfinite(mu)], initial=0.0)))
     drawn_mu = bars(place, mu, "upper bound of mu", Style("#8fbbdc"), 0.5)
     return Figure(

@@ -23,7 +23,12 @@ def parameters(found: GapFinding) -> Section:
     if gap.effects or gap.traces:
         pieces += [_sizes(gap), Bullets(tuple(_as_text(one) for one in (*gap.effects, *gap.traces)))]
     else:
-        pieces.append(Paragraph("No effect is named: the updated model is the rig within its tolerances."))
+        pieces.append(
+            Paragraph(
+                "No effect is named: the updated model is the re-identified rig, with its values fitted under their "
+                "tolerances."
+            )
+        )
     if len(gap.baseline.values):
         both = " and updated" if gap.effects else ""
         groups = inseparable_parameters(gap.baseline)
@@ -43,9 +48,9 @@ def _sizes(gap: Gap) -> Table:
             spread = f"± {sigma}" if np.isfinite(p.std) and p.std > 0 else "none"
             rows.append((one.name, one.location, name, value, spread, "" if p.unit == "1" else words.unit(p.unit)))
     return table(
-        "Parameters of the named effects. Those of the table are fitted together with all parameters of the "
-        "rig and all tolerances. Their standard deviation includes the noise and what no effect explains. "
-        "Those of hum, converters and floor are from the records themselves.",
+        "Parameters of the named effects. Those of mechanical and drive effects are fitted together with all "
+        "parameters of the rig and all tolerances; their standard deviation includes the noise and what no effect "
+        "explains. Those of hum, converters and floor motion are estimated from the records directly.",
         ("effect", "place", "parameter", "value", "± 1 σ", "unit"),
         rows,
         "lllrrl",

@@ -27,15 +27,16 @@ log evidence is minus half the sum of squares, less half the log determinants
 
 Search. A score test with priors predicts, to first order, by how much each effect at each place would reduce J. The
 best candidates of each kind of effect are fitted together with all parameters and tolerances. The candidate with the
-largest evidence is accepted if its gain over the current model exceeds what the number of candidates explains. The
+largest evidence is accepted if it raises the log evidence by more than 3.9 plus the logarithm of the number of
+candidates. The
 search continues with this effect in the model, until an effect explains less than 1 % of the gap.
 
-Names. An effect that was found is named if it is more probable than not, if its parameters from the lower and the upper
-half of the band, and from low and high levels, agree with the whole, if its values are physically possible, and if the
-held-out records are more likely with it. Its probability is relative to all that was fitted in its place, including
-faults that are not in the library. Two kinds of odds are computed, from the evidence and from how evenly the difference
-d_g of the log-likelihoods is spread over bands and levels g. The less certain odds are used, because real elements do
-not follow textbook laws exactly:
+Names. An effect that was found is named if it is more probable than not, if its parameters from the lower and the
+upper half of the band, and from low and high levels, agree with the whole, if its values are physically possible, and
+if the held-out records have a higher likelihood with it. Its probability is relative to all that was fitted in its
+place, including faults that are not in the library. Two kinds of odds are computed, from the evidence and from how
+evenly the difference d_g of the log-likelihoods is spread over bands and levels g. The less certain odds are used,
+because real elements do not follow textbook laws exactly:
 
 $ z = sum_g d_g slash (sum_g (d_g - overline(d))^2)^(1 slash 2), quad P = Phi(z) $
 z is the sum of the differences over their spread; the probability is the normal distribution of z

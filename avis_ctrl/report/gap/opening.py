@@ -16,9 +16,9 @@ from avis_ctrl.study.gap import GapFinding
 # Maximum number of an effect's parameters in a row; the section on parameters lists all.
 MOST = 5
 CHANCES = (
-    " The probability takes into account the other candidates, the tolerances, and causes outside the library; "
-    "for hum, a converter and floor motion it is one minus the p-value of the signal. No probability above 99 % "
-    "is stated."
+    " The probability is relative to the candidates fitted in its place, including some faults outside the library; "
+    "it is at most 99 %. For hum, a converter and floor motion it is a confidence level: one minus the p-value of "
+    "the test that the signal is absent."
 )
 
 
@@ -89,8 +89,8 @@ def _reference(gap: Gap) -> float:
 def _group(one: NamedEffect) -> str:
     names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
     return (
-        f"These records cannot distinguish {words.joined(names)}. The missing effect is one of them; the section "
-        "on what to measure next names the record that would decide."
+        f"These records cannot distinguish {words.joined(names)}. Any of them may be the cause, and so may a "
+        "cause that was not among the candidates. See the section on what to measure next."
     )
 
 

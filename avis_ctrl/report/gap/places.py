@@ -80,7 +80,8 @@ def table_of(places: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
     return listed(
         f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
-        "noise power. p-value: probability of such a residual by noise alone, family-wise over all places.",
+        "noise power. p-value: probability of such a residual by noise alone, corrected for the number of "
+        "places tested (family-wise).",
         places,
         {
             "place": wording.place,

@@ -15,24 +15,25 @@ from avis_ctrl.uncertain_value import with_prefix
 
 # What each verdict claims, and what it does not.
 CLAIMS = {
-    "none": "Verdict: none. With its own parameters re-identified and every value of the rig file within its "
-    "tolerance, the residual is noise, or less than 1 % of the response, and no effect is named. An effect "
+    "none": "Verdict: none. The parameters of the rig were re-identified, and the other values of the rig file were "
+    "fitted with their tolerances as standard deviations. The residual is noise, or less than 1 % of the "
+    "response, and no effect is named. An effect "
     "can still be present if it is too weak for this campaign, if these records do not excite it, or if "
     "the parameters of the rig can imitate it.",
     "explained": "Verdict: explained. On held-out records the re-identified model has a residual beyond noise. "
     "Tolerances and the effects named above remove at least 90 % of its power, or the rest is noise.",
-    "partly explained": "Verdict: partly explained. The effects named above meet all conditions for a name. Together "
-    "with the tolerances they remove less than 90 % of the power that the residual of the "
+    "partly explained": "Verdict: partly explained. The effects named above meet all conditions for being named. "
+    "Together with the tolerances they remove less than 90 % of the power that the residual of the "
     "re-identified model has beyond noise. The rest is described below. The updated model is "
     "better, not complete.",
     "unexplained": "Verdict: unexplained. Model and held-out records disagree. Neither the tolerances nor any effect "
-    "of the library that meets all conditions for a name explains the difference. The updated model has "
+    "of the library that meets all conditions for being named explains the difference. The updated model has "
     "tolerances only.",
 }
 # The claim if only the increased noise of some sensors is unexplained.
 RAISED = (
-    "Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and the library has no "
-    "name for that. As a whole, the residual of the model{with_effects} on the held-out data is the measured "
+    "Verdict: {verdict}. The noise of {sensors} is above the rig file's ambient level, and no effect of the "
+    "library describes this. As a whole, the residual of the model{with_effects} on the held-out data is the measured "
     "noise."
 )
 

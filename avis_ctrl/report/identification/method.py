@@ -36,8 +36,8 @@ relative parameters from several starts, with analytic derivatives. The noise co
 records and then from the residuals.
 """
 TOLERANCES = """
-Tolerances. Every value of the rig file that has a tolerance (places, directions, gains, corners and damping ratios of
-geophones, centre of mass, products of inertia) is fitted beside the parameters, with its tolerance as the standard
+Tolerances. Every value of the rig file that has a tolerance (positions, directions, gains, corners and damping ratios
+of geophones, centre of mass, products of inertia) is fitted beside the parameters, with its tolerance as the standard
 deviation of a normal prior. The residual is weighted by noise, by a relative error of each path from an input to a
 sensor that is constant over a third of an octave, and by distortion; the variances of the last two are estimated from
 the residual in turn with the fit. The information on the parameters alone is the Schur complement of H with respect to

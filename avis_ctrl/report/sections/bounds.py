@@ -25,7 +25,8 @@ def bounds(result: DesignResult) -> Section:
             lambda c: c.mu,
             "mu, performance",
             "mu of the weighted performance",
-            "If it is below 1 (dashed line) at all frequencies, every plant of the uncertainty set meets every bound.",
+            "If it is below 1 (dashed line) at all frequencies, every plant of the uncertainty set meets every "
+            "weighted requirement.",
         ),
         _figure(
             "mu_stability",
@@ -33,8 +34,8 @@ def bounds(result: DesignResult) -> Section:
             lambda c: c.stability,
             "mu, stability",
             "mu of the uncertainty alone",
-            "Below 1 the loop is stable for every plant of the set; the whole set may grow at least by the inverse of "
-            "the peak of the upper bound.",
+            "Below 1 the loop is stable for every plant of the set. The inverse of the peak of the upper bound is a "
+            "guaranteed factor by which the uncertainty may grow.",
         ),
     ]
     pieces += [_stability(result), _worst(result)]
@@ -61,7 +62,7 @@ def certificate(result: DesignResult) -> Paragraph:
         f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
         f"{words.bound(mu.upper, digits_apart(mu.upper, 1.0, 4))}, at {words.hertz(mu.omega)}"
         + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
-        + f". If mu is below 1, every plant of the uncertainty set meets every bound. {between}{reached}"
+        + f". If mu is below 1, every plant of the uncertainty set meets every weighted requirement. {between}{reached}"
     )
 
 

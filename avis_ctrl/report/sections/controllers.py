@@ -61,9 +61,9 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
             "order": lambda c: str(c.order),
             "fastest pole": lambda c: f"{words.number(c.fastest_pole_Hz)} Hz",
             "relative to half the rate": lambda c: words.number(2 * c.fastest_pole_Hz / rate),
-            "stable itself": lambda c: words.yes(_system(c).is_stable()),
+            "stable by itself": lambda c: words.yes(_system(c).is_stable()),
             "gain at rest": lambda c: f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
-            "offset needs": lambda c: _offset(c.rest.percent) if c.rest else "",
+            "range used by offset": lambda c: _offset(c.rest.percent) if c.rest else "",
         },
         "llrrrcrr",
     )

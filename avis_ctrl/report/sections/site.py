@@ -20,7 +20,9 @@ def site(result: DesignResult) -> Section:
         f"({floor.source}); sensor noise is added. Nominal plant, linear model."
     )
     return Section(
-        "On the site", "site", (text, _third_octaves(result), _motion(result), _volts(result), _compliance(result))
+        "Motion at the site",
+        "site",
+        (text, _third_octaves(result), _motion(result), _volts(result), _compliance(result)),
     )
 
 
@@ -72,7 +74,7 @@ def _volts(result: DesignResult) -> Table:
     limits = dict(zip(names, result.rig.limits_of(names).tolist(), strict=True))
     both = [(c, c.site.volts_rms, c.site.volts_peak) for c in controlled]
     return table(
-        "Voltages on the site by channel, r.m.s. / peak [V]. The peak is the level that a Gaussian signal "
+        "Voltages at the site by channel, r.m.s. / peak [V]. The peak is the level that a Gaussian signal "
         f"exceeds once in ten minutes; the limit is {words.limits(limits)}.",
         ("controller", *names),
         [(c.title, *(f"{words.number(rms[n])} / {words.number(peak[n])}" for n in rms)) for c, rms, peak in both],

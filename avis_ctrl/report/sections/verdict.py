@@ -55,7 +55,11 @@ def _asked(result: DesignResult) -> Paragraph:
         f"{result.rig.name}. It must stabilise {members}. The weight of the synthesis demands a transmissibility "
         f"of at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and of at most "
         f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
-        + (" The table lists the requirements of the design file:" if result.requirements else "")
+        + (
+            " The table lists the requirements: those of the design file, and those that every design must meet."
+            if result.requirements
+            else ""
+        )
     )
 
 
@@ -111,7 +115,7 @@ def comparison(result: DesignResult) -> Section:
     controllers = sorted(result.controllers, key=lambda c: c.name != "mu")
     compared = table(
         "All controllers, evaluated in the same way on the same plants. Worst cases are upper bounds over the "
-        'whole uncertainty set; "unstable" means that the controller is not proved to stabilise every plant of '
+        'whole uncertainty set; "no bound" means that the controller is not proved to stabilise every plant of '
         f"the set. The floor itself meets {controllers[0].site.floor_rating or 'no criterion'}.",
         ("", *(c.title for c in controllers)),
         [(name, *(value(c) for c in controllers)) for name, value in rows],
