@@ -243,7 +243,7 @@ def test_the_first_interrupt_asks_and_the_second_ends():
         with StopRequest(said.append) as asked:
             assert not asked()
             os.kill(os.getpid(), signal.SIGINT)
-            assert asked() and len(said) == 1 and "again Ctrl-C" in said[0]
+            assert asked() and len(said) == 1 and "Ctrl-C again" in said[0]
             with pytest.raises(KeyboardInterrupt):
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(1)
