@@ -120,9 +120,8 @@ class TableResponse(DrivenTable):
         dY = operands.derivative(model.names, d, more)
         if AMPLIFIERS in model.names and self.is_driven and ops.amplifier_corner_Hz is not None:
             # The effect actuator_lag adds to the time constant.
-            slope, folded = replace(model, amplifier_corner_Hz=ops.amplifier_corner_Hz).drive_slopes(
-                ops.omega, AMPLIFIERS
-            )
+            driven = replace(model, delay_s=ops.delay_s, amplifier_corner_Hz=ops.amplifier_corner_Hz)
+            slope, folded = driven.drive_slopes(ops.omega, AMPLIFIERS)
             mat = model.matrices
             dY[model.names.index(AMPLIFIERS)] = per_force @ (made.T @ (slope * self.folded)) + self.gain * folded * (
                 mat.R @ np.linalg.inv(mat.M) @ mat.T @ self.folded

@@ -14,7 +14,7 @@ from avis_ctrl.gap.effects.payload import PRODUCTS
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.likelihood import Fitted
-from avis_ctrl.identification.priors import Priors, Tolerance, re_identified
+from avis_ctrl.identification.priors import Priors, Tolerance, lag_tolerance, re_identified
 from avis_ctrl.identification.response import AMPLIFIERS
 from avis_ctrl.rigs.instruments import Tolerances
 
@@ -31,8 +31,8 @@ BEYOND: Mapping[str, tuple[Stated, tuple[str, ...]]] = {
         lambda t, p: (t.sensor_corner_percent / 100 * p[0].none, t.sensor_damping_percent / 100 * p[1].none),
         ("corner.{place}", "damping.{place}"),
     ),
-    # The lower limit is the difference between no lag and the expected one.
-    "actuator_lag": (lambda t, p: (SETTINGS.lag_percent / 100 * -p[0].low,), (AMPLIFIERS,)),
+    # The lower limit is the difference between no lag and the expected one; zero if none is expected.
+    "actuator_lag": (lambda t, p: (lag_tolerance(-p[0].low) if p[0].low else 0.0,) * len(p), (AMPLIFIERS,)),
 }
 
 

@@ -17,6 +17,8 @@ class FitSettings:
         (Levenberg-Marquardt damping, as a prior).
     lag_percent : standard deviation of the amplifiers' time constant [%], which no rig file states: amplifiers without
         a lag are within three standard deviations, and a lag of more than twice the expected one is beyond them.
+    least_lag_s : minimum of that standard deviation [s]: lines, filters and converters lag by as much, even if the
+        amplifiers do not.
     shortest_lag : time constant below which amplifiers have no lag, relative to the expected one [1].
     lines : spectral lines per record that are fitted; with 8 drives and 6 sensors the response needs about 100, and
         twice as many give a precise estimate of the unexplained part.
@@ -54,6 +56,7 @@ class FitSettings:
     damping_percent: float = 20.0
     unknown_percent: float = 10.0
     lag_percent: float = 35.0
+    least_lag_s: float = 1e-4
     shortest_lag: float = 1e-3
     lines: int = 200
     residual_lines: int = 800

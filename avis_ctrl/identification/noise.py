@@ -52,7 +52,8 @@ def noise_from_residuals(
 ) -> list[SpectralBlock]:
     """Blocks with the covariance of a model's residuals near their lines, averaged over records of a kind.
 
-    The window grows until the covariance has LEAST_DOF degrees of freedom, and three for each output.
+    At each line the window grows until the covariance has LEAST_DOF degrees of freedom, and three for each output:
+    thinned records have few lines far from resonances.
 
     Raises
     ------
@@ -66,8 +67,9 @@ def noise_from_residuals(
             raise InputError(f"expected residuals of its kind, {kind}", field=f"block {own[0].name}")
         shape = _shape(pool, model)
         flat = [_outer(np.linalg.solve(shape.factor(one.block.omega, model), one.error)) for one in pool]
-        half = max(HALF_Hz * 2 * np.pi, max(LEAST_DOF, 3 * own[0].Y.shape[1]) / _density(pool) / 2)
+        least = max(LEAST_DOF, 3 * own[0].Y.shape[1])
         for block in own:
+            half = np.maximum(HALF_Hz * 2 * np.pi, _reach(pool, block.omega, least))
             total, count = _window_sums(pool, flat, block.omega, half)
             A = shape.factor(block.omega, model)
             noise = A @ (total / np.maximum(count, 1)[:, None, None]) @ _adjoint(A)
@@ -105,7 +107,8 @@ def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
     G = [_floor_response(model, one.block.omega) for one in pool]
     R = [_outer(one.error) for one in pool]
     m = [one.error.shape[2] for one in pool]
-    total, count = _window_sums(pool, R, grid, half)
+    reach = np.maximum(half, _reach(pool, grid, SHAPE_LINES))
+    total, count = _window_sums(pool, R, grid, reach)
     mean = _lifted(total / np.maximum(count, 1)[:, None, None])
     # The quietest directions contain no floor motion; the excess of the others is the floor's, equal on three axes.
     quiet = np.linalg.eigvalsh(mean)[:, 0]
@@ -114,8 +117,8 @@ def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
     shape = _Shape(grid, loud[:, None, None] * np.eye(3, dtype=complex), np.repeat(quiet[:, None], mean.shape[1], 1))
     for _ in range(ROUNDS):
         parts = [_expected(g, r, k, *shape.at(one.block.omega)) for g, r, k, one in zip(G, R, m, pool, strict=True)]
-        S, count = _window_sums(pool, [part[0] for part in parts], grid, half)
-        d, _ = _window_sums(pool, [part[1] for part in parts], grid, half)
+        S, count = _window_sums(pool, [part[0] for part in parts], grid, reach)
+        d, _ = _window_sums(pool, [part[1] for part in parts], grid, reach)
         shape = _Shape(grid, S / count[:, None, None], np.maximum(d / count[:, None], 1e-9 * quiet[:, None]))
     return shape
 
@@ -158,8 +161,17 @@ def _density(pool: Sequence[Residual]) -> float:
     )
 
 
+def _reach(pool: Sequence[Residual], omega: np.ndarray, least: int) -> np.ndarray:
+    """(n,) half width [rad/s] of the smallest window about each omega with `least` lines of the pool, or with all."""
+    lines = np.sort(np.concatenate([np.repeat(one.block.omega, one.error.shape[2]) for one in pool]))
+    least = min(least, len(lines))
+    first = np.clip(np.searchsorted(lines, omega)[:, None] - np.arange(least + 1), 0, len(lines) - least)
+    ends = np.maximum(omega[:, None] - lines[first], lines[first + least - 1] - omega[:, None])
+    return np.asarray(ends.min(axis=1))
+
+
 def _window_sums(
-    pool: Sequence[Residual], values: Sequence[np.ndarray], omega: np.ndarray, half: float
+    pool: Sequence[Residual], values: Sequence[np.ndarray], omega: np.ndarray, half: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums of values (one array per record, by line) within half of each omega, at least one line; and their
     numbers."""
@@ -168,7 +180,7 @@ def _window_sums(
         own = one.block.omega
         running = np.concatenate([np.zeros((1, *value.shape[1:]), value.dtype), np.cumsum(value, axis=0)])
         # At the ends of the band the window keeps its width and shifts inward.
-        low = np.clip(omega - half, own[0], max(own[-1] - 2 * half, own[0]))
+        low = np.clip(omega - half, own[0], np.maximum(own[-1] - 2 * half, own[0]))
         high = np.minimum(low + 2 * half, own[-1])
         first = np.minimum(np.searchsorted(own, low - 1e-9), len(own) - 1)
         last = np.minimum(np.maximum(np.searchsorted(own, high + 1e-9), first + 1), len(own))

@@ -112,7 +112,8 @@ def beside(
     if AMPLIFIERS not in known or AMPLIFIERS in names:
         return found
     tau, no = np.array([known[AMPLIFIERS].value]), np.zeros(1, bool)
-    lag = Priors((AMPLIFIERS,), tau, settings.lag_percent / 100 * tau, no, settings.shortest_lag * tau)
+    within = np.array([lag_tolerance(float(tau[0]), settings)])
+    lag = Priors((AMPLIFIERS,), tau, within, no, settings.shortest_lag * tau)
     return found.followed_by(lag)
 
 
@@ -148,6 +149,11 @@ class Tolerance:
 def tolerances_of(rig: Rig) -> Tolerances:
     """Tolerances of the rig file, or those of the contract."""
     return getattr(rig, "tolerances", None) or Tolerances()
+
+
+def lag_tolerance(tau_s: float, settings: FitSettings = SETTINGS) -> float:
+    """Standard deviation [s] of the time constant of amplifiers, from its expected value [s]."""
+    return max(settings.lag_percent / 100 * tau_s, settings.least_lag_s)
 
 
 _RELATIVE: Mapping[str, str] = {

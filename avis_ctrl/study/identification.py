@@ -161,6 +161,8 @@ def identify(
             progress=progress,
             tolerances=tolerances_of(rig),
         )
+        if not found.fit.converged:
+            progress("  warning: the fit did not converge; check the verdict on the held-out records")
         far = far_from_file(model, found.information)
         for sentence in far:
             progress(f"  warning: {sentence}")

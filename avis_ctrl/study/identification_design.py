@@ -13,7 +13,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import SETTINGS, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
-from avis_ctrl.identification.response import AMPLIFIERS, ResponseModel
+from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.avis import AvisTable
@@ -163,10 +163,10 @@ def _template(found: Identification, template: Path | Design | None) -> Design:
         return read_design(template)
     keep = " and ".join(default_keep(found.rig))
     design = default_design(found.rig, f"{found.rig.name}, identified: {keep} under one controller")
-    if AMPLIFIERS not in found.campaign_fit.fit.model.names:
+    if found.model.amplifier_corner_Hz is None:
         return design
-    # The identified lag; above the sample rate it makes no difference, and a faster pole is harder to compute with.
-    corner = float(f"{min(found.model.amplifier_corner_Hz or np.inf, found.rig.sample_rate_Hz):.4g}")
+    # A faster pole makes the synthesis stiff. At a hundredth of this limit the difference is 1 %.
+    corner = float(f"{min(found.model.amplifier_corner_Hz, 10 * found.rig.sample_rate_Hz):.4g}")
     return design.model_copy(update={"loop": design.loop.model_copy(update={"amplifier_corner_Hz": corner})})
 
 

@@ -273,13 +273,15 @@ def test_time_constants_of_amplifiers_add_up():
     assert told["corner_Hz"].value == pytest.approx(1 / (2 * np.pi * total))
 
 
-def test_derivative_by_the_time_constant_of_amplifiers_with_an_added_lag(rng):
+@pytest.mark.parametrize("delay_s", [0.0, 0.7e-3])
+def test_derivative_by_the_time_constant_of_amplifiers_with_an_added_lag(rng, delay_s):
     base = replace(BARE.base, amplifier_corner_Hz=200.0, names=("mass", AMPLIFIERS))
     model = with_effect("actuator_lag", "actuators", [1.2e-3], TableModel(base))
+    model = with_effect("loop_delay", "loop", [delay_s], model)
     omega = 2 * np.pi * np.array([3.0, 30.0, 90.0])
     U = rng.normal(size=(3, len(model.inputs), 1)) + 0j
     step = 1e-8
-    ends = [model.at(model.values + np.array([0, sign * step, 0])).driven(omega, U, False).Y for sign in (1, -1)]
+    ends = [model.at(model.values + np.array([0, sign * step, 0, 0])).driven(omega, U, False).Y for sign in (1, -1)]
     slope = (ends[0] - ends[1]) / (2 * step)
     found = model.driven(omega, U).dY
     np.testing.assert_allclose(found[1], slope, atol=1e-5 * np.abs(slope).max())

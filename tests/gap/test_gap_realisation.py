@@ -119,6 +119,12 @@ def test_linear_effects_are_realised_to_rounding(plain, one):
     assert max(differ(asked[:, :, k], without[:, :, k]) for k in (slice(0, n_u), slice(n_u, None))) > 1e-2
 
 
+@pytest.mark.parametrize("one", [LINEAR[5], LINEAR[6], ("actuator_lag", "actuators", (-0.3 * TAU,))], ids=name_of)
+def test_an_added_lag_is_realised_with_the_expected_one(plain, one):
+    known = replace(plain, base=replace(plain.base, amplifier_corner_Hz=1 / (2 * np.pi * TAU)))
+    assert realise(with_one(known, *one), pade_order=10).error < 1e-9
+
+
 @pytest.mark.parametrize("one", [LINEAR[5], LINEAR[6], LINEAR[9]], ids=name_of)
 def test_sampled_models_differ_by_their_aliases(sampled, one):
     model = with_one(sampled, *one)

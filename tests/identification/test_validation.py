@@ -366,6 +366,18 @@ def test_noise_near_sharp_modes_is_measured(true):
     assert shaped[1] < 0.5 * plain[1]
 
 
+def test_noise_where_few_lines_were_fitted_has_full_rank(true):
+    """Thinned records have many lines at resonances and few elsewhere."""
+    rng = np.random.default_rng(12)
+    w = 2 * np.pi * np.concatenate([np.linspace(1, 3, 2000, endpoint=False), np.linspace(3, 30, 150)])
+    e = rng.normal(size=(len(w), 6, 1)) + 1j * rng.normal(size=(len(w), 6, 1))
+    block = SpectralBlock("0", w, np.zeros((len(w), 11, 1), complex), e, kind="k")
+    sparse = block.lines(np.arange(2000, len(w)))
+    found = noise_from_residuals([Residual(block, e, e, 0 * e)], [sparse], true)[0]
+    assert found.dof >= 100
+    assert np.linalg.eigvalsh(found.noise[:, 0]).min() > 0.5  # the variance of every output is 2
+
+
 def test_responses_in_place_of_records(true, model):
     rng = np.random.default_rng(11)
     f = np.geomspace(0.7, 30, 240)

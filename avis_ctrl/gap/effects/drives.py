@@ -42,9 +42,6 @@ class ActuatorLag(Effect):
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
     at = ("actuators", "actuators/each")
 
-    def places(self, model: Table) -> tuple[str, ...]:
-        return self.at if model.amplifier_corner_Hz is None else self.at[:1]
-
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         own = uneven(model.actuators[:-1], "that of drive {} over the mean, less one") if "/" in place else ()
         known = expected_lag(model.nominal or model.base)
@@ -52,7 +49,7 @@ class ActuatorLag(Effect):
         return (EffectParameter("time_constant_s", "s", words, 0.0, -known, 0.3, 1e-3), *own)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        tau, each = values["time_constant_s"] + expected_lag(ops.base), time_constants(values)
+        tau, each = values["time_constant_s"] + expected_lag(ops.base), lags(ops.base, values)
         ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau) if tau > 1e-9 else None
         if len(each) > 1:
             ops.drive = ops.drive * (1 + ops.s[:, None] * tau) / (1 + ops.s[:, None] * each)
@@ -70,9 +67,9 @@ def expected_lag(model: ResponseModel) -> float:
     return 1 / (2 * np.pi * model.amplifier_corner_Hz) if model.amplifier_corner_Hz else 0.0
 
 
-def time_constants(values: Values) -> np.ndarray:
-    """(n_u,) time constants of the amplifiers [s], or (1,) if all are equal."""
-    return values["time_constant_s"] * shares(values)
+def lags(model: ResponseModel, values: Values) -> np.ndarray:
+    """(n_u,) time constants of the amplifiers with the effect [s], not below zero; (1,) if all are equal."""
+    return np.maximum(expected_lag(model) + values["time_constant_s"] * shares(values), 0.0)
 
 
 @register

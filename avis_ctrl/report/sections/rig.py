@@ -168,10 +168,14 @@ def _direction(direction: np.ndarray) -> str:
 
 
 def _corner(s: Sensor) -> str:
-    """Corner and damping ratio of the sensor with its filters, and of a geophone's suspension if different."""
-    if not s.poles:
+    """Corner and damping ratio of the sensor with its filters, except the anti-alias filter, and of a geophone's
+    suspension if different."""
+    own = list(s.poles)
+    for pole in s.low_pass:
+        own.remove(pole)
+    if not own:
         return "none"
-    poles, side = np.array(s.poles), "high-pass" if s.zeros else "low-pass"
+    poles, side = np.array(own), "high-pass" if s.zeros else "low-pass"
     omega = float(np.prod(np.abs(poles)) ** (1 / len(poles)))
     text = f"{side} {words.hertz(omega)}"
     if len(poles) == 1:
