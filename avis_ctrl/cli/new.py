@@ -17,7 +17,7 @@ from avis_ctrl.errors import InputError
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Write a commented rig file or design file to start from. What is not given as an option is asked for.",
+    help="Write a commented rig file or design file to start from. Most values that are not given are asked for.",
 )
 
 
@@ -28,7 +28,7 @@ def _absent(out: Path) -> Path:
     return out
 
 
-def _asked(check: Callable[[typer.Context, str, Any], None], flag: str, question: str) -> Any:
+def _asked(check: Callable[[typer.Context, str, Any], None], flag: str, question: str, prompted: bool = True) -> Any:
     """An option that is prompted for if it is not given; an invalid answer is prompted for again."""
 
     def checked(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
@@ -42,7 +42,9 @@ def _asked(check: Callable[[typer.Context, str, Any], None], flag: str, question
         return value
 
     # [kg] in a help text would be markup.
-    return typer.Option(flag, prompt=question, help=question.replace("[", r"\["), callback=checked)
+    return typer.Option(
+        flag, prompt=question if prompted else False, help=question.replace("[", r"\["), callback=checked
+    )
 
 
 def _with_options(ctx: typer.Context, error: InputError) -> InputError:
@@ -91,7 +93,7 @@ def rig(
     constant_N_per_V: Annotated[float, _of_rig("--force-constant", "Force of a drive [N/V]")] = 2.0,
     limit_V: Annotated[float, _of_rig("--limit", "Largest drive voltage [V]")] = 10.0,
     sensors: Annotated[str, _of_rig("--sensors", "Sensors: geophone or accelerometer")] = "geophone",
-    geophone: Annotated[str, _of_rig("--geophone", "RESP file of the geophones (empty: a common one)")] = "",
+    geophone: Annotated[str, _of_rig("--geophone", "RESP file of the geophones (by default a common one)", False)] = "",
     sample_rate_Hz: Annotated[float, _of_rig("--sample-rate", "Sample rate of the controller [Hz]")] = 1000.0,
 ) -> None:
     """Write a rig file for a table of given mass, size and natural frequencies."""

@@ -44,11 +44,13 @@ class UncertainSettings:
     same : maximum difference of two LFTs, relative to the size of their entries, at which a reduction of copies is
     accepted; the round-off of a few hundred operations.
     inside : range of the deltas at which they are compared, as a fraction of the full range, away from a pole at its
-    ends."""
+    ends.
+    affine : largest feedback from a delta to itself that is round-off, for the order of a product [1]."""
 
     singular: float = 1e13
     same: float = 1e-12
     inside: float = 0.7
+    affine: float = 1e-9
 
 
 SETTINGS = UncertainSettings()
@@ -280,13 +282,22 @@ class UncertainSystem:
 
     __radd__ = __add__
 
+    def _affine(self) -> bool:
+        """Whether a number is affine in the values of its elements. A nominal value that is not in the middle of its
+        range is a quotient of delta, (n + b delta)/(1 + s delta), but no division by the parameter: with
+        mu = delta/(1 + s delta) as the uncertain element, the s is added to a."""
+        skew = [
+            np.full(n * one.rows, getattr(one, "skew", 0.0)) for one, n in zip(self.elements, self.copies, strict=True)
+        ]
+        return bool(np.all(np.abs(self.a + np.diag(np.concatenate([*skew, []]))) < SETTINGS.affine))
+
     def __matmul__(self, other: Any) -> UncertainSystem:
         X, Y = self, as_uncertain(other)
         inputs, outputs = X.inputs if Y._number else Y.inputs, Y.outputs if X._number else X.outputs
         if X.shape == Y.shape == (1, 1) and not (X.nstates or Y.nstates):
             # Numbers commute. Divisors act last, as a mass divides a sum of forces, so that the entries of a row share
             # them; and equal products of parameters get the same order.
-            X, Y = sorted((X, Y), key=lambda one: (not np.any(one.a), sorted(one.uncertain)))
+            X, Y = sorted((X, Y), key=lambda one: (one._affine(), sorted(one.uncertain)))
         if X.shape[1] != Y.shape[0]:
             raise InputError(f"product of shapes {X.shape} and {Y.shape}")
         return _of_both(series(X.matrices, Y.matrices), X, Y, inputs, outputs)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, tf
+from avis_ctrl.robust import robustness
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.uncertainty import uncertain_models
 from avis_ctrl.uncertainty.uncertain_models import complex_disk, connect, dynamics, matrix, real, ss
@@ -442,3 +443,27 @@ def test_sampled_systems_keep_their_clock():
     with pytest.raises(InputError, match="different sample times"):
         _ = G + tf([1.0], [1.0, 1.0])
     np.testing.assert_allclose(la.eigvals((G @ G).substitute(p=0.55).A), [0.55, 0.55], atol=1e-7)
+
+
+def test_an_asymmetric_range_adds_no_copies():
+    """Two masses on springs: each entry of a row is divided by the same mass, whatever the ranges."""
+
+    def plant(k2):
+        m1, m2 = real("m1", 2.0, percent=20), real("m2", 0.8, percent=30)
+        k1, c = real("k1", 120.0, percent=15), real("c", 0.8, plus_minus=0.3)
+        A = [
+            [0, 0, 1, 0],
+            [0, 0, 0, 1],
+            [-(k1 + k2) / m1, k2 / m1, -2 * c / m1, c / m1],
+            [k2 / m2, -k2 / m2, c / m2, -c / m2],
+        ]
+        return ss(A, [[0, 0], [0, 0], [1 / m1, 0], [0, 1 / m2]], [[1, 0, 0, 0], [0, 1, 0, 0]])
+
+    skewed, even = plant(real("k2", 60.0, range=(45, 80))), plant(real("k2", 62.5, plus_minus=17.5))
+    assert list(skewed.uncertain) == list(even.uncertain) and skewed.copies == even.copies
+    assert sorted(skewed.copies[1:]) == [1, 1, 1, 1, 2]
+    # The same set of plants: the same worst case, up to the gap between the bounds.
+    gains = [robustness.worst_case_gain(one) for one in (skewed, even)]
+    assert gains[0].upper == pytest.approx(gains[1].upper, rel=1e-2)
+    corner = skewed.substitute(m1=2.4, m2=1.04, k1=102.0, k2=45.0, c=0.5)
+    assert hinf_norm(corner).gain <= gains[0].upper < 1.1
