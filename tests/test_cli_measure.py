@@ -116,7 +116,7 @@ def test_truncated_files_are_one_line(campaign, tmp_path, keep):
         (("simulate-campaign", "--rig", "avis", "--out", "c.h5", "--plan", "none.toml"), "none.toml"),
         (("convert", "C", "no/where/c.h5"), "no/where"),
         (("convert", "C"), "--out: missing"),
-        (("convert", "C", "a.h5", "--out", "b.h5"), "a.h5 is named, too"),
+        (("convert", "C", "a.h5", "--out", "b.h5"), "a.h5 and --out were both given"),
         (("single-axis", "pendulum", "C", "--columns", "u=u"), "pendulum"),
         (("single-axis", "drive", "C", "--columns", "force"), "force"),
     ],

@@ -13,7 +13,7 @@ from avis_ctrl.study.design_file import Design, design_from_table
 
 DOCS = Path(__file__).parents[2] / "docs"
 # "## Isolators: `[payload]`" or "## `[[requirement]]`, a line of ..."
-HEADING = re.compile(r"^## (?:(Isolators|Springs|Either): )?(?:`\[+([\w.]+)\]+`)?.*?$(.*?)(?=^## |\Z)", re.S | re.M)
+HEADING = re.compile(r"^## (?:(Isolators|Springs|Both kinds): )?(?:`\[+([\w.]+)\]+`)?.*?$(.*?)(?=^## |\Z)", re.S | re.M)
 
 
 def page(name):
@@ -58,8 +58,8 @@ def test_the_page_on_rig_files_lists_every_key():
         "acceleration",
         "displacement",
     ]
-    assert listed(text, ("Isolators", "Either")) == keys(AvisFile)
-    assert listed(text, ("Springs", "Either")) == keys(HalcyonicsFile)
+    assert listed(text, ("Isolators", "Both kinds")) == keys(AvisFile)
+    assert listed(text, ("Springs", "Both kinds")) == keys(HalcyonicsFile)
 
 
 def test_the_page_on_design_files_lists_every_key():
