@@ -36,8 +36,7 @@ MEASUREMENT: HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or fre
 --band LOW HIGH: Hz; by default the excited band
 --starts: number of starting points of the fit
 --amplifier-corner: expected corner of the amplifiers' first-order lag [Hz]; by default none, or 300 Hz on a rig with
-    accelerometers. In records of a table on isolators the time constant is fitted, with a
-    tolerance of 35 %
+    accelerometers. For records of a table on isolators, the time constant is fitted (docs/gap_engine.md)
 --kalman: also run the extended Kalman filter, for comparison
 --design DESIGN.toml: design file whose rig and uncertainty are replaced by the identified ones; by default a design for
     z and phi_x with the weights of the shipped examples

@@ -17,7 +17,7 @@ from avis_ctrl.errors import InputError
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Write a commented rig file or design file to start from. Most values that are not given are asked for.",
+    help="Write a commented rig file or design file to start from. It asks for most values that are not given.",
 )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.drives import expected_lag, lags
+from avis_ctrl.gap.effects.drives import lags
 from avis_ctrl.gap.effects.sensors import suspensions
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.state_space import SETTINGS, ReducedTable, addition, chassis, has_addition
@@ -177,7 +177,7 @@ def _drives(model: TableModel) -> list[StateSpace]:
         if one.effect.name == "actuator_gain":
             factors[one.place] *= one.by_name["gain"]
         if one.effect.name == "actuator_lag" and len(one.values) > 1:
-            tau = max(expected_lag(model.base) + one.by_name["time_constant_s"], 1e-9)
+            tau = max(model.base.amplifier_time_constant_s + one.by_name["time_constant_s"], 1e-9)
             each = np.maximum(lags(model.base, one.by_name), 1e-9)
             added = [cascade([-1 / tau], [-1 / own], tau / own) for own in each]
     return [lag.scaled(factors[name]) for lag, name in zip(added, model.actuators, strict=True)]

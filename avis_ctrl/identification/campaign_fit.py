@@ -26,6 +26,7 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.rig import Rig
 
 Progress = Callable[[str], None]
 Item = TypeVar("Item")
@@ -348,6 +349,12 @@ class CampaignFit:
         return self.fit.information.of_some(self.start.names).along(self.first.information)
 
 
+def fits_tolerances(measured: Campaign | FrequencyResponse, rig: Rig) -> bool:
+    """Whether `fit_campaign` can fit the tolerances of the rig file: those of records of a table on isolators, whose
+    channels can be separated."""
+    return isinstance(measured, Campaign) and isinstance(rig, AvisTable)
+
+
 def fit_campaign(
     campaign: Campaign | FrequencyResponse,
     model: ResponseModel,
@@ -378,7 +385,7 @@ def fit_campaign(
         )
     raw, notes = campaign_blocks(campaign, model, band_Hz)
     blocks, said, known = weighted(raw, campaign, band_Hz)
-    within = tolerances if isinstance(model.rig, AvisTable) else None
+    within = tolerances if fits_tolerances(campaign, model.rig) else None
     fitted = blocks
     if within is not None:
         blocks = [thinned(block, FIT.residual_lines) for block in blocks]

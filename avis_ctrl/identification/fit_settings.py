@@ -17,7 +17,7 @@ class FitSettings:
         (Levenberg-Marquardt damping, as a prior).
     lag_percent : standard deviation of the amplifiers' time constant [%], which no rig file states: amplifiers without
         a lag are within three standard deviations, and a lag of more than twice the expected one is beyond them.
-    least_lag_s : minimum of that standard deviation [s]: lines, filters and converters lag by as much, even if the
+    least_lag_s : minimum of that standard deviation [s]: cables, filters and converters lag by as much, even if the
         amplifiers do not.
     shortest_lag : time constant below which amplifiers have no lag, relative to the expected one [1].
     lines : spectral lines per record that are fitted; with 8 drives and 6 sensors the response needs about 100, and

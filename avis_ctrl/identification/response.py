@@ -491,6 +491,11 @@ class ResponseModel:
         )
 
     @property
+    def amplifier_time_constant_s(self) -> float:
+        """Time constant of the amplifiers [s]; 0 without a lag."""
+        return 1 / (2 * np.pi * self.amplifier_corner_Hz) if self.amplifier_corner_Hz else 0.0
+
+    @property
     def _known(self) -> frozenset[str]:
         """Names of all parameters that may be free."""
         return frozenset(self.all_parameters())
@@ -508,8 +513,7 @@ class ResponseModel:
                 found[f"damping.{name}"] = Parameter(own[1], "", f"damping ratio of the suspension of {name}")
         found["loop_delay_s"] = Parameter(self.delay_s, "s", "delay from the sample to the actuator voltage")
         if self.amplifier_corner_Hz:
-            tau = 1 / (2 * np.pi * self.amplifier_corner_Hz)
-            found[AMPLIFIERS] = Parameter(tau, "s", "time constant of the amplifiers")
+            found[AMPLIFIERS] = Parameter(self.amplifier_time_constant_s, "s", "time constant of the amplifiers")
         return found
 
     @cached_property
@@ -728,8 +732,8 @@ class ResponseModel:
         aliases, which are small and, as a function of the delay, have a kink at whole samples."""
         s, (a, _) = 1j * omega[:, None, None], self.drive(omega)
         if name == AMPLIFIERS:
-            corner = 2 * np.pi * self.amplifier_corner_Hz  # type: ignore[operator]
-            tau, step = 1 / corner, 1e-4 / corner
+            tau = self.amplifier_time_constant_s
+            step = 1e-4 * tau
             ends = [replace(self, amplifier_corner_Hz=1 / (2 * np.pi * end)) for end in (tau - step, tau + step)]
             slope, width = -s / (1 + s * tau) * a, 2 * step
         else:

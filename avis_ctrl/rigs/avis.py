@@ -195,8 +195,7 @@ class AvisTable(Rig):
         if kind == "place":
             slope = _ARM[k].T @ one.direction
         else:
-            along = ({0, 1, 2} - set(one.across)).pop()
-            turn = np.eye(3)[k] - np.eye(3)[along] * one.direction[k] / one.direction[along]
+            turn = np.eye(3)[k] - np.eye(3)[one.along] * one.direction[k] / one.direction[one.along]
             slope = point_map(one.position).T @ turn
         drive = isinstance(one, Drive)
         return [("T" if drive else "R", channel, slope * one.constant_N_per_V if drive else slope)]

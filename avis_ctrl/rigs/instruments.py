@@ -44,8 +44,8 @@ def unit_vector(direction: Triple, field: str) -> Triple:
 class Channel:
     """A drive or sensor at a position [m] with a direction (unit vector with sign).
 
-    dependent : index of the component of the direction that follows from the other two, by the unit length; by default
-        the largest. It does not change while a fit turns the direction, even if another component becomes the largest.
+    dependent : index of the component of the direction that follows from the other two, by the unit length; None for
+        the largest (`along`). It does not change while a fit turns the direction, even if another becomes the largest.
     """
 
     name: str
@@ -54,19 +54,21 @@ class Channel:
     dependent: int | None = field(default=None, kw_only=True, compare=False, repr=False)
 
     @property
-    def across(self) -> tuple[int, int]:
+    def along(self) -> int:
+        """Index of the dependent component."""
+        return int(np.argsort(np.abs(self.direction), kind="stable")[-1]) if self.dependent is None else self.dependent
+
+    @property
+    def across(self) -> tuple[int, ...]:
         """Indices of the other two components, which are free."""
-        largest = int(np.argsort(np.abs(self.direction), kind="stable")[-1])
-        first, second = sorted({0, 1, 2} - {largest if self.dependent is None else self.dependent})
-        return first, second
+        return tuple(k for k in range(3) if k != self.along)
 
     def turned(self, components: Mapping[int, float]) -> Self:
         """The channel with other values of some of these two components; the sign of the dependent one is kept.
 
         Raises InputError for components of no unit vector.
         """
-        free, n = list(self.across), np.array(self.direction)
-        along = ({0, 1, 2} - set(free)).pop()
+        free, along, n = list(self.across), self.along, np.array(self.direction)
         n[free] = [components.get(k, n[k]) for k in free]
         rest = 1 - float(np.sum(n[free] ** 2))
         if rest <= 0:

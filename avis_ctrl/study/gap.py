@@ -149,7 +149,7 @@ def find_gap(
     with threadpool_limits(1):
         findings = _gates(measured, rig, options, progress) if options.gates else ()
         corner = amplifier_corner(rig, options.amplifier_corner_Hz)
-        known = (amplifier_words(corner, options.amplifier_corner_Hz, True),) if corner else ()
+        known = (amplifier_words(corner, options.amplifier_corner_Hz, fitted=True),) if corner else ()
         for words in known:
             progress(words)
         gap = analyse(measured, rig, options.seed, options.band_Hz, corner, None, progress, each)

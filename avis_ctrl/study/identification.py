@@ -18,6 +18,7 @@ from avis_ctrl.identification.campaign_fit import (
     driven_inputs,
     excited_band,
     fit_campaign,
+    fits_tolerances,
     split_campaign,
 )
 from avis_ctrl.identification.ekf import identify_ekf
@@ -37,7 +38,6 @@ from avis_ctrl.identification.validation import Validation, validate
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Finding
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
 from avis_ctrl.study.plausible_fit import far_from_file
@@ -145,8 +145,8 @@ def identify(
         if unplayed:
             progress(unplayed)
         if model.amplifier_corner_Hz:
-            fits = isinstance(measured, Campaign) and isinstance(rig, AvisTable)
-            progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz, fits))
+            fitted_lag = fits_tolerances(measured, rig)
+            progress(amplifier_words(model.amplifier_corner_Hz, options.amplifier_corner_Hz, fitted=fitted_lag))
         progress(
             f"maximum likelihood: {len(model.names)} parameters, {band[0]:.3g} to {band[1]:.3g} Hz"
             + (f"; {split.how}" if split else "")

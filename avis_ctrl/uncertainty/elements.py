@@ -44,6 +44,11 @@ class Element:
         """Whether its copies form a block delta I."""
         return self.rows == self.cols == 1
 
+    @property
+    def skew(self) -> float:
+        """s in value = (nominal + b delta)/(1 + s delta); 0 unless a real range is asymmetric."""
+        return 0.0
+
     def block(self, copies: int) -> Block:
         """The block of a number of copies."""
         return ComplexScalar(copies, self.name)
@@ -73,7 +78,7 @@ class RealParameter(Element):
 
     @property
     def skew(self) -> float:
-        """a in value = (nominal + b delta)/(1 + a delta); 0 for a symmetric range."""
+        """s in value = (nominal + b delta)/(1 + s delta); 0 for a symmetric range."""
         width = self.high - self.low
         skew = (2 * self.nominal - self.high - self.low) / width
         return skew if abs(skew) > 1e-14 * (abs(self.high) + abs(self.low)) / width else 0.0

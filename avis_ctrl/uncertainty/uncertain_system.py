@@ -283,13 +283,14 @@ class UncertainSystem:
     __radd__ = __add__
 
     def _affine(self) -> bool:
-        """Whether a number is affine in the values of its elements. A nominal value that is not in the middle of its
-        range is a quotient of delta, (n + b delta)/(1 + s delta), but no division by the parameter: with
-        mu = delta/(1 + s delta) as the uncertain element, the s is added to a."""
-        skew = [
-            np.full(n * one.rows, getattr(one, "skew", 0.0)) for one, n in zip(self.elements, self.copies, strict=True)
-        ]
-        return bool(np.all(np.abs(self.a + np.diag(np.concatenate([*skew, []]))) < SETTINGS.affine))
+        """Whether a number is affine in the values of its elements, with no product or quotient of them. A parameter
+        with an asymmetric range is a quotient of its delta, (nominal + b delta)/(1 + s delta): with delta/(1 + s delta)
+        in place of delta, s is added to a."""
+        a = self.a.copy()
+        for one, n, w, z in self._slices():
+            if one.skew:
+                a[z, w] += one.skew * np.eye(n)
+        return bool(np.all(np.abs(a) < SETTINGS.affine))
 
     def __matmul__(self, other: Any) -> UncertainSystem:
         X, Y = self, as_uncertain(other)

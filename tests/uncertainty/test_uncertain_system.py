@@ -467,3 +467,10 @@ def test_an_asymmetric_range_adds_no_copies():
     assert gains[0].upper == pytest.approx(gains[1].upper, rel=1e-2)
     corner = skewed.substitute(m1=2.4, m2=1.04, k1=102.0, k2=45.0, c=0.5)
     assert hinf_norm(corner).gain <= gains[0].upper < 1.1
+
+
+def test_a_number_of_dynamics_with_several_channels_is_multiplied():
+    number = matrix([[1.0, 1.0, 1.0]]) @ dynamics("D", 0.2, (3, 2)) @ matrix([[1.0], [1.0]])
+    product = number * real("k", 2.0, range=(1.0, 4.0))
+    D = np.arange(6.0).reshape(3, 2) / 20
+    np.testing.assert_allclose(product.substitute(D=D, k=3.0), [[3.0 * 0.2 * D.sum()]])

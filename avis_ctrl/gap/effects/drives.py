@@ -44,32 +44,28 @@ class ActuatorLag(Effect):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         own = uneven(model.actuators[:-1], "that of drive {} over the mean, less one") if "/" in place else ()
-        known = expected_lag(model.nominal or model.base)
+        known = (model.nominal or model.base).amplifier_time_constant_s
         words = "time constant of the amplifiers" + (f" beyond the expected {1e3 * known:.3g} ms" if known else "")
         return (EffectParameter("time_constant_s", "s", words, 0.0, -known, 0.3, 1e-3), *own)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        tau, each = values["time_constant_s"] + expected_lag(ops.base), lags(ops.base, values)
+        tau, each = values["time_constant_s"] + ops.base.amplifier_time_constant_s, lags(ops.base, values)
         ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau) if tau > 1e-9 else None
         if len(each) > 1:
             ops.drive = ops.drive * (1 + ops.s[:, None] * tau) / (1 + ops.s[:, None] * each)
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        tau, std = values["time_constant_s"] + expected_lag(model.base), float(np.sqrt(max(covariance[0, 0], 0.0)))
+        tau = values["time_constant_s"] + model.base.amplifier_time_constant_s
+        std = float(np.sqrt(max(covariance[0, 0], 0.0)))
         found = super().reported(model, place, values, covariance) | {"time_constant_s": Reported(tau, std, "s")}
         if tau <= 1e-9:  # at its bound there is no corner
             return found
         return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau**2), "Hz"), **found}
 
 
-def expected_lag(model: ResponseModel) -> float:
-    """Time constant [s] of the amplifiers of a model without effects."""
-    return 1 / (2 * np.pi * model.amplifier_corner_Hz) if model.amplifier_corner_Hz else 0.0
-
-
 def lags(model: ResponseModel, values: Values) -> np.ndarray:
     """(n_u,) time constants of the amplifiers with the effect [s], not below zero; (1,) if all are equal."""
-    return np.maximum(expected_lag(model) + values["time_constant_s"] * shares(values), 0.0)
+    return np.maximum(model.amplifier_time_constant_s + values["time_constant_s"] * shares(values), 0.0)
 
 
 @register

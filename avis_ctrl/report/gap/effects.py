@@ -25,8 +25,8 @@ def parameters(found: GapFinding) -> Section:
     else:
         pieces.append(
             Paragraph(
-                "No effect is named: the updated model is the re-identified rig, with its values fitted under their "
-                "tolerances."
+                "No effect is named: the updated model is the re-identified rig, with the tolerances of its values as "
+                "priors."
             )
         )
     if len(gap.baseline.values):

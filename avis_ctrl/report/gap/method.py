@@ -28,8 +28,7 @@ log evidence is minus half the sum of squares, less half the log determinants
 Search. A score test with priors predicts, to first order, by how much each effect at each place would reduce J. The
 best candidates of each kind of effect are fitted together with all parameters and tolerances. The candidate with the
 largest evidence is accepted if it raises the log evidence by more than 3.9 plus the logarithm of the number of
-candidates. The
-search continues with this effect in the model, until an effect explains less than 1 % of the gap.
+candidates. The search continues with this effect in the model, until an effect explains less than 1 % of the gap.
 
 Names. An effect that was found is named if it is more probable than not, if its parameters from the lower and the
 upper half of the band, and from low and high levels, agree with the whole, if its values are physically possible, and
