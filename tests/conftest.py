@@ -15,6 +15,16 @@ settings.register_profile("seeded", derandomize=True)
 settings.load_profile("default" if os.environ.get("AVIS_EXPLORE") else "seeded")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+# Simulators of tables with hidden effects, written apart from the package. Their own tests take minutes and change only
+# with them.
+SIMULATORS = [Path(__file__).parent / name for name in ("truth", "own_tables")]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if any(folder in item.path.parents for folder in SIMULATORS):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,7 +41,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder of measured data (AVIS_DATA, or ../shared/data); the test is skipped where it is absent."""
-    folder = Path(os.environ.get("AVIS_DATA", SHARED / "data"))
+    folder = Path(os.environ.get("AVIS_DATA") or SHARED / "data")
     if not folder.is_dir():
         pytest.skip(f"measured data absent: {folder} (set AVIS_DATA)")
     return folder

@@ -54,9 +54,14 @@ def given(tmp_path_factory) -> dict[str, str]:
     [
         (("simulate-campaign", "--rig", "avis", "--plan", "PLAN", "--out"), "c.h5", 200_000),
         (("convert", "CAMPAIGN"), "c.h5", 1000),
-        (("convert", "CAMPAIGN"), "c.h5", 200_000),
+        pytest.param(("convert", "CAMPAIGN"), "c.h5", 200_000, marks=pytest.mark.slow),
         (("predict", "FOUND", "CAMPAIGN", "--out"), "p.h5", 200_000),
-        (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.h5", 1000),
+        pytest.param(
+            ("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"),
+            "s.h5",
+            1000,
+            marks=pytest.mark.slow,
+        ),
         (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.csv", 200_000),
         (("excite", "--rig", "avis", "--rms", "0.1", "--kind", "noise", "--out"), "s.mat", 1000),
     ],

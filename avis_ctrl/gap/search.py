@@ -51,9 +51,8 @@ def candidates(
 ) -> list[Candidate]:
     """Every effect at every place with its best seed, the largest reduction first.
 
-    Effects that add a resonance with many parameters take long to initialise. They are searched only if a resonance
-    with an arbitrary shape on every path gives a sufficient reduction; it describes the data at least as well as each
-    of them.
+    Effects that add resonances with many parameters take long to initialise. They are searched only if one resonance
+    with an arbitrary shape on every path gives a sufficient reduction.
     """
     score = EvidenceScore(fitted, data, settings)
     model, taken = score.model, {name_of(label) for label in fitted.labels}

@@ -114,7 +114,9 @@ class ParameterFilter:
             noise += self.floor.density * entry @ entry.T
             decay = float(np.exp(-self.floor.rate * self.period_s))
         H = np.hstack([model.H, np.zeros((len(model.H), n_f))])
-        constant, slopes, reference, T, H, G = map(np.ascontiguousarray, (*model[2:4], model.values, model.T, H, G))
+        # Copies, because numba compiles the filter again for a read-only array or another memory layout.
+        arrays = (*model[2:4], model.values, model.T, H, G)
+        constant, slopes, reference, T, H, G = (np.array(one, order="C") for one in arrays)
         return Plant(constant, slopes, reference, T, H, G, decay, self.settings.lowest), A, noise
 
 

@@ -81,9 +81,9 @@ def stops(y, v):
     ("name", "extra", "true"),
     [
         ("cubic_stiffness", lambda y, v: 0.01 * y**3, 0.01),
-        ("quadratic_stiffness", lambda y, v: 0.02 * y * y, 0.02),
-        ("quadratic_damping", lambda y, v: 2e-6 * abs(v) * v, 2e-6),
-        ("coulomb_friction", lambda y, v: 0.1 * math.tanh(v / 5), 0.1),
+        *slow(("quadratic_stiffness", lambda y, v: 0.02 * y * y, 0.02)),
+        *slow(("quadratic_damping", lambda y, v: 2e-6 * abs(v) * v, 2e-6)),
+        *slow(("coulomb_friction", lambda y, v: 0.1 * math.tanh(v / 5), 0.1)),
         ("end_stops", stops, 0.5),
     ],
 )
@@ -291,6 +291,7 @@ def test_joint_with_friction_and_a_constant_force(seed):
     assert gap.stages[-1].nrmse < gap.stages[0].nrmse / 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "seed"), [(5, 0), *slow((5, 1), (10, 2))])
 def test_a_force_logged_late_is_a_negative_delay(shift, seed):
     data = drive(coulomb, seed)

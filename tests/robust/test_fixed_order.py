@@ -77,6 +77,7 @@ def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(fu
     assert reached <= 1.03 * made.mu_upper_complex
 
 
+@pytest.mark.slow
 def test_a_gain_above_its_limit_is_lowered(full):
     """Without a limit the controller of two states has a direct term; gains on a dense grid beyond the limit's two."""
     P, _, made = full
@@ -154,6 +155,7 @@ def test_a_slightly_different_start_ends_at_the_same_peak(full):
     assert max(peaks) <= 1.01 * min(peaks)
 
 
+@pytest.mark.slow
 def test_the_result_is_that_of_the_short_controller(full):
     P, blocks, made = full
     short = musyn(P, blocks, 1, 1, order=2, max_iterations=4, state=made.saved_state)

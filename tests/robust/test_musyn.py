@@ -262,6 +262,7 @@ def _burn() -> None:
         pass
 
 
+@pytest.mark.slow
 def test_the_same_call_gives_the_same_controller_on_a_busy_machine(long_run):
     """To the last bit, with two processes in the way."""
     busy = [multiprocessing.get_context("fork").Process(target=_burn, daemon=True) for _ in range(2)]

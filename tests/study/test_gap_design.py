@@ -263,6 +263,7 @@ def test_an_effect_without_a_realisation_is_said_to_be_unchecked(monkeypatch, ba
     assert found.to_json()["not_checked"] == found.not_checked
 
 
+@pytest.mark.slow
 def test_two_ways_to_the_same_limit_of_stability(rig, baseline, design):
     """Delay that a skyhook survives: on the design's plant, and on six coordinates through every channel's chain."""
     plain, asked, _ = plant_of(design, baseline)

@@ -66,13 +66,19 @@ def test_the_limit_keeps_the_loop_gain_of_every_sampled_plant_below_one():
 
 
 @pytest.fixture(scope="module")
-def loops():
+def table():
     design, rig = table_of(), load_rig("avis")
     plant = build_plant(design, rig)
-    skyhook = classical_skyhook(plant, rig, design)
-    return plant, rig, skyhook, tuned_loops(plant, rig, design, skyhook.K)
+    return plant, rig, classical_skyhook(plant, rig, design)
 
 
+@pytest.fixture(scope="module")
+def loops(table):
+    plant, rig, skyhook = table
+    return plant, rig, skyhook, tuned_loops(plant, rig, table_of(), skyhook.K)
+
+
+@pytest.mark.slow
 def test_each_axis_sees_its_own_signal_alone(loops):
     _, _, _, made = loops
     response = made.K.frequency_response(np.geomspace(0.01, 1e4, 100))
@@ -83,6 +89,7 @@ def test_each_axis_sees_its_own_signal_alone(loops):
     assert made.notes == (f"states of each axis's loop: z {of_z}, phi_x_edge {of_phi_x}",) and of_z + of_phi_x == 6
 
 
+@pytest.mark.slow
 def test_mu_is_below_that_of_the_skyhook_and_the_gain_below_its_limit(loops):
     """The loop is formed anew; bounds by `mu_peak`, gains on a dense grid."""
     plant, rig, skyhook, made = loops
@@ -108,13 +115,13 @@ def test_a_design_that_asks_for_the_loops_has_them(loops):
 
 
 @pytest.mark.parametrize("asked", [[], ["loops"]])
-def test_only_a_design_that_asks_has_loops(loops, monkeypatch, asked):
+def test_only_a_design_that_asks_has_loops(table, monkeypatch, asked):
     """Those that cannot be made do not stop it."""
 
     def none(*arguments):
         raise ComputationError("no loops")
 
-    plant, rig, skyhook, _ = loops
+    plant, rig, skyhook = table
     monkeypatch.setattr("avis_ctrl.study.runner.tuned_loops", none)
     candidates = [replace(skyhook, name="mu", title="mu"), replace(skyhook, name="passive", K=None)]
     found = compare(table_of(compare_with=asked), plant, rig, candidates)

@@ -93,6 +93,7 @@ def test_lightly_damped_modes_are_not_taken_for_instability(light_table):
         assert search.merit(point, 2.0).unstable == 0
 
 
+@pytest.mark.slow
 def test_no_multiple_of_the_tuned_gains_is_better(light_table):
     """By the bounds over the whole set: least transmissibility in the band of all that keep the limit on the peak."""
     design, plant, rig = light_table
