@@ -68,6 +68,15 @@ class NamedEffect:
             if not name.startswith("uneven_"):
                 words = spoken(name, p.unit)
                 stem, _, axis = words.rpartition(" ") if words[-2:].strip() in COORDINATES[:3] else (words, "", "")
+                if p.unit == "Hz" and words in (
+                    "x",
+                    "y",
+                    "z",
+                    "rx",
+                    "ry",
+                    "rz",
+                ):  # of a resonance along or about an axis
+                    stem, axis = "frequency", words if len(words) == 1 else f"about {words[1:]}"
                 groups.setdefault(stem, []).append((axis, p))
         # Of these all components are given, also those that are zero.
         direction, position = groups.pop("direction", []), groups.pop("", [])
