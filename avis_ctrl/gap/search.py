@@ -23,7 +23,7 @@ from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.probability import Step, name_of, probability_of
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
+from avis_ctrl.gap.starting_values import FindsItsStart, HasExtendedModels, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap.tolerances import of_effect, of_values, rescaled, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
@@ -88,10 +88,11 @@ def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candida
     return list(chosen.values())[: settings.refits]
 
 
-def other_laws(found: Sequence[Candidate], best: str, fitted: Collection[str]) -> list[Candidate]:
-    """The same effect at the same place with its other laws, except those already fitted; `best` and `fitted` are
+def other_laws(found: Sequence[Candidate], best: Collection[str], fitted: Collection[str]) -> list[Candidate]:
+    """The same effects at the same places with their other laws, except those already fitted; `best` and `fitted` are
     labels."""
-    return [one for one in found if name_of(one.effect.label) == name_of(best) and one.effect.label not in fitted]
+    names = {name_of(label) for label in best}
+    return [one for one in found if name_of(one.effect.label) in names and one.effect.label not in fitted]
 
 
 def extensions(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> list[Candidate]:
@@ -324,7 +325,9 @@ def next_effect(
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)
     while better:
-        further = [*extensions(list(better.values()), data, settings), *other_laws(found, best, asked)]
+        least = begun.log_evidence + settings.near_best * (tried[best].log_evidence - begun.log_evidence)
+        rivals = [label for label, one in tried.items() if one.log_evidence >= least]
+        further = [*extensions(list(better.values()), data, settings), *other_laws(found, rivals, asked)]
         asked |= {one.effect.label for one in further}
         more, before = _tried(begun, further, data, settings, each), tried
         tried = _likelier([*before.values(), *more.values()])
@@ -392,6 +395,13 @@ def _tried(
             one.reduction >= 2 * settings.not_far_behind * most
             and (end is None or end.reduction < settings.least_promised * one.reduction)
         )
+    ]
+    # Starting values that an effect has found in different ways.
+    near += [
+        start
+        for one, _ in made
+        if at_full_strength(one.effect) and isinstance(one.effect.effect, FindsItsStart)
+        for start in one.others
     ]
     return _likelier(_joint_fits(now, near, data, settings, each))
 

@@ -45,6 +45,8 @@ class GapSettings(FitSettings):
     first_iterations : iterations from each of these values, after which only the best is continued.
     rough_iterations : maximum iterations of the first fit of every candidate's own parameters, which cost little; a
         sharp resonance that starts half its width away needs more than a few.
+    near_best : fraction of the best candidate's gain of log evidence, above which the other laws of a candidate are
+        fitted, too: a law with fewer parameters can have the larger evidence [1].
     not_far_behind : fraction of the best candidate's gain of log evidence in that fit, above which another candidate is
         fitted further.
     least_promised : fraction of the reduction predicted by the score test, below which a fit of a candidate's own
@@ -98,6 +100,7 @@ class GapSettings(FitSettings):
     starts: int = 4
     first_iterations: int = 4
     rough_iterations: int = 16
+    near_best: float = 0.8
     not_far_behind: float = 0.3
     least_promised: float = 0.5
     quick_rounds: int = 4

@@ -178,9 +178,12 @@ class BaseCompliance(OfMounts):
         )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Short fits to few lines, from the best resonance of each coordinate by itself, and from points with one
-        frequency for all coordinates, the best by the score test with all parameters. The best fit is then refined with
-        other frequencies of one coordinate after the other.
+        """The end of short fits to few lines, and the best resonance of each coordinate by itself.
+
+        The short fits start there, and from points with one frequency for all coordinates, the best by the score test
+        with all parameters. The best fit is then refined with other frequencies of one coordinate after the other. They
+        keep the tolerances fixed: where these imitate the chassis, only a fit of all parameters from the resonances
+        themselves finds it.
 
         With six resonances of 1 % damping, each off by several half-widths, a fit weighted by the measured noise stops
         in a local minimum. Weights relative to the response, as in a Bode plot, widen the minimum; the last fit uses
@@ -218,7 +221,7 @@ class BaseCompliance(OfMounts):
             SETTINGS.own_Hz[2] ** len(_coordinates(place)),
             few - reached.chi2,
         )
-        return [found] if found.chi2 > 0 else own
+        return [found, *own] if found.chi2 > 0 else own
 
     def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """The same law with other frequencies of coupled coordinates."""
