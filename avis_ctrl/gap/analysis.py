@@ -139,9 +139,9 @@ def _fits(
     starts: list[ActiveEffect] = []
     if not credible(tolerant, settings):
         progress("search without tolerances: with them, values of the rig file move too far")
-        # Resonances are searched in any case: tolerances that imitate one keep its fit from its true values.
-        every = replace(settings, resonance_share=0.0)
-        step = next_effect(base, data, _with_unnamed(effects), every, each)
+        # Resonances are always searched here: a fit from tolerances that imitate one does not reach its true values.
+        always_resonant = replace(settings, resonance_share=0.0)
+        step = next_effect(base, data, _with_unnamed(effects), always_resonant, each)
         starts = [one.model.effects[-1] for one in step.tried.values()] if step else []
     return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings, starts)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -68,15 +69,9 @@ class NamedEffect:
             if not name.startswith("uneven_"):
                 words = spoken(name, p.unit)
                 stem, _, axis = words.rpartition(" ") if words[-2:].strip() in COORDINATES[:3] else (words, "", "")
-                if p.unit == "Hz" and words in (
-                    "x",
-                    "y",
-                    "z",
-                    "rx",
-                    "ry",
-                    "rz",
-                ):  # of a resonance along or about an axis
-                    stem, axis = "frequency", words if len(words) == 1 else f"about {words[1:]}"
+                # A resonance along (x) or about (rx) an axis.
+                if p.unit == "Hz" and (of := re.fullmatch("(r?)([xyz])", words)):
+                    stem, axis = "frequency", f"about {of[2]}" if of[1] else of[2]
                 groups.setdefault(stem, []).append((axis, p))
         # Of these all components are given, also those that are zero.
         direction, position = groups.pop("direction", []), groups.pop("", [])

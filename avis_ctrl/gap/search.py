@@ -387,22 +387,13 @@ def _tried(
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
     # shows what an effect can achieve.
-    near += [
-        one.effect
-        for one, end in made
-        if at_full_strength(one.effect)
-        or (
-            one.reduction >= 2 * settings.not_far_behind * most
-            and (end is None or end.reduction < settings.least_promised * one.reduction)
-        )
-    ]
-    # Starting values that an effect has found in different ways.
-    near += [
-        start
-        for one, _ in made
-        if at_full_strength(one.effect) and isinstance(one.effect.effect, FindsItsStart)
-        for start in one.others
-    ]
+    for one, end in made:
+        if at_full_strength(one.effect):
+            near += [one.effect, *(one.others if isinstance(one.effect.effect, FindsItsStart) else ())]
+        elif one.reduction >= 2 * settings.not_far_behind * most and (
+            end is None or end.reduction < settings.least_promised * one.reduction
+        ):
+            near.append(one.effect)
     return _likelier(_joint_fits(now, near, data, settings, each))
 
 

@@ -187,8 +187,8 @@ def test_one_is_found_from_the_first_look(name, seed, strength, parameter):
 
 @pytest.mark.slow
 def test_a_light_chassis_is_found_although_tolerances_imitate_it_at_first():
-    """1.4 times as heavy as the payload, with a damping ratio of 0.011. The fit with tolerances before it moves mounts
-    by six of them; from there, no fit of a chassis reaches its true frequencies."""
+    """It is 1.4 times as heavy as the payload, with a damping ratio of 0.011. Without it, the fit moves a mount by six
+    tolerances; fits of the chassis that keep the tolerances there do not reach its true frequencies."""
     case = draw_case(53050)
     assert case.effects[0].name == "base_compliance"
     found = analyse(simulate_case(case), rig())

@@ -62,7 +62,6 @@ def of_variant(effect: str, variant: str, strength: str = "gross", seed: int = 5
 # --- tolerances
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("effect", [None, "base_compliance"])
 def test_without_tolerances_and_traces_the_table_is_the_clean_one(monkeypatch, effect):
     monkeypatch.setattr(cases, "tolerances", lambda rig: dict.fromkeys(DEFAULTS, 0.0))
@@ -195,7 +194,6 @@ def relative_rms(change: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(np.mean((change / y.std(axis=(0, 1))) ** 2)))
 
 
-@pytest.mark.slow
 def test_each_trace_changes_the_response_by_what_it_says(traced):
     """In noise, where it was sized in a multisine; how much a nonlinear trace does differs between records."""
     u = noise(np.random.default_rng(17), 24000, 8, traced.band_Hz, RATE, 1.0)
@@ -215,7 +213,6 @@ def test_each_trace_changes_the_response_by_what_it_says(traced):
     assert 0.6 < relative_rms(responses(*traced.traces) - y, y) / total < 1.6
 
 
-@pytest.mark.slow
 def test_no_refit_takes_a_trace_away(traced):
     """Mass, inertia, stiffness and damping have given what they could already."""
     pilot = cases._pilot_of(traced)
@@ -239,7 +236,6 @@ def test_traces_are_left_out_where_their_effect_is_hidden(monkeypatch):
     assert len(hum.details["harmonics"]) >= 3
 
 
-@pytest.mark.slow
 def test_cluttered_cases_repeat(monkeypatch):
     monkeypatch.setattr(clutter, "PILOT_S", 1.0)
     case = draw_case(3, kind="two", duration_s=2.0, clutter=True)
@@ -253,7 +249,6 @@ def test_cluttered_cases_repeat(monkeypatch):
     assert np.abs(one.sensor_p - other.sensor_p).min() > 0
 
 
-@pytest.mark.slow
 def test_best_prediction_leaves_noise_and_traces(traced):
     floor = next(seed for seed in range(20) if draw_case(seed, kind="none").floor_recorded)
     clean = draw_case(floor, kind="none", duration_s=4.0)

@@ -178,12 +178,12 @@ class BaseCompliance(OfMounts):
         )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """The end of short fits to few lines, and the best resonance of each coordinate by itself.
+        """The result of short fits to few lines, then the best resonance of each coordinate by itself.
 
-        The short fits start there, and from points with one frequency for all coordinates, the best by the score test
-        with all parameters. The best fit is then refined with other frequencies of one coordinate after the other. They
-        keep the tolerances fixed: where these imitate the chassis, only a fit of all parameters from the resonances
-        themselves finds it.
+        The short fits start from these resonances, and from points with one frequency for all coordinates, the best by
+        the score test with all parameters. The best fit is then refined with other frequencies of one coordinate after
+        the other. All these fits keep the tolerances fixed. If the tolerances imitate the chassis, only a fit of all
+        parameters finds it, and it must start from the single resonances.
 
         With six resonances of 1 % damping, each off by several half-widths, a fit weighted by the measured noise stops
         in a local minimum. Weights relative to the response, as in a Bode plot, widen the minimum; the last fit uses
