@@ -226,7 +226,7 @@ class EvidenceScore(Score):
 
     def __init__(self, fitted: Fitted, data: Data, settings: FitSettings = FIT_SETTINGS):
         full = fitted.model
-        # Fits by which an effect finds its own starting values keep the tolerances fixed.
+        # Score tests of other models, by which an effect finds its starting values, keep the tolerances fixed.
         rig = tuple(name for name in full.base.names if name in default_parameters(full.rig))
         nominal = full.nominal and replace(full.nominal, names=rig)
         self.model, self.kept = replace(full, base=replace(full.base, names=rig), nominal=nominal), {}
@@ -237,12 +237,6 @@ class EvidenceScore(Score):
         self.parts = [Part(self.model, block) for block in blocks]
         self.profile = Profile(fitted, data, settings)
         self.basis, self.e = self.profile.basis, self.profile.e
-
-    @cached_property
-    def plain(self) -> Score:
-        """The score weighted by noise and distortion alone, for effects that find their starting values by their own
-        fits: unexplained path errors are not removed there."""
-        return Score(self.model, [part.block for part in self.parts])
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N + n) as those of `Score`, with the rows of the priors."""

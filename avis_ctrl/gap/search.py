@@ -23,7 +23,7 @@ from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.probability import Step, name_of, probability_of
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.starting_values import FindsItsStart, HasExtendedModels, seeds
+from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap.tolerances import of_effect, of_values, rescaled, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
@@ -388,10 +388,9 @@ def _tried(
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
     # shows what an effect can achieve.
     for one, end in made:
-        if at_full_strength(one.effect):
-            near += [one.effect, *(one.others if isinstance(one.effect.effect, FindsItsStart) else ())]
-        elif one.reduction >= 2 * settings.not_far_behind * most and (
-            end is None or end.reduction < settings.least_promised * one.reduction
+        if at_full_strength(one.effect) or (
+            one.reduction >= 2 * settings.not_far_behind * most
+            and (end is None or end.reduction < settings.least_promised * one.reduction)
         ):
             near.append(one.effect)
     return _likelier(_joint_fits(now, near, data, settings, each))
