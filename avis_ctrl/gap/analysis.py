@@ -23,16 +23,7 @@ from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probabili
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
 from avis_ctrl.gap.score import EvidenceScore
-from avis_ctrl.gap.search import (
-    backward_elimination,
-    forbidden,
-    implausible,
-    is_weak,
-    next_effect,
-    outliers,
-    search,
-    without_effect,
-)
+from avis_ctrl.gap.search import backward_elimination, forbidden, implausible, is_weak, outliers, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
@@ -136,14 +127,7 @@ def _fits(
     )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    starts: list[ActiveEffect] = []
-    if not credible(tolerant, settings):
-        progress("search without tolerances: with them, values of the rig file move too far")
-        # Resonances are always searched here: a fit from tolerances that imitate one does not reach its true values.
-        always_resonant = replace(settings, resonance_share=0.0)
-        step = next_effect(base, data, _with_unnamed(effects), always_resonant, each)
-        starts = [one.model.effects[-1] for one in step.tried.values()] if step else []
-    return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings, starts)
+    return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings)
 
 
 def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
@@ -162,13 +146,7 @@ def _refitted(
 
 
 def _searched(
-    fits: Fits,
-    data: Data,
-    effects: Sequence[Effect],
-    progress: Progress,
-    each: Mapper,
-    settings: GapSettings,
-    starts: Sequence[ActiveEffect] = (),
+    fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
 ) -> Fits:
     """Add the effects that the search finds in addition to those of the best fit."""
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
@@ -178,7 +156,7 @@ def _searched(
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
 
-    steps = search(fits.best, data, _with_unnamed(effects), settings, progress, each, enough, starts)
+    steps = search(fits.best, data, _with_unnamed(effects), settings, progress, each, enough)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 

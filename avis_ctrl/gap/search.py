@@ -166,13 +166,12 @@ def search(
     progress: Progress = lambda text: None,
     each: Mapper = sequential_map,
     enough: Callable[[Step], bool] = lambda step: False,
-    starts: Sequence[ActiveEffect] = (),
 ) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
     they show in how far one of them had to move, hardly in the residual.
 
     base : the initial fit, which may already contain effects. enough : whether the search may end after a step because
-        its effect explains next to nothing. starts : effects with further values at which fits of the first step start.
+        its effect explains next to nothing.
     The last step has the fit with all effects found.
     """
     steps: list[Step] = []
@@ -181,7 +180,7 @@ def search(
         while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(base.labels) + len(steps) + 1}")
-            step = next_effect(now, data, effects, settings, each, () if steps else starts)
+            step = next_effect(now, data, effects, settings, each)
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -304,23 +303,11 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
-def next_effect(
-    now: Fitted,
-    data: Data,
-    effects: Sequence[Effect],
-    settings: GapSettings,
-    each: Mapper,
-    starts: Sequence[ActiveEffect] = (),
-) -> Step | None:
-    """The effect with the largest evidence; None if no effect improves the current model enough.
-
-    starts : effects with values at which fits start in addition to those of the score test.
-    """
+def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper) -> Step | None:
+    """The effect with the largest evidence; None if no effect improves the current model enough."""
     begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, settings, each)
     tried = _tried(begun, shortlist(found, settings), data, settings, each)
-    again = [active(one.effect, begun.model, one.place, one.values) for one in starts]
-    tried = _likelier([*tried.values(), *_joint_fits(begun, again, data, settings, each)])
     if not tried:
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)

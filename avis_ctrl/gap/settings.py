@@ -24,9 +24,8 @@ class GapSettings(FitSettings):
     beyond_least : minimum difference from the rig file's value, in tolerances, for a value to be beyond its tolerance.
     determined : fraction of a tolerance's prior variance that the data must remove for the value to count as determined
         [1].
-    credible : p-value of the sum of squares of all shifts in tolerances, below which they represent a missing effect
-        [1]: effects are then also fitted from the values that they have without tolerances. It costs a minute, in vain
-        in one of ten thousand campaigns without an effect.
+    credible : p-value of the sum of squares of all shifts in tolerances, below which the report says that they may
+        imitate a missing effect [1].
     least_spread : smallest credible spread of these values, in tolerances [1]: there are some tens of them, and the
         model has errors of this size.
     narrow : spread below which outliers from it are searched [1]: an outlier raises the log evidence by half its
