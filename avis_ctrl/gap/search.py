@@ -374,12 +374,15 @@ def _tried(
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
     # shows what an effect can achieve.
-    for one, end in made:
-        if at_full_strength(one.effect) or (
+    near += [
+        one.effect
+        for one, end in made
+        if at_full_strength(one.effect)
+        or (
             one.reduction >= 2 * settings.not_far_behind * most
             and (end is None or end.reduction < settings.least_promised * one.reduction)
-        ):
-            near.append(one.effect)
+        )
+    ]
     return _likelier(_joint_fits(now, near, data, settings, each))
 
 

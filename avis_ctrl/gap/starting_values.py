@@ -73,21 +73,18 @@ class Seed:
     """Starting point of a fit: values of all parameters, and the reduction of chi2 there to first order.
 
     directions : number of directions along which the data could have reduced it. trials : number of frequencies, or
-        other shape values, among which the best was selected. seen : the reduction for the test of significance, if it
-        is not chi2 (from fewer data).
+        other shape values, among which the best was selected.
     """
 
     values: tuple[float, ...]
     chi2: float
     directions: int
     trials: int = 1
-    seen: float | None = None
 
     @property
     def p_value(self) -> float:
         """Probability of as large a reduction by noise alone."""
-        reduction = self.chi2 if self.seen is None else self.seen
-        return min(1.0, self.trials * float(stats.chi2.sf(reduction, self.directions)))
+        return min(1.0, self.trials * float(stats.chi2.sf(self.chi2, self.directions)))
 
 
 @runtime_checkable

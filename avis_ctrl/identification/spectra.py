@@ -161,6 +161,7 @@ def transient_parts(
 
 
 # Relative singular value of unit columns below which a direction is dropped: states with columns this close are one.
+# Its square, an eigenvalue of the Gram matrix, must be well above round-off.
 DEPENDENT = 1e-6
 
 

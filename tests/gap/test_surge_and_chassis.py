@@ -121,7 +121,7 @@ def test_a_chassis_bears_what_hangs_on_the_payload_and_what_holds_it():
 
 
 def test_a_small_recoil_in_one_coordinate_is_significant():
-    """A heavy chassis that moves up and down at 34 Hz: the test counts its own five parameters, not the rig's."""
+    """A heavy chassis that moves up and down at 34 Hz: the test counts its coordinates and the frequencies searched."""
     truth = MODEL.with_effect(
         active(library()["base_compliance"], MODEL, "chassis/translation", [1500.0, 0.018, 280.0, 280.0, 34.0])
     )

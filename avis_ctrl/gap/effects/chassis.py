@@ -44,7 +44,7 @@ class ChassisSettings:
     heights_m : height of the mass over the table's centre, and of the springs over the mass [m], at which a fit starts.
     lines : lines of a record for the search around a fit: fewer than the fit's, because only the order of the groups of
         coordinates matters.
-    followed_groups : groups of coupled coordinates from which a fit is repeated, the most promising first.
+    followed_groups : number of groups of coordinates whose new frequencies are fitted, the most promising first.
     """
 
     own_Hz: tuple[float, float, int] = (7.0, 90.0, 26)
@@ -163,9 +163,9 @@ class BaseCompliance(OfMounts):
         return [Seed(tuple(float(v) for v in values), took.chi2, len(best), SETTINGS.own_Hz[2] ** len(best))]
 
     def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
-        """The same law with other frequencies of one group of coupled coordinates: those that reduce the sum of squares
-        most if the chassis does not move in this group otherwise. A fit can end with a wrong frequency, for which the
-        other parameters compensate."""
+        """The same law with other frequencies of one coordinate, or of two coupled ones. A fit can end with a wrong
+        frequency, for which the other parameters compensate. Therefore the chassis is first fixed in these coordinates,
+        and the score test then gives the frequencies that reduce the sum of squares most."""
         blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
         rest, place = score.model.without(one.label), one.place
         here, found = Score(rest.with_effect(one), blocks).chi2, []
@@ -173,11 +173,11 @@ class BaseCompliance(OfMounts):
             if not set(group) <= set(_coordinates(place)):
                 continue
             fixed = _with_frequencies(one, dict.fromkeys(group, SETTINGS.fixed_Hz))
-            score = Score(rest.with_effect(fixed), blocks)
-            best, took = _resonances(score, group)
-            radii = [_radius(one.by_name["mass_kg"], inverse) for inverse in took.coefficients]
-            moved = _with_frequencies(fixed, best, dict(zip(best, radii, strict=True)))
-            found.append((score.chi2 - took.chi2, moved.values))
+            without = Score(rest.with_effect(fixed), blocks)
+            best, took = _resonances(without, group)
+            inverse = dict(zip(best, took.coefficients, strict=True))
+            radii = {turn: _radius(one.by_name["mass_kg"], inverse[turn]) for turn in best if len(turn) > 1}
+            found.append((without.chi2 - took.chi2, _with_frequencies(fixed, best, radii).values))
         return [(place, values) for chi2, values in sorted(found)[: SETTINGS.followed_groups] if chi2 < here]
 
     def implausible(self, values: Values, std: Values) -> str:
@@ -232,9 +232,9 @@ def _radius(mass: float, inverse_inertia: float) -> float:
 def _with_frequencies(
     one: ActiveEffect, frequencies: dict[str, float], radii: dict[str, float] | None = None
 ) -> ActiveEffect:
-    """A chassis with other frequencies [Hz] and radii of gyration [m] of some coordinates."""
+    """A chassis with other frequencies [Hz] of some coordinates, and other radii of gyration [m] of some rotations."""
     values = one.by_name | {f"{coordinate}_Hz": f for coordinate, f in frequencies.items()}
-    values |= {f"gyration_{c[1]}_m": radius for c, radius in (radii or {}).items() if len(c) > 1}
+    values |= {f"gyration_{turn[1]}_m": radius for turn, radius in (radii or {}).items()}
     return one.at(list(values.values()))
 
 
@@ -270,8 +270,9 @@ def _greedy(
                 one = reduction(gram[np.ix_(own, own)], product[own])
                 if np.all(one.coefficients > 0):
                     trials.append((one.chi2, k, one))
-        if not trials or max(trials, key=itemgetter(0))[0] < SETTINGS.least_gain * took.chi2:
+        chi2, k, more = max(trials, key=itemgetter(0), default=(0.0, 0, took))
+        if not trials or chi2 < SETTINGS.least_gain * took.chi2:
             return best, took
-        _, k, took = max(trials, key=itemgetter(0))
+        took = more
         rows.append(k)
         best[labels[k][0]] = labels[k][1]
