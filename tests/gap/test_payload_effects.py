@@ -401,18 +401,3 @@ def test_a_mass_without_strength_changes_nothing():
     with_it, without = (Assembled(one.operators(2 * np.pi * F)) for one in (model, BARE))
     np.testing.assert_array_equal(with_it.D, without.D)
     assert model.inner_transients(2 * np.pi * F).shape == (len(F), 6, 0)
-
-
-@pytest.mark.parametrize(
-    ("name", "place", "values", "of"),
-    [
-        ("cable_stiffness", "payload/axes", [60.0, 0.0, 0.0, 0.0, *PLACE], "k_x_N_per_m"),
-        ("attached_oscillator", "payload/axes", [0.6, 14.0, 9.0, 21.0, ZETA, *PLACE], "mass_kg"),
-    ],
-)
-def test_what_the_data_do_not_tell_from_none_is_not_taken(name, place, values, of):
-    own = library()[name]
-    named = dict(zip((one.name for one in own.parameters(BARE, place)), values, strict=True))
-    std = dict.fromkeys(named, 0.0)
-    assert own.implausible(named, {**std, of: named[of] / 2})
-    assert not own.implausible(named, {**std, of: named[of] / 4})

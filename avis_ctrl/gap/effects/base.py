@@ -143,11 +143,6 @@ class Added(NamedTuple):
     output: np.ndarray | None = None
 
 
-def differs_from_zero(values: Values, std: Values, names: Iterable[str]) -> bool:
-    """Whether any of these parameters is more than three standard deviations from zero."""
-    return any(abs(values[name]) > 3 * std[name] for name in names)
-
-
 def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
     """Parameters of mounts, contacts or drives that differ from their mean; words has {} for the name."""
     return (

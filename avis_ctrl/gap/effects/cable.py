@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, register
 from avis_ctrl.gap.effects.impedance import about, at_points, positions, project
 from avis_ctrl.gap.effects.line_of_action import along, best_direction, reported_line
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
@@ -72,14 +72,6 @@ class CableStiffness(AtPoint):
             near = about(np.array(found[0].values[-3:]), 0.5**halving)
             found = sorted(found + of(G, b, near, parameters[0].high), key=lambda seed: -seed.chi2)
         return found
-
-    def implausible(self, values: Values, std: Values) -> str:
-        names = [name for name in values if name.startswith(("along_", "k_"))]
-        return (
-            ""
-            if differs_from_zero(values, std, names)
-            else ("a cable whose stiffness the data do not distinguish from zero")
-        )
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         """For one direction: stiffness, direction, and the foot of the line of action. Otherwise all stiffnesses,

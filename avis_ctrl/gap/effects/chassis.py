@@ -9,7 +9,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from avis_ctrl.gap.effects.base import EffectParameter, Table, Values, differs_from_zero, register
+from avis_ctrl.gap.effects.base import EffectParameter, Table, Values, register
 from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.mounts import OfMounts
 from avis_ctrl.gap.effects.sensors import receptance
@@ -179,13 +179,6 @@ class BaseCompliance(OfMounts):
             radii = {turn: _radius(one.by_name["mass_kg"], inverse[turn]) for turn in best if len(turn) > 1}
             found.append((without.chi2 - took.chi2, _with_frequencies(fixed, best, radii).values))
         return [(place, values) for chi2, values in sorted(found)[: SETTINGS.followed_groups] if chi2 < here]
-
-    def implausible(self, values: Values, std: Values) -> str:
-        return (
-            ""
-            if differs_from_zero(values, std, ["mass_kg"])
-            else ("a chassis so heavy that the data do not distinguish it from a fixed one")
-        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         mass, damping, stiffness = of_chassis(values)

@@ -9,18 +9,7 @@ import numpy as np
 
 from avis_ctrl.gap.dahl import dahl
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
-from avis_ctrl.gap.effects.base import (
-    Added,
-    Effect,
-    EffectParameter,
-    Reported,
-    Table,
-    Values,
-    differs_from_zero,
-    register,
-    shares,
-    uneven,
-)
+from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Reported, Table, Values, register, shares, uneven
 from avis_ctrl.gap.effects.impedance import peaks, project
 from avis_ctrl.gap.effects.sensors import sprung
 from avis_ctrl.gap.operators import Operators, mount_geometry
@@ -170,13 +159,6 @@ class MountSurge(OfMounts):
                 values = (f, 0.5, max(zeta, SETTINGS.least_surge_damping), *np.zeros(len(units) - 1))
                 found.append(Seed(tuple(map(float, values)), took.chi2, len(units), len(tried)))
         return sorted(found, key=lambda seed: -seed.chi2)
-
-    def implausible(self, values: Values, std: Values) -> str:
-        return (
-            ""
-            if differs_from_zero(values, std, ["frequency_Hz"])
-            else ("a resonance whose frequency the data do not determine")
-        )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         up = vertical(ops.base.rig)
