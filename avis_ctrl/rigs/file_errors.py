@@ -15,43 +15,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from avis_ctrl.errors import InputError
 
 Content = TypeVar("Content", bound=BaseModel)
-_UNITS = {
-    "kg",
-    "g",
-    "t",
-    "lb",
-    "m",
-    "mm",
-    "cm",
-    "um",
-    "in",
-    "N",
-    "kN",
-    "mN",
-    "Nm",
-    "Ns",
-    "Nms",
-    "kNs",
-    "per",
-    "rad",
-    "deg",
-    "V",
-    "mV",
-    "kV",
-    "Hz",
-    "kHz",
-    "rtHz",
-    "s",
-    "ms",
-    "us",
-    "s2",
-    "Vs",
-    "Vs2",
-    "kgm2",
-    "gmm2",
-    "kgmm2",
-    "gcm2",
-}
+_UNITS = (
+    "kg g t lb m mm cm um in N kN mN Nm Ns Nms kNs per rad deg V mV kV Hz kHz rtHz s ms us s2 Vs Vs2 kgm2 "
+    "gmm2 kgmm2 gcm2"
+)
 
 # Wording of pydantic, such as "Input should be greater than or equal to 1", replaced by that of these messages.
 _PLAIN = (
@@ -131,7 +98,7 @@ def _unknown_key(key: str, absent: Sequence[str], known: Sequence[str]) -> str:
 def _stem(key: str) -> str:
     """The key without its unit: "mass_kg" and "mass_g" are both "mass"."""
     parts = key.split("_")
-    while len(parts) > 1 and parts[-1] in _UNITS:
+    while len(parts) > 1 and parts[-1] in _UNITS.split():
         parts.pop()
     return "_".join(parts)
 
