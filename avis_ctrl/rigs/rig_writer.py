@@ -13,7 +13,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AXES, INERTIA, AvisTable
 from avis_ctrl.rigs.equipment import Ambient, Electronics
 from avis_ctrl.rigs.halcyonics import Halcyonics
-from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument
+from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument, PositionSensorAt
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -28,6 +28,7 @@ class _Line:
 
 # Title as written in the file, name used in comments and messages, and lines.
 _Section = tuple[str, str, list[_Line]]
+_KINDS = {GeophoneAt: "geophone", AccelerometerAt: "accelerometer", PositionSensorAt: "position_sensor"}
 
 
 def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = "") -> str:
@@ -85,14 +86,8 @@ def _toml(value: Any) -> str:
     return f"[{', '.join(_toml(one) for one in value)}]"
 
 
-def _plain(thing: object, *names: str) -> list[_Line]:
-    """Lines of attributes that have the same name in the file and in the rig."""
-    return [_Line(name, getattr(thing, name)) for name in names]
-
-
 def _ambient(ambient: Ambient | None) -> list[_Section]:
-    names = ("floor_velocity_rms_m_per_s", "sensor_noise_rms_V")
-    return [("[ambient]", "ambient", _plain(ambient, *names))] if ambient else []
+    return [("[ambient]", "ambient", _all(ambient))] if ambient else []
 
 
 def _sum_for(parts: Iterable[float], bases: Iterable[float]) -> list[float]:
@@ -132,7 +127,7 @@ def _avis_sections(rig: AvisTable) -> list[_Section]:
         if any(one.chassis_offset):
             lines.append(_Line("chassis_point_m", _sum_for(one.chassis_offset, one.position)))
         sections.append(("[[isolator]]", f"isolator[{number}]", lines))
-    motors, a = rig.motors, rig.acquisition
+    motors = rig.motors
     lines = [
         _Line("names", [m.name for m in motors]),
         _Line("isolator", [m.isolator for m in motors]),
@@ -142,39 +137,14 @@ def _avis_sections(rig: AvisTable) -> list[_Section]:
     sections.append(("[actuators]", "actuators", [*(lines if motors else []), _Line("limit_V", rig.limit_V)]))
     sections += [("[[drive]]", f"drive[{k}]", _at_place(one)) for k, one in enumerate(rig.drives, 1)]
     if rig.geophones is not None:
-        sections.append(
-            (
-                "[geophones]",
-                "geophones",
-                _plain(
-                    rig.geophones,
-                    "names",
-                    "isolator",
-                    "axis",
-                    "sensitivity_Vs_per_m",
-                    "suspension_Hz",
-                    "suspension_damping",
-                    "compensated_Hz",
-                    "compensated_damping",
-                    "preamplifier_gain",
-                ),
-            )
-        )
+        sections.append(("[geophones]", "geophones", _all(rig.geophones)))
     counted: dict[str, int] = {}
     for instrument in rig.instruments:
-        kind = (
-            "geophone"
-            if isinstance(instrument, GeophoneAt)
-            else "accelerometer"
-            if isinstance(instrument, AccelerometerAt)
-            else "position_sensor"
-        )
+        kind = _KINDS[type(instrument)]
         counted[kind] = counted.get(kind, 0) + 1
         sections.append((f"[[{kind}]]", f"{kind}[{counted[kind]}]", _at_place(instrument)))
     sections += [("[[floor_sensor]]", f"floor_sensor[{k}]", _all(one)) for k, one in enumerate(rig.floor_sensors, 1)]
-    sections.append(
-        ("[acquisition]", "acquisition", _plain(a, "sample_rate_Hz", "adc_bits", "adc_range_V", "loop_delay_s"))
-    )
+    sections.append(("[acquisition]", "acquisition", _all(rig.acquisition)))
     return sections + _ambient(rig.ambient) + _tolerances(rig)
 
 
@@ -251,20 +221,7 @@ def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
                 _Line("free_constant_N_per_V", rig.reaction.constant_N_per_V),
             ],
         ),
-        (
-            "[accelerometers]",
-            "accelerometers",
-            _plain(
-                rig.accelerometers,
-                "at",
-                "sensitivity_Vs2_per_m",
-                "low_corner_Hz",
-                "noise_m_per_s2_rtHz",
-                "sample_rate_Hz",
-                "loop_delay_s",
-                "drive_limit_V",
-            ),
-        ),
+        ("[accelerometers]", "accelerometers", _all(rig.accelerometers)),
     ]
     if (load := rig.load) is not None:
         moments = ("Ixx", "Iyy", "Izz")
