@@ -239,8 +239,8 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
         bands,
         on_floor,
         payload,
-        rating(bands, payload.max(axis=1)).criterion,
-        rating(bands, on_floor).criterion,
+        rating(bands, payload.max(axis=1)),
+        rating(bands, on_floor),
         volts,
         {name: PEAK_FACTOR * value for name, value in volts.items()},
     )
