@@ -13,7 +13,7 @@ from avis_command import avis
 
 from avis_ctrl.measurement.formats import write_campaign
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.simulation import simulate_campaign
+from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.study.plan_file import plan_from_table
 
 DESIGN = Path(__file__).resolve().parents[1] / "designs/avis_z_phix.toml"

@@ -16,7 +16,7 @@ from avis_ctrl.measurement.formats import write_campaign
 from avis_ctrl.measurement.formats.hdf5_writing import STRUCTURE, PatientFile
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
-from avis_ctrl.simulation import simulate_campaign
+from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.study.plan_file import plan_from_table
 
 # A file may not grow beyond this many bytes (Python ignores the signal, so that the write ends with EFBIG).

@@ -30,8 +30,8 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
-from avis_ctrl.simulation import simulate
 from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, AntiWindup, lever_arms
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.random_plants import random_perturbations

@@ -11,7 +11,7 @@ from avis_ctrl.export.c_source import Provenance, c_files
 from avis_ctrl.export.certificate import shipped_loop
 from avis_ctrl.export.compiled import CompiledController
 from avis_ctrl.export.protection import Processor, protection
-from avis_ctrl.simulation import simulate
+from avis_ctrl.simulation.loop import simulate
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from avis_ctrl.report.matplotlib_backend import svg
 from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section, Table
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.simulation import rehearse
+from avis_ctrl.simulation.rehearsal import rehearse
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
 from avis_ctrl.study.plan_file import plan_from_table
 

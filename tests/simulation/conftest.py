@@ -9,7 +9,7 @@ from avis_ctrl.lti import StateSpace, append, tf
 from avis_ctrl.rigs import COORDINATES, load_rig
 from avis_ctrl.rigs.floor_spectrum import shipped_spectrum
 from avis_ctrl.rigs.subsystem import critical_gains
-from avis_ctrl.simulation import SampledLoop, rig_bank
+from avis_ctrl.simulation.sampled_loop import SampledLoop, rig_bank
 
 CONTROLLED = ("z", "phi_x")
 

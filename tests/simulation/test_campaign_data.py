@@ -13,10 +13,10 @@ from avis_ctrl.lti import gain
 from avis_ctrl.measurement.campaign import digest
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.floor_spectrum import shipped_spectrum
-from avis_ctrl.simulation import simulate
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 from avis_ctrl.simulation.discrete import digital_controller
+from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.spectrum_check import POINTS_PER_LINE, REACH_LINES, welch_moments
 
 SILENT = {"ambient": {"velocity_rms_m_per_s": 0.0}, "sensors": {"noise": False, "quantiser": False}, "settle_s": 0.0}

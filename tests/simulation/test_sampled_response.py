@@ -7,8 +7,8 @@ import pytest
 
 from avis_ctrl.lti import StateSpace, gain, tf
 from avis_ctrl.rigs import COORDINATES
-from avis_ctrl.simulation import predict_transmissibility_6dof, sampled_response, simulate
-from avis_ctrl.simulation.sampled_response import IMAGES
+from avis_ctrl.simulation.loop import simulate
+from avis_ctrl.simulation.sampled_response import IMAGES, predict_transmissibility_6dof, sampled_response
 
 PERIOD = 4000
 TONES = {"x": [9, 40], "y": [11, 61], "z": [13, 83], "phi_x": [17, 101], "phi_y": [19, 160], "phi_z": [23, 290]}

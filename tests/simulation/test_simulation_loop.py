@@ -13,9 +13,10 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import discretise, gain
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.simulation import SampledLoop, simulate, spectral_radius
 from avis_ctrl.simulation.culprit import find_culprit
-from avis_ctrl.simulation.sampled_loop import SensorBank
+from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.loop import simulate
+from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank
 
 SKEW = {"com_x": 0.05, "com_y": -0.03, "com_z": 0.12, "J12": 3.0, "J13": -2.0, "J23": 4.0}
 START = np.array([1.0, -2.0, 3.0, 1.5, -1.0, 2.0, 10.0, 20.0, -15.0, 5.0, -8.0, 12.0])

@@ -8,8 +8,9 @@ import pytest
 from scipy import signal, stats
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.simulation import check_designs, check_spectrum_agreement, simulate
-from avis_ctrl.simulation.spectrum_check import POINTS_PER_LINE, REACH_LINES, welch_moments
+from avis_ctrl.simulation.design_check import check_designs
+from avis_ctrl.simulation.loop import simulate
+from avis_ctrl.simulation.spectrum_check import POINTS_PER_LINE, REACH_LINES, check_spectrum_agreement, welch_moments
 
 ALL = ("x", "y", "z", "phi_x", "phi_y", "phi_z")
 

@@ -15,7 +15,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import read_measurements, write_campaign
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.simulation import rehearse
+from avis_ctrl.simulation.rehearsal import rehearse
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
