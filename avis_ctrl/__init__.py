@@ -51,39 +51,22 @@ from typing import Any
 
 __version__ = "0.4.0"
 
-_PLACES = {
-    "rig": "avis_ctrl.interface.workflow",
-    "campaign": "avis_ctrl.interface.workflow",
-    "simulate_campaign": "avis_ctrl.interface.workflow",
-    "identify": "avis_ctrl.interface.workflow",
-    "design": "avis_ctrl.interface.workflow",
-    "single_axis": "avis_ctrl.interface.workflow",
-    "StateSpace": "avis_ctrl.lti",
-    "hinf_norm": "avis_ctrl.lti",
-    "tf": "avis_ctrl.uncertainty.uncertain_models",
-    "ss": "avis_ctrl.uncertainty.uncertain_models",
-    "connect": "avis_ctrl.uncertainty.uncertain_models",
-    "real": "avis_ctrl.uncertainty.uncertain_models",
-    "complex_disk": "avis_ctrl.uncertainty.uncertain_models",
-    "dynamics": "avis_ctrl.uncertainty.uncertain_models",
-    "matrix": "avis_ctrl.uncertainty.uncertain_models",
-    "InputError": "avis_ctrl.errors",
-    "ComputationError": "avis_ctrl.errors",
-    "RealScalar": "avis_ctrl.uncertainty.blocks",
-    "ComplexScalar": "avis_ctrl.uncertainty.blocks",
-    "ComplexFull": "avis_ctrl.uncertainty.blocks",
-    "BlockStructure": "avis_ctrl.uncertainty.blocks",
-    "hinfsyn": "avis_ctrl.robust.hinfsyn",
-    "musyn": "avis_ctrl.robust.musyn",
-    "mu": "avis_ctrl.robust.mu",
-    "mu_peak": "avis_ctrl.robust.mu_peak",
-    "worst_case_gain": "avis_ctrl.robust.robustness",
-    "robust_stability": "avis_ctrl.robust.robustness",
-    "robust_performance": "avis_ctrl.robust.robustness",
-    "disk_margin": "avis_ctrl.robust.disk_margin",
-    "mixed_sensitivity": "avis_ctrl.robust.mixed_sensitivity",
-    "uncertainty_weight": "avis_ctrl.uncertainty.uncertainty_weight",
+_MODULES = {
+    "interface.workflow": "rig campaign simulate_campaign identify design single_axis",
+    "lti": "StateSpace hinf_norm",
+    "uncertainty.uncertain_models": "tf ss connect real complex_disk dynamics matrix",
+    "errors": "InputError ComputationError",
+    "uncertainty.blocks": "RealScalar ComplexScalar ComplexFull BlockStructure",
+    "robust.hinfsyn": "hinfsyn",
+    "robust.musyn": "musyn",
+    "robust.mu": "mu",
+    "robust.mu_peak": "mu_peak",
+    "robust.robustness": "worst_case_gain robust_stability robust_performance",
+    "robust.disk_margin": "disk_margin",
+    "robust.mixed_sensitivity": "mixed_sensitivity",
+    "uncertainty.uncertainty_weight": "uncertainty_weight",
 }
+_PLACES = {name: f"avis_ctrl.{module}" for module, names in _MODULES.items() for name in names.split()}
 # Subpackages that are public names as well; `gap` is callable.
 _PACKAGES = ("gap", "plot")
 
