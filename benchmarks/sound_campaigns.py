@@ -167,7 +167,7 @@ class _Bench:
         n = settle + len(u)
         floor = np.zeros((n + 1, 6))
         for axis in range(3):
-            floor[:-1, axis] = realise(self.ambient, n / self.fs, 1 / self.fs, rng).velocity
+            floor[:-1, axis] = realise(self.ambient, n / self.fs, 1 / self.fs, rng)
         floor[-1] = floor[-2]
         if from_rest:
             floor[:settle] = 0

@@ -318,7 +318,7 @@ def _floor(
     velocity = np.zeros((samples + 1, 6))
     if ambient is not None:
         for axis in range(3):
-            velocity[:-1, axis] = realise(ambient, samples / fs, 1 / fs, rng).velocity
+            velocity[:-1, axis] = realise(ambient, samples / fs, 1 / fs, rng)
     if one.plan.floor_rms_m_per_s is not None:
         low, high = one.plan.band_Hz or plan.band_Hz
         velocity[settle:-1, :3] += one.plan.floor_rms_m_per_s * band_limited(len(one.u), fs, (low, high), 3, rng)

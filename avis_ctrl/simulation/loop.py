@@ -70,8 +70,7 @@ def floor_velocity(loop: SampledLoop, samples: int, rng: np.random.Generator) ->
     for name, spectrum in loop.floor.items():
         if name not in COORDINATES:
             raise InputError(f"a coordinate out of {COORDINATES}", field="floor", value=name)
-        record = realise(spectrum, samples * loop.period_s, loop.period_s, rng)
-        velocity[:-1, COORDINATES.index(name)] = record.velocity
+        velocity[:-1, COORDINATES.index(name)] = realise(spectrum, samples * loop.period_s, loop.period_s, rng)
     velocity[-1] = velocity[0]
     return velocity
 

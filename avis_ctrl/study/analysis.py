@@ -230,8 +230,8 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
 
     n = len(plant.axes)
     bands = third_octave_midbands(1.0, 80.0)
-    payload = np.stack([third_octave_rms(frequency, density[:, k], bands)[1] for k in range(n)], axis=1)
-    on_floor = third_octave_rms(frequency, floor, bands)[1]
+    payload = np.stack([third_octave_rms(frequency, density[:, k], bands) for k in range(n)], axis=1)
+    on_floor = third_octave_rms(frequency, floor, bands)
     volts = {name: rms(density[:, n + k]) for k, name in enumerate(plant.actuators)}
     return SiteResponse(
         {axis: rms(density[:, k], *band_Hz) for k, axis in enumerate(plant.axes)},
