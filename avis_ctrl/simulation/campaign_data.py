@@ -114,7 +114,7 @@ def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
     corner = plan.amplifier_corner_Hz
     # The controller's conditioning of each channel does not affect the records. Offset and 1/f noise are omitted: a
     # campaign's noise model is white.
-    bank = replace(rig_bank(rig, 1.0).white(), conditioning=None)
+    bank = rig_bank(rig, 1.0).white()
     if "acceleration" in bank.quantities:
         corner = corner or ACCELEROMETER_AMPLIFIER_HZ
     bank = replace(

@@ -70,12 +70,12 @@ def digital_controller(loop: SampledLoop) -> StateSpace:
     decoding = arms[:, None] * decoding / bank.gain_V
     forces = append(*(sampled(part, T) for part in (loop.K, *loop.loops.values())))
     seen = gain(decoding, dt=T)
-    if len({id(one) for one in bank.filters}) > 1:
-        parts = [gain(1.0, dt=T) if one is None else sampled(one, T) for one in bank.filters]
+    if len({id(one) for one in bank.conditioning}) > 1:
+        parts = [gain(1.0, dt=T) if one is None else sampled(one, T) for one in bank.conditioning]
         seen = seen @ append(*parts)
-    elif bank.filters[0] is not None:
+    elif bank.conditioning[0] is not None:
         # The same filter in every channel commutes with the decoding: one copy per axis is enough.
-        seen = append(*[sampled(bank.filters[0], T)] * len(names)) @ seen
+        seen = append(*[sampled(bank.conditioning[0], T)] * len(names)) @ seen
     # A force F at the edge is a moment arm * F.
     return gain(allocation * arms, dt=T) @ forces @ seen
 

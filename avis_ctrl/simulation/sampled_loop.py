@@ -22,7 +22,6 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.rigs.floor_motion import DERIVATIVES
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
@@ -40,51 +39,30 @@ class SensorBank:
 
     Attributes
     ----------
-    quantity : what the sensors measure, "velocity" [m/s] or "acceleration" [m/s^2] of the payload in space, or
-        "displacement" [m] of the payload relative to the chassis; one for all, or one per sensor.
+    quantities : what each sensor measures, "velocity" [m/s] or "acceleration" [m/s^2] of the payload in space, or
+        "displacement" [m] of the payload relative to the chassis.
     chains : one system per sensor, from motion to volts.
     gain_V : (n_s,) volts per unit of motion in the passband; the controller divides by it.
     noise_rms_V : (n_s,) white noise of one sample, before the converter.
-    converter : None for unlimited resolution.
     conditioning : filter that the controller applies to each channel after division by the gain (an accelerometer's
-        integrator), one for all or one per sensor; None for none.
+        integrator); None for none.
+    converter : None for unlimited resolution.
     flicker_rms_V : (n_s,) r.m.s. of the white noise whose density equals that of the 1/f noise at 1 Hz.
     offset_V : (n_s,) constant offset of each channel's reading; zero by default.
     """
 
-    quantity: str | tuple[str, ...]
+    quantities: tuple[str, ...]
     chains: tuple[StateSpace, ...]
     gain_V: np.ndarray
     noise_rms_V: np.ndarray
+    conditioning: tuple[StateSpace | None, ...]
     converter: Converter | None = None
-    conditioning: StateSpace | tuple[StateSpace | None, ...] | None = None
     flicker_rms_V: np.ndarray = field(default_factory=lambda: np.zeros(1))
     offset_V: np.ndarray = field(default_factory=lambda: np.zeros(1))
 
     def __post_init__(self) -> None:
-        n = len(self.chains)
-        if len(self.quantities) != n or not set(self.quantities) <= set(DERIVATIVES):
-            raise InputError(
-                f"velocity, acceleration or displacement for each of {n} sensors", field="quantity", value=self.quantity
-            )
-        if len(self.filters) != n:
-            raise InputError(f"one filter, or {n}", field="conditioning", value=len(self.filters))
         for name in ("gain_V", "noise_rms_V", "flicker_rms_V", "offset_V"):
-            values = np.array(np.broadcast_to(getattr(self, name), (n,)), dtype=float)
-            if not np.all(np.isfinite(values)) or (name != "offset_V" and np.any(values < 0)):
-                raise InputError(f"{n} finite numbers, not negative", field=name, value=values.tolist())
-            object.__setattr__(self, name, values)
-
-    @property
-    def quantities(self) -> tuple[str, ...]:
-        """Quantity that each sensor measures."""
-        return (self.quantity,) * len(self.chains) if isinstance(self.quantity, str) else tuple(self.quantity)
-
-    @property
-    def filters(self) -> tuple[StateSpace | None, ...]:
-        """The conditioning of each channel."""
-        alike = self.conditioning is None or isinstance(self.conditioning, StateSpace)
-        return (self.conditioning,) * len(self.chains) if alike else self.conditioning  # type: ignore
+            object.__setattr__(self, name, np.array(np.broadcast_to(getattr(self, name), len(self.chains)), float))
 
     @property
     def white_variance_V2(self) -> np.ndarray:
@@ -108,8 +86,6 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
     """
     sensors, filters = rig.sensors(), conditioning(rig, integrator_corner_Hz)
     systems = {one: None if one.is_one else one.system() for one in filters}
-    made = tuple(systems[one] for one in filters)
-    kinds = tuple(one.quantity for one in sensors)
     # Identical sensors share one chain object.
     chains = {
         one: one.chain()
@@ -118,12 +94,12 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
         )
     }
     return SensorBank(
-        kinds[0] if len(set(kinds)) == 1 else kinds,
+        tuple(one.quantity for one in sensors),
         tuple(chains[replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))] for one in sensors),
         np.array([one.gain for one in sensors]),
         np.array([one.noise_rms_V for one in sensors]),
+        tuple(systems[one] for one in filters),
         rig.converter,
-        made[0] if len(set(filters)) == 1 else made,
         np.array([one.flicker_rms_V for one in sensors]),
     )
 
@@ -179,7 +155,8 @@ class SampledLoop:
 
     Raises
     ------
-    InputError : sizes or names that do not fit, a delay that needs more than MAX_SUBSTEPS steps per sample period.
+    InputError : coordinates controlled twice, accelerometers with drives that act without lag, a delay that needs more
+        than MAX_SUBSTEPS steps per sample period.
     """
 
     rig: Rig
@@ -231,34 +208,6 @@ class SampledLoop:
         controlled = (*self.axes, *self.loops)
         if len(set(controlled)) != len(controlled) or not set(controlled) <= set(COORDINATES):
             raise InputError(f"different coordinates out of {COORDINATES}", field="axes, loops", value=controlled)
-        if self.K.D.shape != (len(self.axes),) * 2:
-            raise InputError(f"a {len(self.axes)} x {len(self.axes)} controller", field="K", value=self.K.D.shape)
-        n_s = len(self.rig.sensor_rows()[0])
-        for name, things, count in (
-            ("sensors", self.sensors.chains, n_s),
-            ("drive_errors", self.drive_errors, self.n_drives),
-        ):
-            if len(things) != count:
-                raise InputError(f"{count} systems", field=name, value=len(things))
-        for name, system in (
-            *self.loops.items(),
-            *((f"drive {k}", s) for k, s in enumerate(self.drive_errors) if s),
-            *((f"sensor {k}", s) for k, s in enumerate(self.sensors.chains)),
-        ):
-            if system.D.shape != (1, 1):
-                raise InputError("one input and one output", field=name, value=system.D.shape)
-        if self.digital is not None and (self.digital.D.shape != (self.n_drives, n_s) or not self.digital.dt):
-            raise InputError(
-                f"a sampled system of {n_s} inputs and {self.n_drives} outputs",
-                field="digital",
-                value=self.digital.D.shape,
-            )
-        if self.drive_coupling is not None and self.drive_coupling.D.shape != (self.n_drives,) * 2:
-            raise InputError(
-                f"a system of {self.n_drives} inputs and outputs",
-                field="drive_coupling",
-                value=self.drive_coupling.D.shape,
-            )
         if "acceleration" in self.sensors.quantities and any(drive.D[0, 0] for drive in self.drives()):
             # Otherwise the acceleration would jump with the voltage, exactly at a sampling instant.
             raise InputError(

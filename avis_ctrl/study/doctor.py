@@ -7,7 +7,7 @@ import platform
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 from typing import Any
@@ -102,11 +102,10 @@ def _simulation() -> str:
     """A table at rest on a motionless floor remains at rest; compiles the kernel."""
     from avis_ctrl.rigs.rig_file import load_rig
     from avis_ctrl.simulation.loop import simulate
-    from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank, rig_bank
+    from avis_ctrl.simulation.sampled_loop import SampledLoop, rig_bank
 
     rig = load_rig("avis")
-    bank = rig_bank(rig, 1.0)
-    silent = SensorBank("velocity", bank.chains, bank.gain_V, np.zeros(len(bank.chains)), bank.converter)
+    silent = replace(rig_bank(rig, 1.0).white(), noise_rms_V=np.zeros(1))
     record = simulate(SampledLoop(rig, gain(np.zeros((1, 1))), ("z",), {}, silent, {}), 0.1, settle_s=0.0)
     if np.any(record.q):
         raise ArithmeticError(f"it moved by {np.max(np.abs(record.q)):.3g} m")
