@@ -6,7 +6,7 @@ from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES, EquationsOfMotion
-from avis_ctrl.rigs.subsystem import reduce_rig, reduction_error
+from avis_ctrl.rigs.subsystem import reduction_error
 
 __all__ = [
     "COORDINATES",
@@ -17,7 +17,6 @@ __all__ = [
     "Rig",
     "actuator_axes",
     "load_rig",
-    "reduce_rig",
     "reduction_error",
     "sensor_axes",
 ]

@@ -13,6 +13,8 @@ from avis_ctrl.classical.skyhook import Skyhook
 from avis_ctrl.classical.tuning import Merit, Scenarios, Search, TuningRange, half_turns
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rig_file import load_rig
+from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_file import read_design
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.skyhooks import TUNING_HZ, critical_gains
@@ -36,6 +38,15 @@ def scenarios(plant) -> Scenarios:
 @pytest.fixture(scope="module")
 def critical() -> tuple[float, ...]:
     return critical_gains(load_rig("avis"), ("z", "phi_x"))
+
+
+def test_critical_gains_give_double_poles_of_each_axis_alone():
+    rig = load_rig("avis")
+    eom = rig.equations_of_motion()
+    for k, name in enumerate(COORDINATES):
+        (g,) = critical_gains(rig, [name]) * lever_arms(rig, [name]) ** 2
+        poles = np.roots([eom.M[k, k], eom.C[k, k] + g, eom.K[k, k]])
+        assert np.allclose(poles, -np.sqrt(eom.K[k, k] / eom.M[k, k]), rtol=1e-6)
 
 
 def random_skyhook(rng: np.random.Generator, critical: tuple[float, ...], reach: float) -> Skyhook:

@@ -8,16 +8,15 @@ import pytest
 from avis_ctrl.lti import StateSpace, append, tf
 from avis_ctrl.rigs import COORDINATES, load_rig
 from avis_ctrl.rigs.floor_spectrum import shipped_spectrum
-from avis_ctrl.rigs.subsystem import critical_gains
 from avis_ctrl.simulation.sampled_loop import SampledLoop, rig_bank
+from avis_ctrl.study.skyhooks import critical_gains
 
 CONTROLLED = ("z", "phi_x")
 
 
 def velocity_feedback(rig, axis: str, factor: float) -> StateSpace:
     """-g v with a high-pass of 0.2 Hz and a low-pass of 150 Hz, g a multiple of critical; in edge units."""
-    arm = rig.edge_m if axis.startswith("phi") else 1.0
-    g, low, high = factor * critical_gains(rig)[axis] / arm**2, 2 * np.pi * 0.2, 2 * np.pi * 150.0
+    g, low, high = factor * critical_gains(rig, [axis])[0], 2 * np.pi * 0.2, 2 * np.pi * 150.0
     return tf([-g * high, 0.0], [1.0, low + high, low * high])
 
 
