@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from avis_ctrl.study.runner import run_design
 from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.sweep.keys import FACTOR, VALUE, expanded, keys_of, put, with_rig_keys
 from avis_ctrl.sweep.points_file import PointsFile
+from avis_ctrl.sweep.task import Job
 
 KEYS = {**keys_of(Design), "base": False}
 BAND = "worst_case_band_transmissibility_dB"
@@ -68,52 +70,47 @@ class DesignBase:
         """Expand a key of the design file or a parameter of its rig."""
         return expanded(key, KEYS, self.rig)
 
-    def job(self, point: Mapping[str, Any]) -> DesignJob:
+    def job(self, point: Mapping[str, Any]) -> Job:
+        """One design on one rig. Its inputs are the design without its title, and the rig file."""
+        design, rig = self.resolved(point)
+        inputs = design.model_dump_json(exclude={"title"}) + rig_toml(rig)
+        return Job(inputs, partial(compute, design, rig, self.skyhook))
+
+    def resolved(self, point: Mapping[str, Any]) -> tuple[Design, Rig]:
         """The design and the rig of a point."""
         if (other := point.get("base")) is not None:
             if not isinstance(other, str):
                 raise InputError("expected the name of a design file", field="base", value=other)
             if other not in self.others:
                 self.others[other] = DesignBase.of(self.path.parent / other, self.skyhook)
-            return self.others[other].job({key: value for key, value in point.items() if key != "base"})
+            return self.others[other].resolved({key: value for key, value in point.items() if key != "base"})
         table = copy.deepcopy(self.table)
         for key, value in point.items():
             if not key.startswith((VALUE, FACTOR)):
                 put(table, key, value, KEYS)
         design, rig = study_of(design_from_table(table), self.path)
-        return DesignJob(design, with_rig_keys(rig, point), self.skyhook)
+        return design, with_rig_keys(rig, point)
 
 
-@dataclass(frozen=True, eq=False)
-class DesignJob:
-    """One design on one rig."""
+def compute(design: Design, rig: Rig, skyhook: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Figures of the controller, and the controller itself."""
+    found, further = _skyhook(design, rig) if skyhook else _mu(design, rig)
+    return figures_of(found) | further, {"controller": controller_dict(found)}
 
-    design: Design
-    rig: Rig
-    skyhook: bool
 
-    @property
-    def inputs(self) -> str:
-        """The design without its title, and the rig file."""
-        return self.design.model_dump_json(exclude={"title"}) + rig_toml(self.rig)
+def _mu(design: Design, rig: Rig) -> tuple[ControllerResult, dict[str, Any]]:
+    result = run_design(design, rig)
+    return result.controller("mu"), {
+        "stable": result.stable,
+        "requirements_met": all(one.met for one in result.requirements),
+    }
 
-    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Figures of the controller, and the controller itself."""
-        found, further = self._skyhook() if self.skyhook else self._mu()
-        return figures_of(found) | further, {"controller": controller_dict(found)}
 
-    def _mu(self) -> tuple[ControllerResult, dict[str, Any]]:
-        result = run_design(self.design, self.rig)
-        return result.controller("mu"), {
-            "stable": result.stable,
-            "requirements_met": all(one.met for one in result.requirements),
-        }
-
-    def _skyhook(self) -> tuple[ControllerResult, dict[str, Any]]:
-        plant = build_plant(self.design, self.rig)
-        made = classical_skyhook(plant, self.rig, self.design)
-        samples = random_perturbations(plant, 0, self.design.simulation.seed)
-        return analyse(self.design, plant, made.K, made.name, made.title, made.kind, samples, made.notes), {}
+def _skyhook(design: Design, rig: Rig) -> tuple[ControllerResult, dict[str, Any]]:
+    plant = build_plant(design, rig)
+    made = classical_skyhook(plant, rig, design)
+    samples = random_perturbations(plant, 0, design.simulation.seed)
+    return analyse(design, plant, made.K, made.name, made.title, made.kind, samples, made.notes), {}
 
 
 def figures_of(found: ControllerResult) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.gap import GapOptions, find_gap
 from avis_ctrl.sweep.keys import FACTOR, VALUE, expanded, keys_of, with_rig_keys
 from avis_ctrl.sweep.points_file import PointsFile
+from avis_ctrl.sweep.task import Job
 
 Hertz = Annotated[float, Field(gt=0)]
 
@@ -73,8 +75,8 @@ class GapBase:
         """Expand an option of `avis gap` or a parameter of the rig."""
         return expanded(key, KEYS, self.rig)
 
-    def job(self, point: Mapping[str, Any]) -> GapJob:
-        """The campaign, the rig and the options of a point."""
+    def job(self, point: Mapping[str, Any]) -> Job:
+        """One search. Its inputs are the hash of the samples, the options and the rig file."""
         names = {"base": self.campaign, "rig": self.rig_name} | {
             key: point[key] for key in ("base", "rig") if key in point
         }
@@ -85,43 +87,27 @@ class GapBase:
         path = (self.folder / names["base"]).resolve()
         if path not in self.digests:
             self.digests[path] = digest(_campaign(path))
-        return GapJob(path, self.digests[path], with_rig_keys(_rig(self.folder, names["rig"]), point), options)
+        rig = with_rig_keys(_rig(self.folder, names["rig"]), point)
+        inputs = self.digests[path] + options.model_dump_json() + rig_toml(rig)
+        return Job(inputs, partial(search, path, rig, options))
 
 
-@dataclass(frozen=True, eq=False)
-class GapJob:
-    """One search. The campaign may be large, so it is read where the point is computed."""
-
-    campaign: Path
-    digest: str
-    rig: Rig
-    options: Options
-
-    @property
-    def inputs(self) -> str:
-        """Hash of the samples, the options and the rig file."""
-        return self.digest + self.options.model_dump_json() + rig_toml(self.rig)
-
-    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Figures of the finding, and gap.json."""
-        o = self.options
-        band = None if o.band_Hz is None else (o.band_Hz[0], o.band_Hz[1])
-        found = find_gap(
-            _campaign(self.campaign),
-            self.rig,
-            GapOptions(o.seed, band, o.gates, o.despite_gates, o.amplifier_corner_Hz),
-        )
-        gap, errors = found.gap, [stage.nrmse for stage in found.gap.stages]
-        figures = {
-            "verdict": gap.verdict,
-            "effects": "; ".join(f"{one.name} at {one.location}" for one in gap.effects),
-            "nrmse_nominal": errors[0],
-            "nrmse_identified": errors[1],
-            "nrmse": errors[-1],
-            "noise_nrmse": gap.noise_nrmse,
-            "search_seconds": gap.seconds,
-        }
-        return figures, {"gap": found.to_json()}
+def search(campaign: Path, rig: Rig, options: Options) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Figures of the finding, and gap.json. The campaign may be large, so it is read where the point is computed."""
+    band = None if options.band_Hz is None else (options.band_Hz[0], options.band_Hz[1])
+    settings = GapOptions(options.seed, band, options.gates, options.despite_gates, options.amplifier_corner_Hz)
+    found = find_gap(_campaign(campaign), rig, settings)
+    gap, errors = found.gap, [stage.nrmse for stage in found.gap.stages]
+    figures = {
+        "verdict": gap.verdict,
+        "effects": "; ".join(f"{one.name} at {one.location}" for one in gap.effects),
+        "nrmse_nominal": errors[0],
+        "nrmse_identified": errors[1],
+        "nrmse": errors[-1],
+        "noise_nrmse": gap.noise_nrmse,
+        "search_seconds": gap.seconds,
+    }
+    return figures, {"gap": found.to_json()}
 
 
 def _campaign(path: Path) -> Campaign:

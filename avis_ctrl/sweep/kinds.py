@@ -7,17 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from avis_ctrl.sweep.points_file import PointsFile
-
-
-class Job(Protocol):
-    """A point with everything that its result depends on; it is pickled to other processes."""
-
-    @property
-    def inputs(self) -> str:
-        """Everything that the result depends on, as text."""
-
-    def compute(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Figures for the table, and further content of the point's file. Raises AvisError."""
+from avis_ctrl.sweep.task import Job
 
 
 class Base(Protocol):

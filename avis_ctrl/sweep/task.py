@@ -8,6 +8,7 @@ import json
 import platform
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +21,6 @@ from avis_ctrl.errors import AvisError
 from avis_ctrl.files import write_whole
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.workers import alone
-from avis_ctrl.sweep.kinds import Job
 
 FORMAT = "avis-sweep-point"
 # Status of results that are kept. A lost point (a process that died, a full disk or memory, a missing library) may
@@ -28,6 +28,18 @@ FORMAT = "avis-sweep-point"
 LASTING = ("done", "failed")
 # The kernels keep module-level state: a cluster process with several threads computes one point at a time.
 _one_at_a_time = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A point with everything that its result depends on; it is pickled to other processes.
+
+    inputs : everything that the result depends on, as text.
+    compute : gives figures for the table, and further content of the point's file. Raises AvisError.
+    """
+
+    inputs: str
+    compute: Callable[[], tuple[dict[str, Any], dict[str, Any]]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,7 +75,7 @@ def test_every_parameter_of_a_wildcard_is_drawn_by_itself(tmp_path):
     file = PointsFile.model_validate({"base": "x", "vary": [drawn("rig_factor.isolator*.k_z", low=0.9, high=1.1)]})
     point = points_of(file, base.expand)[0]
     assert sorted(point) == [f"rig_factor.isolator{n}.k_z" for n in (1, 2, 3, 4)] and len(set(point.values())) == 4
-    before, after = load_rig("avis").parameters(), base.job(point).rig.parameters()
+    before, after = load_rig("avis").parameters(), base.resolved(point)[1].parameters()
     for key, factor in point.items():
         name = key.removeprefix("rig_factor.")
         assert after[name].value == pytest.approx(factor * before[name].value, rel=1e-12)
@@ -92,7 +92,7 @@ def small(folder) -> DesignBase:
 def test_values_reach_the_design_and_the_rig(tmp_path):
     base = small(tmp_path)
     (tmp_path / "other.toml").write_text(SMALL.replace('["z"]', '["z", "phi_x"]'))
-    job = base.job(
+    design, rig = base.resolved(
         {
             "transmissibility.band_dB": -5.0,
             "uncertainty.parameters_percent.isolator1.k_z": 20.0,
@@ -101,13 +101,12 @@ def test_values_reach_the_design_and_the_rig(tmp_path):
             "base": "other.toml",
         }
     )
-    design = job.design
     assert (design.keep, design.transmissibility.band_dB) == (["z", "phi_x"], -5.0)
     assert design.uncertainty.parameters_percent == {"mass": 10.0, "isolator1.k_z": 20.0}
     assert design.uncertainty.actuator_chains.crossover_Hz == 90.0
-    assert job.rig.parameters()["mass"].value == 550.0
+    assert rig.parameters()["mass"].value == 550.0
     # The base itself is as it was.
-    assert base.job({}).design.transmissibility.band_dB == -3.0
+    assert base.resolved({})[0].transmissibility.band_dB == -3.0
 
 
 def test_the_identity_is_that_of_the_resolved_input(tmp_path):
