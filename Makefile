@@ -22,8 +22,9 @@ lint: $(BIN)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# By file, so that what the tests of a file share is computed once.
-TEST = $(BIN)/pytest -n 2 --dist loadfile
+# By file, so that what the tests of a file share is computed once; in the order of the folders, because files with few
+# tests, the slowest among them, would otherwise come last.
+TEST = $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: lint
 	$(TEST) -m "not slow"
