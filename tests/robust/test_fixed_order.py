@@ -63,10 +63,18 @@ def test_slope_is_that_of_differences(full, states, most):
         assert slope @ d == pytest.approx(numeric, rel=0.02, abs=1e-3 * np.linalg.norm(slope))
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
-def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(full, order):
+@pytest.fixture(scope="module")
+def one_state(full):
+    """The last step towards the best controller of one state."""
     P, _, made = full
-    *_, step = fixed_order(Task(P, ONE_DRIVE), made.K, order)
+    *_, step = fixed_order(Task(P, ONE_DRIVE), made.K, 1)
+    return step
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
+def test_less_states_than_the_full_controller_and_less_mu_than_its_truncation(full, one_state, order):
+    P, _, made = full
+    step = one_state if order == 1 else [*fixed_order(Task(P, ONE_DRIVE), made.K, order)][-1]
     K, on_grid = step.K, step.peak
     assert K.nstates <= order
     reached = peak_by_slicot(lft_lower(P, K))
@@ -117,11 +125,10 @@ def test_starts_of_fewer_states_are_tried(full):
 
 
 @pytest.mark.parametrize("most", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_an_added_mode_lowers_the_smoothed_peak(full, most):
+def test_an_added_mode_lowers_the_smoothed_peak(full, one_state, most):
     """By AB13MD, from the best controller of one state."""
-    P, _, made = full
-    task = Task(P, ONE_DRIVE)
-    *_, one = fixed_order(task, made.K, 1)
+    P, _, _ = full
+    task, one = Task(P, ONE_DRIVE), one_state
     longer = with_mode(task, one.K, most)
     assert one.K.nstates < longer.nstates <= one.K.nstates + most
     omega = frequency_grid(lft_lower(P, one.K))
@@ -135,12 +142,11 @@ def test_an_added_mode_lowers_the_smoothed_peak(full, most):
 
 
 @pytest.mark.slow
-def test_a_start_of_fewer_states_gets_all_states_that_are_asked_for(full):
+def test_a_start_of_fewer_states_gets_all_states_that_are_asked_for(full, one_state):
     P, _, made = full
-    *_, one = fixed_order(Task(P, ONE_DRIVE), made.K, 1)
-    *_, three = fixed_order(Task(P, ONE_DRIVE), one.K, 3)
-    assert one.K.nstates < three.K.nstates <= 3
-    assert peak_by_slicot(lft_lower(P, three.K)) <= min(1.03 * made.mu_upper_complex, one.peak)
+    *_, three = fixed_order(Task(P, ONE_DRIVE), one_state.K, 3)
+    assert one_state.K.nstates < three.K.nstates <= 3
+    assert peak_by_slicot(lft_lower(P, three.K)) <= min(1.03 * made.mu_upper_complex, one_state.peak)
 
 
 @pytest.mark.slow

@@ -21,6 +21,8 @@ from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import nominal_loop
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = Path(__file__).resolve().parents[2] / "designs" / "from_campaign.py"
 
 
