@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from avis_ctrl.checks import require
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.uncertainty.weight_base import Weight, smallest_cover
@@ -47,8 +46,6 @@ class IdentifiedSpread(Weight):
     max_order: int = 12
 
     def __post_init__(self) -> None:
-        for name in ("factor", "slope", "tolerance_dB"):
-            require(getattr(self, name), name)
         omega, data = np.asarray(self.omega, float), np.asarray(self.data, float)
         if omega.ndim != 1 or omega.shape != data.shape or omega.size < 2:
             raise InputError(f"expected two vectors of one length, got {omega.shape} and {data.shape}", field="data")

@@ -198,22 +198,11 @@ def test_edges_are_named():
 
 @pytest.mark.parametrize(
     ("parameters", "keep", "words"),
-    [
-        ([UncertainParameter("isolator9.k_z", 0.1)], ("z",), "isolator9.k_z"),
-        ([UncertainParameter("mass", 0.1), UncertainParameter("mass", 0.2)], ("z",), "twice"),
-        ([UncertainParameter("com_y", 0.1)], ("z",), "absolute"),
-        ([UncertainParameter("mass", 0.1)], ("z", "w"), "'w'"),
-    ],
+    [([UncertainParameter("com_y", 0.1)], ("z",), "absolute"), ([UncertainParameter("mass", 0.1)], ("z", "w"), "'w'")],
 )
 def test_what_is_refused(parameters, keep, words):
     with pytest.raises(InputError, match=words):
         uncertain_rig(load_rig("avis"), parameters, keep)
-
-
-@pytest.mark.parametrize("spread", [1.0, 1.5, 0.0, -0.1, float("nan"), float("inf")])
-def test_spreads_that_are_refused(spread):
-    with pytest.raises(InputError, match="mass spread"):
-        UncertainParameter("mass", spread)
 
 
 def test_an_absolute_spread_may_exceed_one():
