@@ -52,15 +52,11 @@ class UncertainParameter:
         """Change of each affected parameter at delta = 1, in the parameter's unit."""
         return {self.name: self.half_range(nominal[self.name])}
 
-    def describe(self, delta: float, nominal: float, unit: str = "") -> str:
+    def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
         """A value of delta in physical terms: "isolator2.k_z at +15 %"."""
         if self.absolute:
-            return f"{self.name} at {nominal + delta * self.spread:.4g} {unit}".rstrip()
+            return f"{self.name} at {nominal[self.name] + delta * self.spread:.4g} {units[self.name]}".rstrip()
         return f"{self.name} at {100 * delta * self.spread:+.3g} %"
-
-    def words(self, delta: float, nominal: Mapping[str, float], units: Mapping[str, str]) -> str:
-        """`describe`, with the rig's values and units by name."""
-        return self.describe(delta, nominal[self.name], units[self.name])
 
 
 # Maximum number of parameters in the description of a direction; the model contains all of them.
@@ -144,10 +140,6 @@ class UncertainRig:
     nominal: dict[str, float]
     units: dict[str, str]
     coordinates: tuple[str, ...]
-
-    def describe(self, deltas: Sequence[float]) -> list[str]:
-        """Each perturbation in physical terms."""
-        return [p.words(float(d), self.nominal, self.units) for p, d in zip(self.parameters, deltas, strict=True)]
 
     def values(self, deltas: Sequence[float]) -> dict[str, float]:
         """Physical values at normalised deltas, for `rig.with_parameters`; changes by several deltas add up."""

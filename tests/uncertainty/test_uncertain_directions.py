@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from avis_ctrl.lti import lft_upper
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.uncertainty.generalized_plant import sample_lft
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainParameter, UncertainRig, uncertain_rig
 
 OMEGA = 2 * np.pi * np.geomspace(0.05, 300.0, 25)
@@ -53,7 +53,7 @@ def mismatch(uncertain: UncertainRig, name: str, keep, deltas) -> float:
     """Largest error relative to the largest response of its kind at a frequency."""
     rig, n = load_rig(name), len(keep)
     axes, actuators = uncertain.coordinates, rig.equations_of_motion().actuators
-    plant = sample_lft(uncertain.system, uncertain.blocks, uncertain.blocks.assemble(list(deltas))).select(
+    plant = lft_upper(uncertain.system, uncertain.blocks.assemble(list(deltas)).real).select(
         [*(f"{a}_rel" for a in axes), *(f"{a}_dot" for a in axes)],
         [*actuators, *(f"floor_{a}_dot" for a in axes), *(f"force_{a}" for a in axes)],
     )
