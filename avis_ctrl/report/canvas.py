@@ -18,13 +18,10 @@ class Canvas:
         self.width, self.height = width, height
         self._shapes: list[str] = []
 
-    def line(
-        self, points: Sequence[Point], colour: str = "#333333", width: float = 1.2, dash: str = "", arrow: bool = False
-    ) -> None:
+    def line(self, points: Sequence[Point], colour: str = "#333333", width: float = 1.2, arrow: bool = False) -> None:
         """A polyline, optionally with an arrowhead at its end."""
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-        style = f' stroke-dasharray="{dash}"' if dash else ""
-        self._shapes.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="{width}"{style}/>')
+        self._shapes.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="{width}"/>')
         if arrow:
             self._head(points[-2], points[-1], colour, 4.0 + 2.0 * width)
 
@@ -49,14 +46,12 @@ class Canvas:
         stroke: str = "#333333",
         line: float = 1.2,
         corner: float = 0.0,
-        dash: str = "",
     ) -> None:
         """A rectangle given by its centre."""
-        style = f' stroke-dasharray="{dash}"' if dash else ""
         self._shapes.append(
             f'<rect x="{centre[0] - width / 2:.1f}" y="{centre[1] - height / 2:.1f}" '
             f'width="{width:.1f}" height="{height:.1f}" rx="{corner}" fill="{fill}" '
-            f'stroke="{stroke}" stroke-width="{line}"{style}/>'
+            f'stroke="{stroke}" stroke-width="{line}"/>'
         )
 
     def circle(

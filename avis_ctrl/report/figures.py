@@ -112,14 +112,13 @@ class Heat:
     """A heat map on a logarithmic colour scale; cells that are not finite and positive are grey.
 
     x_edges : (n + 1,). z : (rows, n), the rows at y = 0, 1, 2 ... label : of the colour bar. range : (lowest, highest)
-    value of the colours, blue and dark brown, the same in all panels of a figure. neutral : value drawn in white.
+    value of the colours, blue and dark brown, the same in all panels of a figure; 1 is drawn in white.
     """
 
     x_edges: np.ndarray
     z: np.ndarray
     label: str
     range: tuple[float, float]
-    neutral: float = 1.0
 
     @property
     def logarithm(self) -> np.ndarray:
@@ -130,8 +129,8 @@ class Heat:
     @property
     def colours(self) -> list[tuple[float, str]]:
         """Stops of the colour scale: position on the logarithmic scale, 0 to 1, and colour."""
-        low, high, middle = (float(np.log10(v)) for v in (*self.range, self.neutral))
-        white = (middle - low) / (high - low)
+        low, high = (float(np.log10(v)) for v in self.range)
+        white = -low / (high - low)
         return [
             (0.0, "#9ecae1"),
             (white, "#ffffff"),

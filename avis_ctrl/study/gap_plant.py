@@ -22,6 +22,7 @@ from avis_ctrl.gap.state_space import drift_at
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.connect import connect, lft_lower
 from avis_ctrl.lti.rational import cascade
+from avis_ctrl.lti.realisation import with_rate_input
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
@@ -94,7 +95,9 @@ def plant_of(
     for axis in plant.axes:
         name = f"sensor chain {axis}"
         systems.pop(f"motion of {name}", None)  # the new parts decode each sensor separately
-        systems[name] = Part(name, "sensor", _sensor_chain(plant, axis))
+        chain = plant.sensor_chain.renamed([f"sensed_{axis}_dot"], [f"clean_{axis}_dot"])
+        # The rate of gravity acts on the velocity twice integrated.
+        systems[name] = Part(name, "sensor", with_rate_input(chain, f"tilt_{axis}", 2))
     return _rebuilt(plant, tuple(systems.values()), wrapped), asked, rig
 
 
@@ -154,29 +157,6 @@ def _rig_part(plant: DesignPlant, model: TableModel, wrapped: StateSpace) -> Sta
     return StateSpace(wrapped.A, plain.B, C, D, 0.0, old.inputs, outputs)
 
 
-def _sensor_chain(plant: DesignPlant, axis: str) -> StateSpace:
-    """Sensor chain of an axis for the sensed velocity and the rate of gravity.
-
-    s^2/(s^2 + a s + b) on the velocity and 1/(s^2 + a s + b) on the rate of gravity, in two states; then the anti-alias
-    filter.
-    """
-    poles = sorted(plant.sensor_chain.poles(), key=abs)
-    _, a, b = np.real(np.poly(poles[:2]))
-    A, B = np.array([[-a, 1.0], [-b, 0.0]]), np.array([[-a, 0.0], [-b, 1.0]])
-    high_pass = StateSpace(
-        A,
-        B,
-        np.array([[1.0, 0.0]]),
-        np.array([[1.0, 0.0]]),
-        0.0,
-        (f"sensed_{axis}_dot", f"tilt_{axis}"),
-        (f"clean_{axis}_dot",),
-    )
-    lags = np.real_if_close(np.array(poles[2:], complex))
-    low_pass = cascade([], lags, float(np.prod(np.abs(lags))), f"clean_{axis}_dot", f"clean_{axis}_dot")
-    return low_pass @ high_pass if lags.size else high_pass
-
-
 def six_dof_is_stable(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace, when: float = 0.0) -> bool:
     """Whether the loop is stable with all six coordinates, the others without control: eigenvalues of a realisation.
 
@@ -226,6 +206,8 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_gain":
             key = f"actuator.{one.place}"
+            if isinstance(rig, Halcyonics):
+                key = f"e{rig.actuator_names.index(one.place) + 1}"
             changes[key] = changes.get(key, known[key].value) * values["gain"]
         elif name == "sensor_gain":
             factors[one.place] *= values["gain"]

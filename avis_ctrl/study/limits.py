@@ -248,11 +248,11 @@ def _part(plant: DesignPlant, name: str, omega: float) -> str:
     """The keys of the design file that set a bound at this frequency, in brackets; empty if they are not known."""
     for weight in plant.weights.values():
         if name == "transmissibility bound" and isinstance(weight, TransmissibilityBound):
-            band, f, beside = weight.bands[0], omega / (2 * np.pi), 2.0**weight.transition_octaves
-            if band.low_Hz <= f <= band.high_Hz:
+            (low, high), f, beside = weight.band_Hz, omega / (2 * np.pi), 2.0**weight.transition_octaves
+            if low <= f <= high:
                 return " (band_dB)"
             # The weight may be stricter than peak_dB here.
-            near = band.low_Hz / beside < f < band.high_Hz * beside
+            near = low / beside < f < high * beside
             return " (transition of band_dB)" if near else " (peak_dB)"
         if name == "control effort bound" and isinstance(weight, ControlEffort):
             # Below this frequency the weight is raised to bound the voltage for the offset.

@@ -34,7 +34,6 @@ from avis_ctrl.uncertainty.generalized_plant import Diagram, GeneralizedPlant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain, UncertainRig, uncertain_rig
 from avis_ctrl.uncertainty.weight_base import Weight
 from avis_ctrl.uncertainty.weights import (
-    Band,
     ComplianceBound,
     ControlEffort,
     FlickerNoise,
@@ -462,8 +461,10 @@ class _Connection:
         """Weighted outputs, per m/s of floor velocity (compliance: per newton)."""
         asked, effort = self.design.transmissibility, self.design.control_effort
         limits_V = self.rig.limits_of(self.actuators)
-        band = Band(asked.band_Hz[0], asked.band_Hz[1], asked.band_dB)
-        bound = TransmissibilityBound(asked.peak_dB, (band,), asked.transition_octaves, asked.tolerance_dB)
+        low, high = asked.band_Hz
+        bound = TransmissibilityBound(
+            asked.peak_dB, (low, high), asked.band_dB, asked.transition_octaves, asked.tolerance_dB
+        )
         self.weights["transmissibility"] = bound
         load = np.abs(self.allocation) * (limits_V.max() / limits_V)[:, None]
         for k, axis in enumerate(self.axes):
@@ -475,7 +476,6 @@ class _Connection:
                 effort.floor_velocity_m_per_s,
                 effort.bandwidth_Hz,
                 effort.reduction,
-                1,
                 offset,
                 effort.offset_corner_Hz,
             )

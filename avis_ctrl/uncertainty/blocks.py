@@ -6,7 +6,7 @@ matrix M connected to Delta (z_delta = M w_delta) has sum(cols) rows and sum(row
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -120,23 +120,6 @@ class BlockStructure:
             if not isinstance(block, Block):
                 raise InputError("expected RealScalar, ComplexScalar or ComplexFull", field="blocks", value=block)
         return BlockStructure(blocks)
-
-    @staticmethod
-    def from_dicts(items: Sequence[Mapping[str, Any]]) -> BlockStructure:
-        """From the JSON form of `Block.as_dict`."""
-        made: list[Block] = []
-        for item in items:
-            if not isinstance(item, Mapping):
-                raise InputError("expected a table with kind, rows, cols and name", field="blocks", value=item)
-            kind, name = item.get("kind"), str(item.get("name") or "")
-            rows, cols = item.get("rows", 0), item.get("cols", 0)
-            if kind == "full":
-                made.append(ComplexFull(rows, cols, name))
-            elif kind in ("real", "complex") and rows == cols:
-                made.append(RealScalar(rows, name) if kind == "real" else ComplexScalar(rows, name))
-            else:
-                raise InputError("expected kind real, complex (rows = cols) or full", field="blocks", value=item)
-        return BlockStructure(tuple(made))
 
     @property
     def n_w(self) -> int:

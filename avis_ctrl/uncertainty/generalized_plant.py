@@ -16,13 +16,11 @@ w_delta/z_delta (declared with an uncertainty block), w, z, u and y. Signals are
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.connect import connect, lft_lower, lft_upper, signal_sources
+from avis_ctrl.lti.connect import connect, lft_lower, signal_sources
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
@@ -52,7 +50,6 @@ class GeneralizedPlant:
     w, z, u, y : names of the remaining signals.
     signals : the connection table.
     parts : the parts with their systems, for the block diagram.
-    units : unit of each signal, if known.
     """
 
     P: StateSpace
@@ -63,7 +60,6 @@ class GeneralizedPlant:
     y: tuple[str, ...]
     signals: tuple[Signal, ...] = ()
     parts: tuple[Part, ...] = ()
-    units: dict[str, str] = field(default_factory=dict)
 
     @property
     def nmeas(self) -> int:
@@ -101,15 +97,7 @@ class GeneralizedPlant:
         kept = {name for part in parts for name in (*part.system.inputs, *part.system.outputs)}
         signals = tuple(s for s in self.signals if s.name in kept and s.name not in absent)
         return GeneralizedPlant(
-            connect(systems, inputs, outputs),
-            self.blocks,
-            tuple(w),
-            tuple(z),
-            self.u,
-            self.y,
-            signals,
-            parts,
-            self.units,
+            connect(systems, inputs, outputs), self.blocks, tuple(w), tuple(z), self.u, self.y, signals, parts
         )
 
     def nominal(self) -> GeneralizedPlant:
@@ -239,14 +227,4 @@ class Diagram:
             tuple(y),
             table,
             tuple(self._parts),
-            {name: unit for name, (_, unit) in self._meaning.items()},
         )
-
-
-def sample_lft(system: StateSpace, blocks: BlockStructure, delta: np.ndarray) -> StateSpace:
-    """F_u(system, Delta): one plant of the set (the first signals are z_delta and w_delta)."""
-    if not blocks.contains(delta):
-        raise InputError("Delta does not have the structure of the blocks", field="delta")
-    if np.any(np.abs(delta.imag) > 0):
-        raise InputError("a sampled Delta must be real; realise a complex one as a system first", field="delta")
-    return lft_upper(system, delta.real)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
-from avis_ctrl.checks import require
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.rational import Rational
-from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
+from avis_ctrl.uncertainty.weight_base import Weight, smallest_cover
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 POINTS_PER_OCTAVE = 8
@@ -47,12 +45,7 @@ class IdentifiedSpread(Weight):
     tolerance_dB: float = 1.0
     max_order: int = 12
 
-    role: ClassVar[Role] = "level"
-    unit: ClassVar[str] = "relative"
-
     def __post_init__(self) -> None:
-        for name in ("factor", "slope", "tolerance_dB"):
-            require(getattr(self, name), name)
         omega, data = np.asarray(self.omega, float), np.asarray(self.data, float)
         if omega.ndim != 1 or omega.shape != data.shape or omega.size < 2:
             raise InputError(f"expected two vectors of one length, got {omega.shape} and {data.shape}", field="data")

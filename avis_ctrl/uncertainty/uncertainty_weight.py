@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti.interchange import frequencies_of, is_response, plot_frequencies, response_of
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.summary import Shown
-from avis_ctrl.uncertainty.weight_base import Role, Weight, smallest_cover
+from avis_ctrl.uncertainty.weight_base import Weight, smallest_cover
 
 Kind = Literal["output", "input", "additive"]
 
@@ -47,9 +47,6 @@ class UncertaintyWeight(Shown, Weight):
     kind: Kind
     tolerance_dB: float
     max_order: int
-
-    role: ClassVar[Role] = "level"
-    unit: ClassVar[str] = "relative"
 
     @cached_property
     def shape(self) -> Rational:

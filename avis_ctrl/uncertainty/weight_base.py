@@ -1,9 +1,8 @@
-"""Base class of weighting filters: a rational shape, a physical unit, a bound, and a description."""
+"""Base class of weighting filters: a rational shape, a bound, and a description."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -12,18 +11,12 @@ from avis_ctrl.lti.magnitude_fit import covering_fits
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.lti.statespace import StateSpace
 
-Role = Literal["limit", "level"]
-
 
 class Weight(ABC):
     """A scalar weighting filter: stable, minimum phase, proper.
 
-    A weight with role "limit" multiplies an output that must stay below `bound`: W = 1/bound. A weight with role
-    "level" multiplies a normalised input to scale it to its maximum size `bound`: W = bound.
+    It multiplies an output that must stay below `limit`, or a normalised input to scale it to its maximum size.
     """
-
-    role: ClassVar[Role]
-    unit: ClassVar[str]
 
     @property
     @abstractmethod
@@ -43,10 +36,9 @@ class Weight(ABC):
         """|W(j omega)| at the frequencies omega [rad/s]."""
         return self.shape.magnitude(omega)
 
-    def bound(self, omega: np.ndarray) -> np.ndarray:
-        """Bound realised by the filter, in `unit`, at the frequencies omega [rad/s]."""
-        magnitude = self.magnitude(omega)
-        return 1.0 / magnitude if self.role == "limit" else magnitude
+    def limit(self, omega: np.ndarray) -> np.ndarray:
+        """1/|W(j omega)|: the limit on an output that the filter multiplies."""
+        return 1.0 / self.magnitude(omega)
 
 
 def smallest_cover(

@@ -180,24 +180,18 @@ def explained(campaign: Campaign) -> Gap:
 
 
 def minimal(gap: Gap, verdict: str = "none") -> Gap:
-    """Nothing but what the class asks for."""
+    """Everything empty that a gap may have empty."""
     return replace(
         gap,
         verdict=verdict,
         effects=(),
-        stages=(),
         where=(),
         remaining=(),
-        noise_nrmse=float("nan"),
         next_experiment=None,
         updated=gap.baseline,
         considered=(),
-        heat=None,
-        sentences=(),
-        held_out="",
         covariance=None,
         shares=(),
-        records=(),
     )
 
 

@@ -209,6 +209,15 @@ def test_gains_in_the_files_are_known_to_the_controller(baseline, design):
     assert found.rig.parameters()["actuator.Az1"].value == pytest.approx(0.8 * old.parameters()["actuator.Az1"].value)
 
 
+def test_a_force_constant_of_the_halcyonics_has_its_own_name():
+    """It is e2 there, and not actuator.A2."""
+    asked, rig = read_study(ROOT / "designs" / "halcyonics_z_phix.toml")
+    model = with_one(TableModel(ResponseModel.of(rig, ("mass",))), "actuator_gain", "A2", (0.8,))
+    found = design_files(asked, model)
+    assert found.inside == ("actuator_gain@A2",)
+    assert found.rig.e == pytest.approx([0.8 * e if k == 1 else e for k, e in enumerate(rig.e)])
+
+
 def test_drift_is_carried_at_the_moment_asked(baseline, design):
     found = design_files(design, with_one(baseline, "stiffness_drift", "isolators", (0.2,)), -0.5)
     old = baseline.rig.parameters()["isolator2.k_z"].value

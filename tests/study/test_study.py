@@ -11,8 +11,9 @@ from typing import Any
 import control
 import numpy as np
 import pytest
+from plant_json import blocks_of
 
-from avis_ctrl.lti import StateSpace
+from avis_ctrl.lti import StateSpace, lft_upper
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.musyn_state import HINF, Iteration
@@ -29,7 +30,6 @@ from avis_ctrl.study.runner import design_provenance, run_design
 from avis_ctrl.study.simulation import nominal_loop, with_delta
 from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexScalar, RealScalar
-from avis_ctrl.uncertainty.generalized_plant import sample_lft
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 FLOOR_HZ = np.geomspace(0.1, 100.0, 40)
@@ -171,9 +171,7 @@ def check_figures(plant: dict[str, Any], controller: dict[str, Any] | None, row:
     )
     if row["mu_upper"] is None:  # the set holds an unstable plant
         return
-    structure = BlockStructure.from_dicts(plant["blocks"]).with_performance(
-        plant["performance"]["rows"], plant["performance"]["cols"]
-    )
+    structure = blocks_of(plant["blocks"]).with_performance(plant["performance"]["rows"], plant["performance"]["cols"])
     assert row["mu_lower"] <= row["mu_upper"] * (1 + 1e-9)
     grid = np.array([N(2j * np.pi * f) for f in [*FLOOR_HZ, row["mu_peak_Hz"]]])
     repeated = any(block.repeated for block in structure.blocks)
@@ -345,7 +343,7 @@ def test_sensor_chains_err_where_they_stand(rig_name):
         values[place] = 0.7
         k = names.index(block.name.removeprefix("sensor chain "))
         row = rows[k, 2:4] / np.array([1.0, rig.edge_m])
-        sampled = sample_lft(plant.full.P, blocks, blocks.assemble(values))
+        sampled = lft_upper(plant.full.P, blocks.assemble(values).real)
         seen = sampled.select([f"seen_{a}_dot" for a in plant.axes], plant.floor_velocities).frequency_response(omega)
         expected = clean + 0.7 * W[:, None, None] * (plant.decoding[:, k, None] * row) @ clean
         np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-9 * np.abs(expected).max())

@@ -82,8 +82,6 @@ def test_the_fit_reaches_a_decade_beyond_the_data_or_a_declared_crossover():
         ({"data": np.full(OMEGA.size, np.nan)}, "data"),
         ({"data": np.ones(3)}, "data"),
         ({"omega": OMEGA[::-1]}, "omega"),
-        ({"factor": 0.0}, "factor"),
-        ({"slope": -1.0}, "slope"),
     ],
 )
 def test_what_is_refused(changes, field):

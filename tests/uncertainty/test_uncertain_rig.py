@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.lti import lft_upper
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.uncertainty.generalized_plant import sample_lft
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter, UncertainRig, edge_name, uncertain_rig
 
 OMEGA = 2 * np.pi * np.geomspace(0.05, 300.0, 25)
@@ -88,8 +88,8 @@ def mismatch(uncertain: UncertainRig, case: str, delta: list[float]) -> float:
     name, _, keep = CASES[case]
     rig, n = load_rig(name), len(keep)
     outputs, inputs = signals(uncertain, rig)
-    Delta = uncertain.blocks.assemble(delta)
-    plant = sample_lft(uncertain.system, uncertain.blocks, Delta).select(outputs, inputs)
+    Delta = uncertain.blocks.assemble(delta).real
+    plant = lft_upper(uncertain.system, Delta).select(outputs, inputs)
     # Point by point: the Schur form of frequency_response loses digits of an acceleration far below resonance.
     sampled = np.array([plant(1j * omega) for omega in OMEGA])
     rebuilt = newton(rig.with_parameters(uncertain.values(delta)), keep, OMEGA)
@@ -130,7 +130,7 @@ def test_the_comparison_notices_a_percent(case):
     for k in range(len(uncertain.parameters)):
         delta = [0.0] * len(uncertain.parameters)
         delta[k] = 0.3
-        sampled = sample_lft(uncertain.system, uncertain.blocks, uncertain.blocks.assemble(delta))
+        sampled = lft_upper(uncertain.system, uncertain.blocks.assemble(delta).real)
         change = sampled.select(outputs, inputs).frequency_response(OMEGA) - nominal
         assert np.max(np.abs(change) / np.abs(nominal).max(axis=(1, 2), keepdims=True)) > 1e-6
 
@@ -172,17 +172,18 @@ def test_a_resting_payload_follows_the_floor_at_low_frequency():
 
 def test_perturbations_in_words():
     relative = UncertainParameter("isolator2.k_z", 0.15)
-    assert relative.describe(1.0, 2e5) == "isolator2.k_z at +15 %"
-    assert relative.describe(-0.5, 2e5) == "isolator2.k_z at -7.5 %"
+    assert relative.words(1.0, {"isolator2.k_z": 2e5}, {"isolator2.k_z": "N/m"}) == "isolator2.k_z at +15 %"
+    assert relative.words(-0.5, {"isolator2.k_z": 2e5}, {"isolator2.k_z": "N/m"}) == "isolator2.k_z at -7.5 %"
     absolute = UncertainParameter("load.L8", 0.01, absolute=True)
-    assert absolute.describe(-1.0, 0.05, "m") == "load.L8 at 0.04 m"
+    assert absolute.words(-1.0, {"load.L8": 0.05}, {"load.L8": "m"}) == "load.L8 at 0.04 m"
 
 
 def test_words_and_values_of_a_rig_agree():
     uncertain = built("loaded halcyonics")
     rig = load_rig("halcyonics_loaded")
     n = len(uncertain.parameters)
-    words, values = uncertain.describe([1.0] * n), uncertain.values([1.0] * n)
+    values = uncertain.values([1.0] * n)
+    words = [p.words(1.0, uncertain.nominal, uncertain.units) for p in uncertain.parameters]
     known = rig.parameters()
     for parameter, line in zip(uncertain.parameters, words, strict=True):
         nominal = known[parameter.name].value
@@ -198,22 +199,11 @@ def test_edges_are_named():
 
 @pytest.mark.parametrize(
     ("parameters", "keep", "words"),
-    [
-        ([UncertainParameter("isolator9.k_z", 0.1)], ("z",), "isolator9.k_z"),
-        ([UncertainParameter("mass", 0.1), UncertainParameter("mass", 0.2)], ("z",), "twice"),
-        ([UncertainParameter("com_y", 0.1)], ("z",), "absolute"),
-        ([UncertainParameter("mass", 0.1)], ("z", "w"), "'w'"),
-    ],
+    [([UncertainParameter("com_y", 0.1)], ("z",), "absolute"), ([UncertainParameter("mass", 0.1)], ("z", "w"), "'w'")],
 )
 def test_what_is_refused(parameters, keep, words):
     with pytest.raises(InputError, match=words):
         uncertain_rig(load_rig("avis"), parameters, keep)
-
-
-@pytest.mark.parametrize("spread", [1.0, 1.5, 0.0, -0.1, float("nan"), float("inf")])
-def test_spreads_that_are_refused(spread):
-    with pytest.raises(InputError, match="mass spread"):
-        UncertainParameter("mass", spread)
 
 
 def test_an_absolute_spread_may_exceed_one():

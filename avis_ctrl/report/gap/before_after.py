@@ -38,10 +38,9 @@ def before_after(found: GapFinding) -> Section:
     """Errors on held-out data as figures and numbers, and measured responses compared with both models."""
     gap = found.gap
     pieces: list[Piece] = []
-    if gap.heat is not None and gap.heat.before.size:
+    if gap.heat is not None:
         pieces.append(spectrum(gap.heat, bool(gap.effects)))
-    if gap.stages:
-        pieces.append(_stages(gap))
+    pieces.append(_stages(gap))
     seen = gap_overlay(found.measured, gap.baseline, gap.updated)
     pieces += [Paragraph(seen, "note")] if isinstance(seen, str) else responses(seen, bool(gap.effects))
     return Section("The gap before and after" if gap.effects else "The gap", "before_after", tuple(pieces))
@@ -49,7 +48,7 @@ def before_after(found: GapFinding) -> Section:
 
 def spectrum(heat: HeatMap, named: bool) -> Figure:
     """Residual power over noise power by frequency: mean of all channels, and worst channel."""
-    edges, panels = edges_of(heat), []
+    edges, panels = heat.bands_Hz, []
     sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
     x, y = hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log")
     for title, reduce in (("Mean of all channels", _mean), ("Worst channel of each band", _worst)):
@@ -65,12 +64,6 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
         2,
         0.95,
     )
-
-
-def edges_of(heat: HeatMap) -> np.ndarray:
-    """Band edges (n_bands + 1,) [Hz] for a logarithmic axis: a first edge of zero becomes half the second one."""
-    edges = np.asarray(heat.bands_Hz, float)
-    return np.append(edges[1] / 2, edges[1:]) if edges[0] <= 0 else edges
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
@@ -117,7 +110,7 @@ def _stages(gap: Gap) -> Table:
         rows.append(("noise alone", words.percent(noise), "1", "1"))
     return table(
         "Each model is fitted to the same records; the figures are those of records or periods that no fit "
-        f"has seen{f': {gap.held_out}' if gap.held_out else ''}. Error: r.m.s. of the residual "
+        f"has seen: {gap.held_out}. Error: r.m.s. of the residual "
         "relative to that of the measured outputs.",
         ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"),
         rows,

@@ -21,11 +21,10 @@ from avis_ctrl.study.gap import GapFinding
 def measurement(found: GapFinding) -> Section:
     """The records, and their division into fitted and held-out ones."""
     use = {one.name: "held out" if one.held_out else "fitted" for one in found.gap.records}
-    how = found.gap.held_out.rstrip(".")
     return Section(
         "Measurement",
         "measurement",
-        (records(found.measured, use, f"Held out: {how}" if how else ""), *remarks(found.measured)),
+        (records(found.measured, use, f"Held out: {found.gap.held_out.rstrip('.')}"), *remarks(found.measured)),
     )
 
 

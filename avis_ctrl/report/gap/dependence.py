@@ -53,10 +53,9 @@ HOW = {
 def dependence(found: GapFinding) -> Section:
     """The residual of each record by level and by time, and the decomposition of the power of the outputs."""
     gap = found.gap
-    no_records = Paragraph("The residual of single records was not computed.", "note")
     no_shares = "No fractions of power were computed: the driven records have too few lines for their inputs."
     pieces: list[Piece] = [
-        by_record(gap) if gap.records else no_records,
+        by_record(gap),
         Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"),
         *(coherence(gap.shares) if gap.shares else [Paragraph(no_shares, "note")]),
     ]

@@ -70,8 +70,6 @@ SOURCES = (
 
 def method(gap: Gap) -> Section:
     """Summary of the method with its formulas."""
-    held_out = (
-        f"Held out: {gap.held_out.rstrip('.')}." if gap.held_out else "How the records were divided is not stated."
-    )
-    pieces = (*prose(METHOD), Paragraph(held_out), Heading("Sources"), Bullets(SOURCES))
+    held_out = Paragraph(f"Held out: {gap.held_out.rstrip('.')}.")
+    pieces = (*prose(METHOD), held_out, Heading("Sources"), Bullets(SOURCES))
     return Section("Method", "method", pieces)

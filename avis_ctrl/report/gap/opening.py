@@ -25,18 +25,20 @@ CHANCES = (
 def opening(found: GapFinding) -> Section:
     """Verdict, the gap in numbers, named effects."""
     gap = found.gap
-    pieces: list[Piece] = [wording.verdict(sentence(gap), gap.verdict), Paragraph(wording.claim(gap))]
-    if numbers := in_numbers(gap):
-        pieces.append(Paragraph(numbers))
-    if gap.stages:
-        pieces.append(ladder(gap))
+    first, *more = map(wording.said, gap.sentences)
+    pieces: list[Piece] = [
+        wording.verdict(first, gap.verdict),
+        Paragraph(wording.claim(gap)),
+        Paragraph(in_numbers(gap)),
+        ladder(gap),
+    ]
     if gap.effects or gap.traces:
         pieces.append(named(gap, CHANCES))
     pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
     if gap.detectable:
         pieces.append(Paragraph("The section on the residual lists the detection limits of the effects."))
-    if told := gap.sentences[1:]:
-        pieces.append(Bullets(tuple(map(wording.said, told))))
+    if more:
+        pieces.append(Bullets(tuple(more)))
     pieces.append(Paragraph(f"What to measure next: {next_step(found)}"))
     warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
     if warned:
@@ -46,44 +48,20 @@ def opening(found: GapFinding) -> Section:
     return Section("Summary", "result", tuple(pieces), alone=True)
 
 
-def sentence(gap: Gap) -> str:
-    """First sentence of the finder, or a sentence on the effects if there is none."""
-    if gap.sentences:
-        return wording.said(gap.sentences[0])
-    if not gap.effects:
-        return (
-            "No disagreement beyond the measured noise."
-            if gap.verdict == "none"
-            else "A significant disagreement that no effect of the library accounts for."
-        )
-    return " ".join(
-        f"{wording.titled(one.name).capitalize()} at {one.location}: {wording.quantities(one.parameters)}; "
-        f"probability {wording.probability(one.probability)}."
-        for one in gap.effects
-    )
-
-
 def in_numbers(gap: Gap) -> str:
     """Error of each stage on held-out data, compared with that of noise alone."""
-    if not gap.stages:
-        return ""
     told = [f"{words.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
     text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
     if np.isfinite(gap.noise_nrmse):
         text += f"; that of the noise alone is estimated at {words.percent(gap.noise_nrmse)}"
-    first, last = _reference(gap), gap.stages[-1].nrmse
+    first = next(one.nrmse for one in gap.stages if one.name == "re-identified")
+    last = gap.stages[-1].nrmse
     if gap.effects and first > 0 and last > 0:
         text += f". With the effect{'s' * (len(gap.effects) > 1)} the error is "
         text += f"{words.number(first / last)} times smaller than that of the re-identified model"
         if gap.noise_nrmse > 0:
             text += f", and {words.number(last / gap.noise_nrmse)} times the noise"
     return text + "."
-
-
-def _reference(gap: Gap) -> float:
-    """Error of the re-identified model."""
-    named = {one.name: one.nrmse for one in gap.stages}
-    return named.get("re-identified", gap.stages[0].nrmse)
 
 
 def _group(one: NamedEffect) -> str:

@@ -10,7 +10,6 @@ from avis_ctrl.gap.result import Gap, HeatMap, Where
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.before_after import edges_of
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
@@ -23,10 +22,8 @@ def places(found: GapFinding) -> Section:
     """Heat map before and after adding effects, and table of the places before."""
     gap = found.gap
     pieces: list[Piece] = []
-    if gap.heat is not None and gap.heat.before.size:
+    if gap.heat is not None:
         pieces.append(heat_map(gap.heat, bool(gap.effects)))
-    else:
-        pieces.append(Paragraph("No map of channels and frequencies was computed.", "note"))
     if gap.where:
         pieces.append(table_of(gap.where, "Places of the gap after re-identification, before any effect is added. "))
     else:
@@ -50,7 +47,7 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     known = np.concatenate([heat.before.ravel(), heat.after.ravel()])
     known = known[np.isfinite(known) & (known > 0)]
     top = float(10 ** np.ceil(np.log10(max(LEAST_TOP, known.max(initial=LEAST_TOP))) - 1e-9))
-    edges, n = edges_of(heat), len(heat.columns)
+    edges, n = heat.bands_Hz, len(heat.columns)
     x = hertz(float(edges[0]), float(edges[-1]))
     y = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
 
@@ -86,13 +83,7 @@ def table_of(places: Sequence[Where], caption: str) -> Table:
         {
             "place": wording.place,
             "fraction": lambda one: words.percent(one.share),
-            "over noise": lambda one: words.number(one.excess) if np.isfinite(one.excess) else "not stated",
-            "p-value": lambda one: _chance(one.p_value),
+            "over noise": lambda one: words.number(one.excess),
+            "p-value": lambda one: "< 1e−6" if one.p_value < 1e-6 else words.number(one.p_value, 2),
         },
     )
-
-
-def _chance(value: float) -> str:
-    if not np.isfinite(value):
-        return "not stated"
-    return "< 1e−6" if value < 1e-6 else words.number(value, 2)

@@ -118,7 +118,7 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
     mu = _mu(result)
     omega = mu.transmissibility.omega
     f = omega / (2 * np.pi)
-    limit = result.plant.weights["transmissibility"].bound(omega)
+    limit = result.plant.weights["transmissibility"].limit(omega)
     curves = (
         Curve(f, asked_dB(result, omega), "target of the synthesis", STYLES["limit"]),
         Curve(f, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
@@ -140,7 +140,7 @@ def _effort(result: DesignResult) -> Figure:
         weight, shown = plant.effort_weight(axis), words.axis(axis)
         if EFFORT not in plant.weights or not k:  # one limit for all axes is drawn once
             of = "" if EFFORT in plant.weights else f", {shown}"
-            curves.append(Curve(HZ, weight.bound(omega), f"1/|W_u|, allowed{of}", STYLES["limit"]))
+            curves.append(Curve(HZ, weight.limit(omega), f"1/|W_u|, allowed{of}", STYLES["limit"]))
         closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
         curves.append(Curve(HZ, gain, f"mu synthesis, {shown}", numbered(k)))
@@ -198,7 +198,7 @@ def _compliance(result: DesignResult) -> list[Piece]:
     omega = _mu(result).transmissibility.omega
     f = omega / (2 * np.pi)
     curves = (
-        Curve(f, result.plant.weights["compliance"].bound(omega), "1/|W_c|, allowed", STYLES["limit"]),
+        Curve(f, result.plant.weights["compliance"].limit(omega), "1/|W_c|, allowed", STYLES["limit"]),
         Curve(f, _mu(result).compliance, "mu synthesis", STYLES["mu"]),
     )
     return [

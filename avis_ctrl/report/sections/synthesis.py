@@ -6,15 +6,13 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, level, log_limits, numbered
-from avis_ctrl.report.pieces import Paragraph, Section, listed
+from avis_ctrl.report.pieces import Section, listed
 from avis_ctrl.study.design_result import DesignResult
 
 
 def synthesis(result: DesignResult) -> Section:
     """Each iteration of the mu synthesis."""
     history = result.dk_history
-    if not history:
-        return Section("D-K iteration", "synthesis", (Paragraph("No iteration was run."),))
     iterations = listed(
         'The iterations. Kind: "H-infinity", "nominal" (plant without uncertainty) and "given" (a controller '
         "for comparison) are initial controllers. Each later step is an H-infinity synthesis with scalings D: "
