@@ -11,10 +11,12 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, connect, gain, hinf_norm, lft_lower, summing_junction, tf
+from avis_ctrl.robust import gamma_descent
 from avis_ctrl.robust.dstep import PointwiseScalings, equal_order_fits
 from avis_ctrl.robust.frequency_grid import MAX_POINTS, frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
+    _tried,
     descend,
     gamma_and_gradient,
     parameters,
@@ -325,14 +327,14 @@ def test_slope_of_gamma_is_its_derivative(blocks):
     assert np.allclose(slope, numeric, rtol=1e-3, atol=1e-4)
 
 
-def test_descent_learns_the_curvature():
+def test_descent_learns_the_curvature(monkeypatch):
     """After as many evaluations it is below steepest descent, which creeps along the valley from the same start."""
     P, structure = distillation(), BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)
     d = ScalarScaling.from_roots(1.0, [-0.5, -1.0], [-0.6, -0.9])
     start = Scalings(structure, (d, d, ScalarScaling.constant(1.0)))
     problem, theta = ScaledProblem.of(P, 2, 2), parameters(start)
     gamma, slope = gamma_and_gradient(problem, start)
-    step = -slope
+    first, step = gamma, -slope
     for _ in range(40):
         trial = gamma_and_gradient(problem, with_parameters(start, theta + step))
         if trial[0] < gamma:
@@ -340,8 +342,10 @@ def test_descent_learns_the_curvature():
             step = -slope
         else:
             step = step / 3
-    found = descend(P, 2, 2, start, (1e-3, 1e3), evaluations=40)
-    assert found.evaluations <= 40 and found.gamma < 0.98 * gamma < 0.95 * found.gamma_before
+    tried = []
+    monkeypatch.setattr(gamma_descent, "_tried", lambda *args: tried.append(args) or _tried(*args))
+    found, _ = gamma_and_gradient(problem, descend(P, 2, 2, start, (1e-3, 1e3), evaluations=40))
+    assert 1 + len(tried) <= 40 and found < 0.98 * gamma < 0.95 * first
 
 
 @pytest.mark.parametrize(("d", "orders"), [((1.0, 1.0), (1, 1, 0)), ((0.3, 3.0), (1, 0, 0))])
