@@ -11,12 +11,10 @@ import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, connect, gain, hinf_norm, lft_lower, summing_junction, tf
-from avis_ctrl.robust import gamma_descent
 from avis_ctrl.robust.dstep import PointwiseScalings, equal_order_fits
 from avis_ctrl.robust.frequency_grid import MAX_POINTS, frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
-    _tried,
     descend,
     gamma_and_gradient,
     parameters,
@@ -342,8 +340,8 @@ def test_descent_learns_the_curvature(monkeypatch):
             step = -slope
         else:
             step = step / 3
-    tried = []
-    monkeypatch.setattr(gamma_descent, "_tried", lambda *args: tried.append(args) or _tried(*args))
+    reaches, tried = ScaledProblem.reaches, []
+    monkeypatch.setattr(ScaledProblem, "reaches", lambda *args: tried.append(args) or reaches(*args))
     found, _ = gamma_and_gradient(problem, descend(P, 2, 2, start, (1e-3, 1e3), evaluations=40))
     assert 1 + len(tried) <= 40 and found < 0.98 * gamma < 0.95 * first
 
