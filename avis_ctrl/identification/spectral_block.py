@@ -46,15 +46,8 @@ class SpectralBlock:
     samples: int = 0
 
     def __post_init__(self) -> None:
-        n, m = len(self.omega), self.U.shape[-1]
-        if self.U.shape[0] != n or self.Y.shape[0] != n or self.Y.shape[2] != m or n == 0:
-            raise InputError(
-                f"expected U (n, n_in, m) and Y (n, n_y, m) on {n} lines",
-                field=f"block {self.name}",
-                value=(self.U.shape, self.Y.shape),
-            )
-        if self.transient and m != 1:
-            raise InputError("expected one experiment in a block with a transient", field=f"block {self.name}")
+        if not len(self.omega):
+            raise InputError("expected at least one line", field=f"block {self.name}")
 
     @property
     def numbers(self) -> int:

@@ -1,7 +1,7 @@
 """Linear systems: state-space models with named signals, connection by name, norms, realisations."""
 
 from avis_ctrl.lti.connect import connect, lft_lower, lft_upper, summing_junction
-from avis_ctrl.lti.norms import h2_norm, hinf_norm
+from avis_ctrl.lti.norms import hinf_norm
 from avis_ctrl.lti.realisation import balance, balanced_truncation, discretise, minimal
 from avis_ctrl.lti.statespace import StateSpace, append, gain, tf
 
@@ -13,7 +13,6 @@ __all__ = [
     "connect",
     "discretise",
     "gain",
-    "h2_norm",
     "hinf_norm",
     "lft_lower",
     "lft_upper",

@@ -1,4 +1,4 @@
-"""H-infinity and H2 norms, computed on the realisation as given.
+"""The H-infinity norm, computed on the realisation as given.
 
 `hinf_norm` is the two-step method of Bruinsma and Steinbuch (Systems & Control Letters 14, 1990). The level is raised
 to the gain at the midpoints between imaginary-axis eigenvalues of its Hamiltonian, until the Hamiltonian has no
@@ -201,20 +201,3 @@ def symplectic_scale(A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> np.ndarray:
     _, (both, _) = la.matrix_balance(magnitude, permute=False, separate=True)
     logs = np.log2(both)
     return np.exp2(np.round((logs[:n] - logs[n:]) / 2))
-
-
-def h2_norm(system: StateSpace) -> float:
-    """H2 norm (square root of the output variance for unit white noise); inf if the system is unstable or the
-    direct term of a continuous system is not zero."""
-    if not system.is_stable():
-        return np.inf
-    if system.dt:
-        X = la.solve_discrete_lyapunov(system.A, system.B @ system.B.T) if system.nstates else np.zeros((0, 0))
-        return float(np.sqrt(np.trace(system.C @ X @ system.C.T + system.D @ system.D.T)))
-    if np.any(system.D):
-        return np.inf
-    if not system.nstates:
-        return 0.0
-    balanced = _balanced(system)
-    X = la.solve_continuous_lyapunov(balanced.A, -balanced.B @ balanced.B.T)
-    return float(np.sqrt(max(np.trace(balanced.C @ X @ balanced.C.T), 0.0)))

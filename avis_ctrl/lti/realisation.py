@@ -60,12 +60,6 @@ def gramian_factors(system: StateSpace) -> tuple[np.ndarray, np.ndarray]:
     return factor(Wc), factor(Wo)
 
 
-def hankel_singular_values(system: StateSpace) -> np.ndarray:
-    """Hankel singular values of a stable system, descending."""
-    Lc, Lo = gramian_factors(balance(system))
-    return la.svdvals(Lo.T @ Lc)
-
-
 def balanced_truncation(system: StateSpace, order: int | None = None, tolerance: float | None = None) -> StateSpace:
     """Balanced truncation (square-root method; Tombs and Postlethwaite 1987) of a stable system.
 

@@ -72,7 +72,7 @@ def fixed_order(task: Task, K: StateSpace, order: int, others: Sequence[StateSpa
             )
     if K.nstates > order:
         omega = frequency_grid(lft_lower(task.P, K))
-        K = reduce_controller(task.P, K, lambda one: task.peak(one, omega), SETTINGS.free, range(order, K.nstates)).K
+        K = reduce_controller(task.P, K, lambda one: task.peak(one, omega), SETTINGS.free, range(order, K.nstates))
     for step in _shortened(task, K, order):
         if step.K.nstates > order:
             yield step

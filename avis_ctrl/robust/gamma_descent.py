@@ -72,16 +72,6 @@ class ScaledProblem:
         return gamma_test(self.normal(scalings).plant, gamma).feasible
 
 
-@dataclass(frozen=True)
-class Descent:
-    """The best scalings found, gamma before and after, and the number of evaluated points."""
-
-    scalings: Scalings
-    gamma_before: float
-    gamma: float
-    evaluations: int
-
-
 def parameters(scalings: Scalings) -> np.ndarray:
     """theta of all free scalings in one vector; parameters shared by a group occur once."""
     places = scalings.places()
@@ -177,7 +167,7 @@ def descend(
     *,
     evaluations: int = 40,
     tolerance: float = 1e-3,
-) -> Descent:
+) -> Scalings:
     """Quasi-Newton descent (BFGS with bounds) on log gamma over the parameters of the scalar scalings.
 
     P (w, u -> z, y); roots stay within `band` [rad/s]. Ends when five steps together gain less than `tolerance`.
@@ -186,7 +176,7 @@ def descend(
     low, high = np.array(parameter_box(scalings, band)).T
     here = with_parameters(scalings, np.clip(parameters(scalings), low, high))
     gamma, slope = gamma_and_gradient(problem, here)
-    first, count, trail = gamma, 1, [gamma]
+    count, trail = 1, [gamma]
     H = np.eye(low.size)
     while count < evaluations:
         theta = parameters(here)
@@ -208,7 +198,7 @@ def descend(
         trail.append(gamma)
         if len(trail) > 5 and trail[-6] / gamma - 1 < tolerance:
             break
-    return Descent(here, first, gamma, count)
+    return here
 
 
 def _direction(H: np.ndarray, slope: np.ndarray, theta: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

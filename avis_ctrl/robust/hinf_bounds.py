@@ -8,76 +8,27 @@ Q(s). By Parrott's theorem no Q gives a norm below
 By the maximum principle each such value bounds the H-infinity norm. On the imaginary axis it is the gain in directions
 that actuators do not affect or sensors do not measure. At a zero of u -> z or w -> y in the right half plane it is the
 interpolation bound, such as |W(z)| for a weighted sensitivity (Zames and Francis 1983; Skogestad and Postlethwaite,
-Multivariable Feedback Control, 2nd ed. 2005, section 5.6.1). The Riccati test gives the sharp bound if the plant needs
-no regularisation.
+Multivariable Feedback Control, 2nd ed. 2005, section 5.6.1). If the plant needs no regularisation, the Riccati test
+gives the sharp bound instead.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.robust.hinf_plant import (
-    Plant,
-    as_plant,
-    in_usual_units,
-    normal_form,
-    parrott_at_infinity,
-    pointwise,
-    posed_plant,
-    rank_margins,
-)
-from avis_ctrl.robust.hinf_riccati import find_gamma
-from avis_ctrl.robust.hinf_settings import SETTINGS
+from avis_ctrl.robust.hinf_plant import Plant, in_usual_units, parrott_at_infinity, pointwise
 
 
-@dataclass(frozen=True)
-class HinfLowerBound:
-    """No stabilising controller achieves a norm below `gamma`.
+def pointwise_bound(plant: Plant) -> float:
+    """Largest Parrott bound over frequencies on the imaginary axis and the zeros in the right half plane.
 
-    point : s [rad/s] where the bound is attained (of the bilinear image if P is sampled); nan for the Riccati test.
-    source : description of the argument.
+    The frequencies are 400 over the range of the plant poles, with two decades beyond.
     """
-
-    gamma: float
-    point: complex
-    source: str
-
-
-def hinf_lower_bound(P: Any, nmeas: int, ncon: int, omega: np.ndarray | None = None) -> HinfLowerBound:
-    """The largest of the pointwise bounds and, if applicable, the bound of the Riccati test (within 0.1 %).
-
-    omega : frequencies [rad/s] to evaluate; default: 400 over the range of the plant poles, with two decades beyond.
-    Raises the errors of `hinfsyn`.
-    """
-    P, nmeas, ncon = as_plant(P, nmeas, ncon)
-    plant = posed_plant(P, nmeas, ncon)
-    best = pointwise_bound(plant, omega)
-    if min(rank_margins(plant)) >= SETTINGS.rank_tolerance:
-        lower = find_gamma(normal_form(plant).plant, 1e-3).lower
-        if lower > best.gamma:
-            return HinfLowerBound(float(lower), complex(np.nan), "the two-Riccati test fails there")
-    return best
-
-
-def pointwise_bound(plant: Plant, omega: np.ndarray | None = None) -> HinfLowerBound:
-    """Largest Parrott bound over frequencies on the imaginary axis and the zeros in the right half plane."""
     plant = in_usual_units(plant)
-    if omega is None:
-        poles = np.abs(plant.sample_points())
-        omega = np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)
-    best = HinfLowerBound(parrott_at_infinity(plant), complex(np.inf), "directions free at infinite frequency")
-    for s, source in [
-        *((1j * w, "directions free at one frequency") for w in omega),
-        *((z, "a right-half-plane zero of u -> z or w -> y") for z in right_zeros(plant)),
-    ]:
-        value = pointwise(plant, s, at_zero=s.real > 0)
-        if value > best.gamma:
-            best = HinfLowerBound(value, complex(s), source)
-    return best
+    poles = np.abs(plant.sample_points())
+    points = [*(1j * np.geomspace(1e-2 * np.min(poles), 1e2 * np.max(poles), 400)), *right_zeros(plant)]
+    return max(parrott_at_infinity(plant), *(pointwise(plant, s, at_zero=s.real > 0) for s in points))
 
 
 def right_zeros(plant: Plant) -> np.ndarray:

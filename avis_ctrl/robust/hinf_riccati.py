@@ -51,15 +51,12 @@ class GammaTest:
 class GammaBracket:
     """lower: largest gamma proved infeasible; upper: the test at the smallest gamma that passed.
 
-    undecided : the largest gamma at which the test did not pass; above `lower` if this failure is not proved.
-    limited_by : the reason for this failure.
+    limited_by : the reason for the failure at the largest gamma at which the test did not pass, proved or not.
     """
 
     lower: float
     upper: GammaTest
     limited_by: str
-    tests: int
-    undecided: float = 0.0
 
 
 def direct_term_bound(plant: Plant) -> float:
@@ -182,11 +179,11 @@ def find_gamma(
         search.try_gamma(step)
         factor = min(factor**2, 1e3)
     if search.upper.gamma <= 100 * nothing:
-        return GammaBracket(0.0, search.upper, "nothing: the optimum is zero to working precision", search.tests)
+        return GammaBracket(0.0, search.upper, "nothing: the optimum is zero to working precision")
     search.refine(tolerance, nothing)
     if proved:
         search.prove(tolerance)
-    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11", search.tests, search.failed)
+    return GammaBracket(search.lower, search.upper, search.reason or "the direct term D11")
 
 
 class _Search:
@@ -199,11 +196,9 @@ class _Search:
         self.below: GammaTest | None = None
         self.second: GammaTest | None = None
         self.reason = ""
-        self.tests = 0
 
     def try_gamma(self, gamma: float) -> bool:
         outcome = gamma_test(self.plant, gamma)
-        self.tests += 1
         passed = outcome.feasible and (not outcome.doubtful or norm_is_confirmed(self.plant, outcome))
         self.lower = max(self.lower, outcome.forbidden)
         if passed:
@@ -221,7 +216,6 @@ class _Search:
             middle = np.sqrt(self.lower * unproved) if self.lower > 0.1 * unproved else unproved / 3
             before = self.lower
             outcome = gamma_test(self.plant, middle)
-            self.tests += 1
             self.lower = max(self.lower, outcome.forbidden)
             if self.lower == before:
                 unproved = middle

@@ -66,7 +66,7 @@ class Synthesis(Shown):
     K : controller, inputs named as the plant's y, outputs as its u; positive feedback u = K y.
     gamma : measured H-infinity norm of `closed_loop` (relative accuracy 1e-6).
     gamma_optimal_bounds : (largest gamma proved infeasible, smallest gamma found feasible). If channels were added, the
-        lower bound is the pointwise bound of `hinf_lower_bound`. In this case, or if the controller missed its target,
+        lower bound is the pointwise bound of `hinf_bounds`. In this case, or if the controller missed its target,
         the upper bound is the measured gamma.
     fastest_pole : largest magnitude [rad/s] of a controller pole (of its continuous image if P is sampled).
     limited_by : the condition that fails just below the optimum.
@@ -150,7 +150,7 @@ def hinfsyn(
     )
     if notes and method != "lmi":
         # Extra channels only make the problem harder: a gamma that fails with them may be feasible without them.
-        bounds = pointwise_bound(problem.plant).gamma, result.gamma
+        bounds = pointwise_bound(problem.plant), result.gamma
     if raised:
         status, notes = Status.BACKED_OFF, (*notes, raised)
         bounds = bounds[0], max(bounds[1], result.gamma)

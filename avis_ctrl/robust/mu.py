@@ -16,19 +16,21 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.robust.mu_lmi import Array
 from avis_ctrl.robust.mu_lower import lower_bound
-from avis_ctrl.robust.mu_upper import UpperBound, upper_bound
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MuUpper(Shown):
-    """Upper bound of mu with its scalings; arrays have a leading frequency axis if M has one.
+class MuBounds(Shown):
+    """Bounds of mu with their proofs; arrays have a leading frequency axis if M has one.
 
-    upper : scalar or (n_omega,).
+    upper, lower : scalar or (n_omega,); lower is 0 if no singular perturbation was found (mu itself may be 0).
     D, D_w : (.., n_z, n_z) and (.., n_w, n_w), Hermitian positive definite, commuting with Delta.
     G : (.., n_w, n_z), Hermitian on each real block, zero elsewhere.
+    delta : (.., n_w, n_z) with the block structure, ||delta|| = 1/lower and I - M delta singular. If lower is 0, delta
+        is None for a single M, and has NaN entries in a stack.
 
     M^H D^2 M + j (G M - M^H G^H) <= upper^2 D_w^2; without real blocks upper = sigma_max(D M inv(D_w)).
     """
@@ -37,17 +39,6 @@ class MuUpper(Shown):
     D: Array
     D_w: Array
     G: Array
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MuBounds(MuUpper):
-    """Both bounds of mu; arrays have a leading frequency axis if M has one.
-
-    lower : scalar or (n_omega,); 0 if no singular perturbation was found (mu itself may be 0).
-    delta : (.., n_w, n_z) with the block structure, ||delta|| = 1/lower and I - M delta singular. If lower is 0, delta
-        is None for a single M, and has NaN entries in a stack.
-    """
-
     lower: float | Array
     delta: Array | None
 
@@ -67,25 +58,6 @@ def checked(M: Array, blocks: BlockStructure | Sequence[Block]) -> tuple[Array, 
     if not np.all(np.isfinite(M)):
         raise InputError("expected finite entries", field="M")
     return M.reshape(-1, *M.shape[-2:]), structure
-
-
-def mu_upper(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e-5) -> MuUpper:
-    """Upper bound of mu alone, batched over frequency (the analysis step of D-K iteration).
-
-    Parameters
-    ----------
-    M : (n_z, n_w) or (n_omega, n_z, n_w) complex; n_z = sum of the blocks' cols, n_w = sum of their rows.
-    tolerance : relative accuracy in upper^2 at which the optimisation stops. The returned value is an upper
-        bound in any case: it is recomputed from the scalings by an eigenvalue computation.
-
-    Raises
-    ------
-    InputError : shapes that do not fit the blocks, entries that are not finite.
-    """
-    stack, structure = checked(M, blocks)
-    with one_thread():
-        bound = upper_bound(stack[:, None], structure, tolerance)
-        return _with_roots(bound, np.ndim(M) == 2)
 
 
 def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e-5) -> MuBounds:
@@ -114,24 +86,16 @@ def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e
     (0.8583, 0.8583)
     """
     stack, structure = checked(M, blocks)
-    single = np.ndim(M) == 2
     with one_thread():
         bound = upper_bound(stack[:, None], structure, tolerance)
         found = lower_bound(stack, structure, bound.beta, bound.scalings)
-        upper = _with_roots(bound, single)
-    delta = np.where((found.beta > 0)[:, None, None], found.delta, np.nan)
-    if single:
+        X_z, X_w, G = bound.scalings
+        D, D_w = _root(X_z), _root(X_w)
+    if np.ndim(M) == 2:
         lower = float(found.beta[0])
-        return MuBounds(upper.upper, upper.D, upper.D_w, upper.G, lower, delta[0] if lower else None)
-    return MuBounds(upper.upper, upper.D, upper.D_w, upper.G, found.beta, delta)
-
-
-def _with_roots(bound: UpperBound, single: bool) -> MuUpper:
-    X_z, X_w, G = bound.scalings
-    D, D_w = _root(X_z), _root(X_w)
-    if single:
-        return MuUpper(float(bound.beta[0]), D[0], D_w[0], G[0])
-    return MuUpper(bound.beta, D, D_w, G)
+        return MuBounds(float(bound.beta[0]), D[0], D_w[0], G[0], lower, found.delta[0] if lower else None)
+    delta = np.where((found.beta > 0)[:, None, None], found.delta, np.nan)
+    return MuBounds(bound.beta, D, D_w, G, found.beta, delta)
 
 
 def _root(X: Array) -> Array:

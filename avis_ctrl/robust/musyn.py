@@ -27,11 +27,12 @@ from avis_ctrl.robust.dstep import PointwiseScalings, tightened
 from avis_ctrl.robust.fixed_order import fixed_order
 from avis_ctrl.robust.frequency_grid import frequency_grid
 from avis_ctrl.robust.hinf_plant import as_plant
-from avis_ctrl.robust.mu import mu_upper
 from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn_iteration import Options, Problem, initial_controllers, initial_loop, iterate
 from avis_ctrl.robust.musyn_state import Iteration, Loop, State, analysed
+from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.robust.robustness import opened
 from avis_ctrl.robust.scalings import Scalings
 from avis_ctrl.summary import Shown
@@ -338,7 +339,9 @@ def _best_with_real_blocks(made: DKIteration, result: MuSynthesis, sample_rate_H
         except ComputationError:
             continue
         response = lft_lower(made.problem.P, loop.K).frequency_response(points.omega)
-        if np.max(mu_upper(response, made.uncertainty).upper) < result.mu_upper:
+        with one_thread():
+            upper = upper_bound(response[:, None], made.uncertainty).beta
+        if np.max(upper) < result.mu_upper:
             note = (
                 f"an initial controller ({kind}) has a smaller mu with real blocks than that of the D-K iteration, "
                 f"{result.mu_upper:.4g}, and is the result"

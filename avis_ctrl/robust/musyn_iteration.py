@@ -305,7 +305,7 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
             return
         start = larger
     try:
-        yield Proposal(descend(problem.P, problem.nmeas, problem.ncon, start, band).scalings, 0.0, state.phase)
+        yield Proposal(descend(problem.P, problem.nmeas, problem.ncon, start, band), 0.0, state.phase)
     except ComputationError:
         return
 

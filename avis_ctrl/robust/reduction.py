@@ -35,26 +35,6 @@ class LagSettings:
 LAGS = LagSettings()
 
 
-@dataclass(frozen=True)
-class Reduction:
-    """The selected controller and the figures of merit of all controllers tried.
-
-    figures : (order, figure) of every controller tried; inf if the closed loop is unstable.
-    full, figure : the figure before and after.
-    """
-
-    K: StateSpace
-    order: int
-    figure: float
-    full: float
-    figures: tuple[tuple[int, float], ...]
-
-    @property
-    def growth(self) -> float:
-        """Relative growth of the figure."""
-        return self.figure / self.full - 1 if self.full > 0 else 0.0
-
-
 def closed_loop_gamma(P: StateSpace, K: StateSpace) -> float:
     """H-infinity norm of F_l(P, K); inf if it is unstable."""
     return hinf_norm(lft_lower(P, K)).gain
@@ -67,7 +47,7 @@ def reduce_controller(
     growth: float = 0.01,
     orders: range | None = None,
     limit: float | None = None,
-) -> Reduction:
+) -> StateSpace:
     """The controller of lowest order whose figure of merit grows by at most `growth` (relative).
 
     Parameters
@@ -91,22 +71,18 @@ def reduce_controller(
     figure = measure or (lambda candidate: closed_loop_gamma(P, candidate))
     if not lft_lower(P, K).is_stable():
         raise InputError("the controller to reduce does not stabilise the plant", field="K", value=repr(K))
-    full = float(figure(K))
-    allowed = (1 + growth) * full if limit is None else limit
+    allowed = (1 + growth) * float(figure(K)) if limit is None else limit
     stable, unstable = split_stable(K)
     choices = [k for k in sorted(range(K.nstates) if orders is None else orders) if unstable.nstates <= k < K.nstates]
-    tried: list[tuple[int, float]] = [(K.nstates, full)]
-    best, value, failed, passed = K, full, -1, len(choices)
+    best, failed, passed = K, -1, len(choices)
     while passed - failed > 1:
         middle = (failed + passed) // 2
         candidate = balanced_truncation(stable, choices[middle] - unstable.nstates) + unstable
-        found = float(figure(candidate)) if lft_lower(P, candidate).is_stable() else np.inf
-        tried.append((choices[middle], found))
-        if found <= allowed:
-            best, value, passed = candidate, found, middle
+        if lft_lower(P, candidate).is_stable() and float(figure(candidate)) <= allowed:
+            best, passed = candidate, middle
         else:
             failed = middle
-    return Reduction(best, best.nstates, value, full, tuple(tried))
+    return best
 
 
 def split_stable(K: StateSpace) -> tuple[StateSpace, StateSpace]:

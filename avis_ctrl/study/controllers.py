@@ -121,7 +121,7 @@ def _reduced(
         # No weight changes below the corner up to which the offset may drift.
         lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
-        return reduce_controller(P.P, start, lambda one: peak(P.closed(one), limit), limit=limit).K
+        return reduce_controller(P.P, start, lambda one: peak(P.closed(one), limit), limit=limit)
 
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
     # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.

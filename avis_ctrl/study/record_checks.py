@@ -26,10 +26,7 @@ def expectation(model: ResponseModel) -> Expectation:
         y_lsb_V=converter.lsb_V if converter else None,
         drive_limits_V=dict(zip(model.actuators, rig.limits_of(model.actuators).tolist(), strict=True)),
         sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if converter and rig.ambient else None,
-        u_names=model.actuators,
         y_names=model.sensors.names,
-        u_unit="V",
-        y_unit=model.sensors.unit,
         response=response,
     )
 

@@ -150,10 +150,8 @@ def test_channels_are_added_at_the_corner_opposite_the_first_mount(avis):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda m: Drive(1.0, 0.0),
         lambda m: Drive(1.0, 1.0, (5.0, 1.0)),
         lambda m: Drive(1.0, 1.0, (0.0, 5.0)),
-        lambda m: Drive(1.0, 1.0, (1.0, 5.0), {"v": 1.0}),
         lambda m: changed(m, {"isolator9.p_x": 0.1}),
         lambda m: predicted_information(m, Drive(1, 1, (900.0, 950.0)), NOISE),
     ],

@@ -115,8 +115,7 @@ def test_noise_of_the_position_lowers_the_mass_unless_the_reference_is_the_instr
         ({"cutoff_Hz": 600.0}, "cutoff_Hz = 600.0: expected a cutoff between 0 and 500 Hz"),
         ({"cutoff_Hz": 0.0}, "cutoff_Hz = 0.0: expected a cutoff between 0 and 500 Hz"),
         ({"coulomb": "both"}, "coulomb = 'both': expected one of symmetric, asymmetric, none"),
-        ({"force": np.zeros(7)}, "expected 20000 samples of each channel"),
-        ({"time": np.zeros(20_000)}, "expected at least 32 uniform, increasing times"),
+        ({"time": np.arange(31.0)}, "expected at least 32 samples"),
         ({"position": np.full(20_000, np.nan)}, "expected finite numbers"),
     ],
 )
@@ -336,6 +335,10 @@ def test_from_a_csv_file_to_a_drive(tmp_path, rng):
     )
     assert fit.of("M")[0] == pytest.approx(95.0, rel=0.01)
     assert fit.lines()[0].startswith("M = 9")
+    with pytest.raises(InputError, match="scale of force = 1e\\+308: expected a factor that keeps all samples finite"):
+        identify_single_axis(
+            "drive", tmp_path / "drive.csv", {"t": "t", "position": "pos", "force": "volts"}, scale={"force": 1e308}
+        )
 
 
 def test_too_few_sines_are_refused(tmp_path):

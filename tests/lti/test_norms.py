@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti import StateSpace, discretise, gain, h2_norm, hinf_norm, tf
+from avis_ctrl.lti import StateSpace, discretise, gain, hinf_norm, tf
 from avis_ctrl.lti.norms import largest_singular_value, norm_is_below
 
 
@@ -90,20 +90,6 @@ def test_norms_without_states_or_stability():
     assert hinf_norm(gain([[3.0, 4.0]])).gain == pytest.approx(5.0)
     assert hinf_norm(gain(np.zeros((2, 2)))).gain == 0.0
     assert hinf_norm(tf([1], [1, -1])).gain == np.inf
-    assert h2_norm(tf([1], [1, -1])) == np.inf
-    assert h2_norm(tf([1, 2], [1, 1])) == np.inf
-
-
-@given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
-@settings(max_examples=20, deadline=None)
-def test_h2_norm_of_a_low_pass(a, k):
-    """||k / (s + a)||_2 = k / sqrt(2 a)."""
-    assert h2_norm(tf([k], [1, a])) == pytest.approx(k / np.sqrt(2 * a), rel=1e-9)
-
-
-def test_h2_norm_agrees_with_slicot(rng):
-    G = random_stable(rng, 6, 2, 2, 0.0, 0.1)
-    assert h2_norm(G) == pytest.approx(control.norm(G.to_control(), 2), rel=1e-9)
 
 
 def test_a_response_beyond_all_numbers_is_said():

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, balanced_truncation, discretise, gain, hinf_norm, minimal, tf
-from avis_ctrl.lti.realisation import hankel_singular_values
 
 
 def random_stable(rng, n, n_y=2, n_u=2):
@@ -25,23 +24,13 @@ def test_truncation_error_is_within_its_bound(seed, n):
     """||G - G_k|| <= 2 (sigma_k+1 + ... + sigma_n), and at least sigma_k+1 (Enns 1984; Glover 1984)."""
     rng = np.random.default_rng(seed)
     G = random_stable(rng, n)
-    sigma = hankel_singular_values(G)
+    sigma = control.hankel_singular_values(G.to_control())
     k = int(rng.integers(0, n))
     reduced = balanced_truncation(G, k)
     assert reduced.nstates <= k and reduced.is_stable()
     error = hinf_norm(G - reduced).gain
     assert error <= 2 * np.sum(sigma[k:]) * (1 + 1e-6) + 1e-9 * sigma[0]
     assert error >= sigma[k] * (1 - 1e-6) - 1e-9 * sigma[0]
-
-
-def test_hankel_values_agree_with_python_control(rng):
-    G = random_stable(rng, 6)
-    np.testing.assert_allclose(hankel_singular_values(G), control.hankel_singular_values(G.to_control()), rtol=1e-8)
-
-
-def test_first_order_hankel_value():
-    """k / (s + a): sigma = k / (2 a)."""
-    np.testing.assert_allclose(hankel_singular_values(tf([3.0], [1, 0.25])), [6.0])
 
 
 def test_gramians_of_an_unstable_system_are_refused():

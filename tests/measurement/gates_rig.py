@@ -142,10 +142,7 @@ def known(**changes):
         "y_lsb_V": LSB,
         "drive_limits_V": dict.fromkeys(U_NAMES, 10.0),
         "sensor_noise_rms_V": 1e-3,
-        "u_names": U_NAMES,
         "y_names": Y_NAMES,
-        "u_unit": "V",
-        "y_unit": "V",
         "response": response_of(),
     }
     return Expectation(**(given | changes))

@@ -48,7 +48,7 @@ def test_standard_deviations_are_those_of_repeated_measurements():
     rng = np.random.default_rng(3)
     f = np.arange(30, 70, 0.1)
     G = modes(f, [(50.0, 0.01)], rng)
-    got = [resonance(measured(f, G, 0.5, rng), 50.0, width_Hz=4.0) for _ in range(100)]
+    got = [resonance(measured(f, G, 0.5, rng), 50.0) for _ in range(100)]
     for value, std, exact in (("frequency_Hz", "frequency_std_Hz", 50.0), ("damping", "damping_std", 0.01)):
         z = np.array([(getattr(r, value) - exact) / getattr(r, std) for r in got])
         assert np.std(z) == pytest.approx(1.0, abs=0.2)

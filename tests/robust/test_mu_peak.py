@@ -19,7 +19,7 @@ from avis_ctrl.lti import (
     tf,
 )
 from avis_ctrl.robust.hinfsyn import hinfsyn
-from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.mu_cover import cover
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import residual
@@ -118,7 +118,7 @@ def test_spinning_satellite_real_repeated_is_one_at_one_frequency():
     assert found.lower == pytest.approx(1.0, rel=1e-6) and found.omega == pytest.approx(10.0, rel=1e-6)
     assert found.delta == pytest.approx(-np.eye(2), abs=1e-6) and singular_at(N, found)
     grid = N.frequency_response(np.geomspace(0.1, 1e3, 50))
-    assert np.max(mu_upper(grid, [R(2)]).upper) < 1e-3
+    assert np.max(mu(grid, [R(2)]).upper) < 1e-3
 
 
 @pytest.mark.parametrize("blocks", [[F(2)], [C(2)], [C(), C()]])
@@ -136,7 +136,7 @@ def test_distillation_on_the_grid_of_the_book(channels, blocks, printed):
     """Skogestad and Postlethwaite's own Fig8_15.m: 0.5242 (robust stability) and 5.7726 (robust performance), the
     largest upper bounds at 61 points from 1e-3 to 1e3 rad/s."""
     grid = distillation().select(range(channels), range(channels)).frequency_response(np.logspace(-3, 3, 61))
-    assert np.max(mu_upper(grid, blocks).upper) == pytest.approx(printed, abs=5e-5)
+    assert np.max(mu(grid, blocks).upper) == pytest.approx(printed, abs=5e-5)
 
 
 def test_distillation_robust_stability_and_performance():
@@ -299,7 +299,7 @@ def test_a_proof_that_takes_too_long_is_given_up_and_says_so(rng):
     """Narrow resonances and no room for rounds: the bound is not called proved and the gaps are named."""
     N = flexible(rng, 3, 3, modes=10)
     structure = BlockStructure.of([R(), R(), R()])
-    bound = mu_upper(N.frequency_response(np.abs(N.poles())), structure).upper
+    bound = mu(N.frequency_response(np.abs(N.poles())), structure).upper
     done = cover(
         N,
         structure,
@@ -334,7 +334,7 @@ def test_upper_bound_holds_between_the_points(rng):
     found = mu_peak(N, blocks)
     assert found.guaranteed and "from 0 to infinity" in found.covers
     dense = np.concatenate([np.abs(N.poles()) * (1 + d) for d in np.linspace(-5e-3, 5e-3, 41)])
-    assert np.max(mu_upper(N.frequency_response(dense), blocks).upper) <= found.upper * (1 + 1e-6)
+    assert np.max(mu(N.frequency_response(dense), blocks).upper) <= found.upper * (1 + 1e-6)
     assert found.lower >= 0.9 * found.upper and singular_at(N, found)
     assert found.upper_curve.shape == found.lower_curve.shape == found.frequencies.shape
     assert np.all(found.lower_curve <= found.upper_curve * (1 + 1e-6)) and np.max(found.upper_curve) <= found.upper
@@ -344,7 +344,7 @@ def test_band():
     N = distillation()
     low = mu_peak(N, [C(), C(), F(2)], band=(0.0, 0.1))
     assert low.guaranteed and low.omega == pytest.approx(0.1)
-    assert low.upper == pytest.approx(mu_upper(N(0.1j), [C(), C(), F(2)]).upper, rel=1e-3)
+    assert low.upper == pytest.approx(mu(N(0.1j), [C(), C(), F(2)]).upper, rel=1e-3)
     high = worst_case_gain(N, [C(), C()], band=(100.0, np.inf))
     assert high.guaranteed and high.upper < 0.5 * worst_case_gain(N, [C(), C()]).upper
 

@@ -18,7 +18,7 @@ from avis_ctrl.lti import StateSpace, balance, gain, hinf_norm
 from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.hinfsyn import hinfsyn
-from avis_ctrl.robust.mu import mu_upper
+from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.mu_gain import perturbed
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study import limits
@@ -238,7 +238,7 @@ def test_a_controller_no_better_than_none_is_called_so(one_axis, measured):
 
 
 def test_the_bound_that_limits_mu_is_named_with_mu_without_it(one_axis, measured):
-    """Both numbers are those of the loop without the rows of the bound, by `mu_upper` and `mu_peak`."""
+    """Both numbers are those of the loop without the rows of the bound, by `mu` and `mu_peak`."""
     _, plant = one_axis
     skyhook = measured["skyhook_classical"]
     text = limiting(plant, skyhook)
@@ -250,7 +250,7 @@ def test_the_bound_that_limits_mu_is_named_with_mu_without_it(one_axis, measured
     there, most = (
         float(one) for one in re.findall(r"at most (\S+) at this frequency, and at most (\S+) over all", text)[0]
     )
-    upper = mu_upper(rest.frequency_response(np.array([omega])), blocks).upper[0]
+    upper = mu(rest.frequency_response(np.array([omega])), blocks).upper[0]
     assert upper * (1 - 1e-6) <= there < 1.01 * upper
     assert 0.99 * without.lower < most < 1.03 * without.upper
 
@@ -299,7 +299,7 @@ def test_figures_of_the_advice_are_rounded_in_the_safe_direction(one_axis, measu
     (alone,) = re.findall(r"the transmissibility bound is relaxed by (\S+) dB", text)
     ways.append(np.r_[np.ones(n_z), np.where(is_e, 10 ** (-float(alone) / 20), 1.0)])
     for left in ways:
-        assert np.max(mu_upper(M * left[:, None], P.all_blocks).upper) <= 1 + 1e-6
+        assert np.max(mu(M * left[:, None], P.all_blocks).upper) <= 1 + 1e-6
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avis_ctrl.measurement.formats.hdf5 import read, write_campaign
+from avis_ctrl.measurement.formats import read_measurements, write_campaign
 
 from .cases import LIBRARY, OUTSIDE_LIBRARY, channel_change, draw_case, relative_change, rig, simulate_case
 
@@ -31,7 +31,7 @@ def test_cases_repeat_and_campaigns_follow_the_contract(tmp_path):
         assert a.u.std() == pytest.approx(c.u.std(), rel=0.01) and np.abs(a.u - c.u).max() > a.u.std()
     assert len(one.records) == 6 and one.records[5].header.start_s > 320
     write_campaign(tmp_path / "case.h5", one)
-    back = read(tmp_path / "case.h5")
+    back = read_measurements(tmp_path / "case.h5")
     np.testing.assert_array_equal(back.records[2].load().y, one.records[2].y)
 
 

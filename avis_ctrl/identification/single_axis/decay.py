@@ -21,21 +21,14 @@ def fit_decay(
 
     Parameters
     ----------
-    time : (n,) s, starting after the release. channels : (n, c), normalised here to unit standard deviation. corner_Hz,
-    damping : initial values. drift : degree of the polynomial of each channel's drifting zero.
+    time : (n,) s, starting after the release. channels : (n, c) or (n,), normalised here to unit standard deviation.
+    corner_Hz, damping : initial values. drift : degree of the polynomial of each channel's drifting zero.
 
     Raises
     ------
-    InputError : wrong shapes or initial values. ComputationError : no decaying oscillation fits.
+    InputError : wrong initial values, a constant channel. ComputationError : no decaying oscillation fits.
     """
-    time, y = np.asarray(time, float).ravel(), np.asarray(channels, float)
-    y = y[:, None] if y.ndim == 1 else y
-    if y.shape[0] != len(time) or len(time) < 32 or not np.all(np.isfinite(y)) or not np.all(np.diff(time) > 0):
-        raise InputError(
-            "expected at least 32 finite samples of each channel at increasing times",
-            field="decay",
-            value=(len(time), y.shape),
-        )
+    y = channels[:, None] if channels.ndim == 1 else channels
     if not (corner_Hz > 0 and damping > 0) or not 0 <= drift <= 3:
         raise InputError(
             "expected a positive corner in Hz and damping to start from, and a drift of degree 0 to 3",

@@ -261,16 +261,12 @@ def regression(
 
     Raises
     ------
-    InputError : shapes that do not fit, numbers that are not finite. ComputationError : a column of zeros.
+    InputError : too few samples, numbers that are not finite. ComputationError : a column of zeros.
     """
     Z = X if instruments is None else instruments
     n, p = X.shape
-    if y.shape != (n,) or Z.shape != (n, p) or n <= 4 * p:
-        raise InputError(
-            f"expected {p} columns and more than {4 * p} samples of equal length",
-            field="samples",
-            value=(X.shape, y.shape, Z.shape),
-        )
+    if n <= 4 * p:
+        raise InputError(f"expected more than {4 * p} samples", field="samples", value=n)
     if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(Z))):
         raise InputError("expected finite numbers", field="samples")
     if lost := [name for name, x, z in zip(parameters, X.T, Z.T, strict=True) if not (np.any(x) and np.any(z))]:

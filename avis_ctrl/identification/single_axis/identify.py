@@ -246,7 +246,12 @@ def _channels(
     found = {driven: record.u[:, 0]} if driven else {}
     found |= {role: record.y[:, k] for k, role in enumerate(measured)}
     time = np.arange(source.header.samples) / source.header.sample_rate_Hz
-    return time, {role: scale.get(role, 1.0) * values for role, values in found.items()}
+    found = {role: scale.get(role, 1.0) * values for role, values in found.items()}
+    for role, values in found.items():
+        if not np.all(np.isfinite(values)):  # the record's own samples are finite
+            field = f"scale of {role}"
+            raise InputError("expected a factor that keeps all samples finite", field=field, value=scale[role])
+    return time, found
 
 
 def _decay(

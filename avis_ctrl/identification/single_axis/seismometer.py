@@ -57,17 +57,9 @@ class Responses:
                 value=sorted(self.value),
             )
         for kind, H in self.value.items():
-            V = self.variance.get(kind)
-            if (
-                V is None
-                or np.shape(H) != (n,)
-                or np.shape(V) != (n,)
-                or not np.all(np.isfinite(H))
-                or not np.all(np.isfinite(V))
-                or not np.all(V > 0)
-                or not np.all(np.abs(H) > 0)
-            ):
-                raise InputError(f"expected {n} finite values with positive variances, none zero", field=kind)
+            size, variance = np.abs(H), self.variance[kind]
+            if not np.all((size > 0) & np.isfinite(size) & (variance > 0) & np.isfinite(variance)):
+                raise InputError("expected finite values with positive variances, none zero", field=kind)
         if n < 4 or not np.all(np.diff(self.frequency_Hz) > 0) or self.frequency_Hz[0] <= 0:
             raise InputError("expected at least four increasing, positive frequencies", field="frequency_Hz", value=n)
 

@@ -45,26 +45,19 @@ class Layout:
     lines: int  # number of lines before the first line of numbers
 
 
-def read(
-    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
-) -> Campaign:
+def read(path: Path, columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign:
     """A CSV file (one record) or a directory of CSV files (one record each, in the order of their names).
 
-    columns : roles t, u, y, floor to names of columns; hints : what the file does not state.
-
-    Raises
-    ------
-    InputError : names file, line and column, or number and place of wrong time stamps.
+    columns : roles t, u, y, floor to names of columns. Errors name file, line and column, or number and place of wrong
+    time stamps.
     """
-    path, hints = Path(path), hints or Hints()
     files = [path]
     if path.is_dir():
         shown = [file for file in path.iterdir() if not file.name.startswith(".")]
         files = sorted(file for file in shown if file.suffix.lower() == ".csv" and file.is_file())
         if not files:
             raise InputError("expected CSV files (*.csv) in the directory; there is none", file=path)
-    with reading(path):
-        require_small(path, sum(file.stat().st_size for file in files))
+    require_small(path, sum(file.stat().st_size for file in files))
     records, notes, rigs = [], [], []
     for file in files:
         with reading(file, "the CSV file"):
@@ -72,8 +65,7 @@ def read(
         records.append(record)
         notes += assumed
         rigs.append(stated)
-    with reading(path):
-        return campaign_from(records, notes, rig or rigs[0], path)
+    return campaign_from(records, notes, rig or rigs[0], path)
 
 
 def is_text(head: bytes) -> bool:

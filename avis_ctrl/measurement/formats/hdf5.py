@@ -26,7 +26,6 @@ from avis_ctrl.measurement.formats.common import (
     as_names,
     as_number,
     as_text,
-    existing_file,
     kind_of,
     printable,
     reading,
@@ -66,19 +65,12 @@ DATASETS = {
 CHUNK = 1 << 14  # samples per chunk on disk
 
 
-def read(
-    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
-) -> Campaign | FrequencyResponse:
+def read(path: Path, columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign | FrequencyResponse:
     """An HDF5 campaign, whose samples stay in the file until they are loaded, or its frequency response.
 
-    columns, hints : none that apply to records, because the file states them itself; rig : replaces the name in the
-    file.
-
-    Raises
-    ------
-    InputError : not an HDF5 campaign, a missing or wrong attribute or data set; names file, record and field.
+    columns, hints : none that apply to records, because the file states them itself. Errors name file, record and
+    field.
     """
-    path, hints = existing_file(path), hints or Hints()
     with reading(path, "the HDF5 file"), stored.open_hdf5(path) as file:
         names = stored.members(file)
         response = "frf" in names and "records" not in names

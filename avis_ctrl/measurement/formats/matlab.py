@@ -17,7 +17,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import matlab_records, matlab_v5, matlab_v73
-from avis_ctrl.measurement.formats.common import as_names, existing_file, reading
+from avis_ctrl.measurement.formats.common import as_names, reading
 from avis_ctrl.measurement.formats.matlab_tree import Matrix, describe
 from avis_ctrl.measurement.formats.records import Hints, Mapped
 from avis_ctrl.measurement.formats.response import stated_response
@@ -28,16 +28,8 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 MATRICES_V4 = {1000 * order + 10 * number + kind for order in (0, 1) for number in range(6) for kind in range(3)}
 
 
-def read(
-    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
-) -> Campaign | FrequencyResponse:
-    """A .mat file: records, or a frequency response (variables frequency_Hz and H).
-
-    Raises
-    ------
-    InputError : names file, record or variable, and what was expected.
-    """
-    path, hints = existing_file(path), hints or Hints()
+def read(path: Path, columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign | FrequencyResponse:
+    """A .mat file: records, or a frequency response (variables frequency_Hz and H)."""
     with reading(path, "the .mat file"):
         tree = variables(path)
         if len(tree) == 1 and isinstance(only := next(iter(tree.values())), dict) and "records" not in tree:

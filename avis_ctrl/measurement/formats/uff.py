@@ -17,15 +17,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
-from avis_ctrl.measurement.formats.common import (
-    ALLOWED,
-    INPUT_NAME,
-    Unit,
-    existing_file,
-    reading,
-    require_small,
-    unit_of,
-)
+from avis_ctrl.measurement.formats.common import ALLOWED, INPUT_NAME, Unit, reading, require_small, unit_of
 from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, campaign_from, mapped, pick, record_from
 from avis_ctrl.measurement.formats.response import response_from
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, rounded, sample_rate_from
@@ -53,19 +45,12 @@ AVERAGES = (r"(\d+)\s*averages?\b", r"\baverages?\s*[:=]?\s*(\d+)")
 Entry = tuple[Point, Point]
 
 
-def read(
-    path: str | Path, columns: Mapped | None = None, rig: str | None = None, hints: Hints | None = None
-) -> Campaign | FrequencyResponse:
+def read(path: Path, columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign | FrequencyResponse:
     """A universal file: a campaign if it contains time responses, otherwise its frequency responses.
 
     columns : roles u, y, floor to names of channels. Without it, excitation forces, references of other functions and
     the names u*, A1, Ax1, ... are inputs.
-
-    Raises
-    ------
-    InputError : names file, data set or channel, and what was expected.
     """
-    path, hints = existing_file(path), hints or Hints()
     with reading(path, "the universal file"):
         require_small(path)
         found = functions(path)

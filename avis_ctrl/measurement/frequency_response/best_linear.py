@@ -49,37 +49,17 @@ class _Experiments:
 
 
 def best_linear_approximation(
-    campaign: Campaign,
-    *,
-    band_Hz: Band | None = None,
-    level_V: float | None = None,
-    transient: Transient = "auto",
-    smooth_lines: int | None = None,
+    campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None, transient: Transient = "auto"
 ) -> FrequencyResponse:
-    """G from the drives on the excited lines, with total, noise and distortion covariances.
+    """The response, where all excited lines have the same inputs.
 
-    The floor motion is not periodic and counts as noise.
-
-    Parameters
-    ----------
-    band_Hz : frequency band; all lines by default.
-    level_V : r.m.s. level of the records to use, if the campaign has several levels.
-    transient : "drop": drop the periods that have not settled (at least two are kept); "remove": remove the transient
-        by local polynomials or rational functions through the lines between harmonics; "none"; "auto": drop if at least
-        half of the periods remain and are settled, otherwise remove. If a mode is narrower than about two lines of the
-        record, part of its transient remains and is included in C.
-    smooth_lines : C is averaged over 2 smooth_lines + 1 excited lines; by default the smallest number with 2 n_y + 4
-        degrees of freedom.
+    Parameters and errors as in `best_linear_approximations`.
 
     Raises
     ------
-    InputError : no periodic records, several levels or periods, different inputs on different lines (then use
-        `best_linear_approximations`), neither repeated periods nor several realisations.
-    ComputationError : experiments that cannot separate the inputs.
+    InputError : different inputs on different lines.
     """
-    found = best_linear_approximations(
-        campaign, band_Hz=band_Hz, level_V=level_V, transient=transient, smooth_lines=smooth_lines
-    )
+    found = best_linear_approximations(campaign, band_Hz=band_Hz, level_V=level_V, transient=transient)
     if len(found) > 1:
         sets = "; ".join(f"{', '.join(r.inputs)} on {r.frequency_Hz.size} lines" for r in found)
         message = (
@@ -91,16 +71,27 @@ def best_linear_approximation(
 
 
 def best_linear_approximations(
-    campaign: Campaign,
-    *,
-    band_Hz: Band | None = None,
-    level_V: float | None = None,
-    transient: Transient = "auto",
-    smooth_lines: int | None = None,
+    campaign: Campaign, *, band_Hz: Band | None = None, level_V: float | None = None, transient: Transient = "auto"
 ) -> tuple[FrequencyResponse, ...]:
-    """One response for each set of inputs that are excited on the same lines (several sets for zippered multisines).
+    """G from the drives on the excited lines, with total, noise and distortion covariances.
 
-    Parameters and errors as in `best_linear_approximation`.
+    One response for each set of inputs that are excited on the same lines (several sets for zippered multisines). The
+    floor motion is not periodic and counts as noise. C is averaged over the smallest number of excited lines with
+    2 n_y + 4 degrees of freedom.
+
+    Parameters
+    ----------
+    band_Hz : frequency band; all lines by default.
+    level_V : r.m.s. level of the records to use, if the campaign has several levels.
+    transient : "drop": drop the periods that have not settled (at least two are kept); "remove": remove the transient
+        by local polynomials or rational functions through the lines between harmonics; "none"; "auto": drop if at least
+        half of the periods remain and are settled, otherwise remove. If a mode is narrower than about two lines of the
+        record, part of its transient remains and is included in C.
+
+    Raises
+    ------
+    InputError : no periodic records, several levels or periods, neither repeated periods nor several realisations.
+    ComputationError : experiments that cannot separate the inputs.
     """
     records = periodic_records(campaign, level_V)
     used = channels(records, False)
@@ -114,10 +105,7 @@ def best_linear_approximations(
     frequency = np.arange(keep.start, keep.stop) * rate / n
     treatment = f"{dropped} periods dropped" + (", transient removed" if remove else "")
     words = f"best linear approximation, {len(data.U)} experiments of {means[0].periods} periods, {treatment}"
-    return tuple(
-        _response(data, frequency, line, active, used, smooth_lines, words)
-        for active, line in _excited_sets(data, used)
-    )
+    return tuple(_response(data, frequency, line, active, used, words) for active, line in _excited_sets(data, used))
 
 
 def chosen_treatment(
@@ -185,13 +173,7 @@ def _excited_sets(data: _Experiments, used: Channels) -> list[tuple[list[int], n
 
 
 def _response(
-    data: _Experiments,
-    frequency_Hz: np.ndarray,
-    line: np.ndarray,
-    active: list[int],
-    used: Channels,
-    smooth_lines: int | None,
-    words: str,
+    data: _Experiments, frequency_Hz: np.ndarray, line: np.ndarray, active: list[int], used: Channels, words: str
 ) -> FrequencyResponse:
     names = tuple(used.inputs[j] for j in active)
     U, Y = np.moveaxis(data.U[:, line][:, :, active], 0, 1), np.moveaxis(data.Y[:, line], 0, 1)
@@ -208,7 +190,7 @@ def _response(
         message = f"expected repeated periods or more than {len(active)} experiments, to estimate the noise"
         raise InputError(message, field="records", value=len(data.U))
     per_line = dof or data.dof
-    half = _smoothing(smooth_lines, per_line, n_y, line.size)
+    half = _smoothing(per_line, n_y, line.size)
     C = noise = None if noise is None else _running_mean(noise, half)
     distortion = None
     said = "; noise only, distortion not separated"
@@ -246,12 +228,8 @@ def _check_rank(gram: np.ndarray, names: tuple[str, ...], experiments: int, freq
         )
 
 
-def _smoothing(asked: int | None, dof: int, n_y: int, count: int) -> int:
+def _smoothing(dof: int, n_y: int, count: int) -> int:
     """Number of lines on each side over which C is averaged."""
-    if asked is not None:
-        if not 0 <= asked <= (count - 1) // 2:
-            raise InputError(f"expected 0 to {(count - 1) // 2} lines to each side", field="smooth_lines", value=asked)
-        return asked
     half = 0
     while (2 * half + 1) * dof < 2 * n_y + 4 and 2 * half + 3 <= count:
         half += 1

@@ -117,10 +117,9 @@ def noise_covariance(
     campaign: Campaign,
     frequency_Hz: np.ndarray,
     *,
-    smooth_Hz: float | None = None,
+    smooth_Hz: float,
     band_Hz: Band | None = None,
     order: int = 2,
-    half_width: int | None = None,
     floor: bool | None = None,
     longest_piece: int | None = None,
 ) -> NoiseCovariance:
@@ -133,7 +132,7 @@ def noise_covariance(
 
     Parameters
     ----------
-    frequency_Hz : (n,) frequencies of the result. smooth_Hz : half the smoothing band; one window by default.
+    frequency_Hz : (n,) frequencies of the result. smooth_Hz : half the smoothing band.
     Other parameters as in `local_polynomial`.
 
     Raises
@@ -144,15 +143,13 @@ def noise_covariance(
     if not records:
         raise InputError("expected a record other than a stepped sine", field="records")
     data = _Data.of(records, floor, band_Hz, longest_piece)
-    width = data.width(order) if half_width is None else half_width
-    if smooth_Hz is not None and not smooth_Hz > 0:
-        raise InputError("expected a positive frequency", field="smooth_Hz", value=smooth_Hz)
+    width = data.width(order)
     asked, every = data.grid(frequency_Hz, width), data.grid(None, width)
     centres = every[width : every.size - width : 2 * width + 1]  # windows without a common line
     # The residual of the outputs is known whether or not the inputs can be separated.
     found = data.fit(centres, order, width).estimate(data.names, partial=True)
     least = min(-(-(len(data.used.outputs) + 2) // found.dof), centres.size)
-    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz or width * data.step_Hz, least)
+    return _smoothed(centres, found.noise, found.dof, asked, smooth_Hz, least)
 
 
 def _smoothed(

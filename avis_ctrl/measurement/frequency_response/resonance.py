@@ -60,21 +60,20 @@ class Resonance:
     lines: int
 
 
-def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | None = None) -> Resonance:
+def resonance(response: FrequencyResponse, near_Hz: float) -> Resonance:
     """Local fit of one mode near a frequency.
 
     Parameters
     ----------
-    near_Hz : the search starts at the largest response within 5 % of it (or within width_Hz / 2).
-    width_Hz : band of the fit around the mode; by default 1, 2 or 4 half-power bandwidths to each side, the widest for
-        which the model still explains everything but the noise.
+    near_Hz : the search starts at the largest response within 5 % of it. The fit extends over 1, 2 or 4 half-power
+        bandwidths to each side of the mode, the widest for which the model still explains everything but the noise.
 
     Raises
     ------
     InputError : too few lines there. ComputationError : no mode inside the band.
     """
     f = response.frequency_Hz
-    reach = SETTINGS.search * near_Hz if width_Hz is None else width_Hz / 2
+    reach = SETTINGS.search * near_Hz
     inside = np.flatnonzero(np.abs(f - near_Hz) <= reach)
     if not f.size:
         raise InputError("expected lines", field="near_Hz", value=near_Hz)
@@ -86,9 +85,9 @@ def resonance(response: FrequencyResponse, near_Hz: float, *, width_Hz: float | 
         raise InputError(message, field="near_Hz", value=near_Hz)
     size = np.sum(np.abs(response.value) ** 2 / np.mean(np.abs(response.value[inside]) ** 2, axis=0), axis=(1, 2))
     peak = f[inside[np.argmax(size[inside])]]
-    half = reach if width_Hz is not None else max(reach / 2, SETTINGS.fewest_lines / 2 * float(np.median(np.diff(f))))
+    half = max(reach / 2, SETTINGS.fewest_lines / 2 * float(np.median(np.diff(f))))
     found = _fit(response, peak, half, near_Hz, reach)
-    for width in SETTINGS.reach if width_Hz is None else ():
+    for width in SETTINGS.reach:
         wider = found
         for _ in range(4):
             half = width * 2 * wider.damping * wider.frequency_Hz
@@ -164,7 +163,7 @@ def _require_pole(
             measured=f"a pole explains {ratio:.3g} times as much as of pure noise, from {f[0]:.6g} "
             f"to {f[-1]:.6g} Hz; {limit:.3g} is needed",
             cause="no resonance there, or one hidden by noise",
-            next_step="look at the response, and give near_Hz and width_Hz around a peak",
+            next_step="look at the response, and give near_Hz at a peak",
         )
 
 
@@ -188,7 +187,7 @@ def _result(
             measured=f"the fit ended at {natural / (2 * np.pi):.6g} Hz with damping "
             f"{decay / natural:.3g} over {f[0]:.6g} to {f[-1]:.6g} Hz",
             cause="no resonance there, or one too broad or too close to another for a local fit",
-            next_step="look at the response, and give near_Hz and width_Hz around a single peak",
+            next_step="look at the response, and give near_Hz at a single peak",
         )
     # The rows of J are scaled to variance 1/2.
     covariance = np.linalg.inv(2 * J.T @ J) * max(misfit, 1.0)
