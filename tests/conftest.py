@@ -15,15 +15,15 @@ settings.register_profile("seeded", derandomize=True)
 settings.load_profile("default" if os.environ.get("AVIS_EXPLORE") else "seeded")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
-# Simulators of tables with hidden effects, written apart from the package. Their own tests take minutes and change only
-# with them.
-SIMULATORS = [Path(__file__).parent / name for name in ("truth", "own_tables")]
+# Tests of what stands beside the package and changes only with it: simulators of tables with hidden effects, written
+# apart from it, and the programs in benchmarks. They take minutes.
+APART = [Path(__file__).parent / name for name in ("truth", "own_tables", "benchmark_programs")]
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if any(folder in item.path.parents for folder in SIMULATORS):
+        if any(folder in item.path.parents for folder in APART):
             item.add_marker(pytest.mark.slow)
 
 

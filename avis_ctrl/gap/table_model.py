@@ -76,7 +76,7 @@ class ActiveEffect:
 def active(effect: Effect, model: TableModel, place: str, values: Sequence[float] | None = None) -> ActiveEffect:
     """An effect at a place of a model; at zero strength if no values are given."""
     parameters = effect.parameters(model, place)
-    values = effect.starts(model, place)[0].tolist() if values is None else list(values)
+    values = list(effect.starts(model, place)[0] if values is None else values)
     if len(values) != len(parameters):
         raise InputError(f"expected {len(parameters)} values", field=effect.name, value=list(values))
     return ActiveEffect(effect, place, parameters, tuple(float(v) for v in values))

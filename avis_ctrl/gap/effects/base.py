@@ -18,6 +18,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -239,14 +240,9 @@ class Effect(ABC):
             force = on_lines(self.force, values)
         return Added(volts, force, on_lines(self.reading, values))
 
-    def starts(self, model: Table, place: str) -> Sequence[np.ndarray]:
+    def starts(self, model: Table, place: str) -> Sequence[tuple[float, ...]]:
         """Initial points of the search, (n_parameters,) each: shape parameters on their grid, linear ones at none."""
-        parameters = self.parameters(model, place)
-        points = [np.array([])]
-        for one in parameters:
-            values = (one.none,) if one.linear else one.grid
-            points = [np.append(point, value) for point in points for value in values]
-        return points
+        return list(product(*((one.none,) if one.linear else one.grid for one in self.parameters(model, place))))
 
     def implausible(self, values: Values, std: Values) -> str:
         """Why these values are not physical; empty if they are plausible."""
