@@ -149,7 +149,8 @@ class Judged:
 
 
 def is_trace(named: Named, line: Line) -> bool:
-    return any(one.name == named.name for one in line.traces)
+    """Whether a named effect is a trace of a cluttered table, or a value of it that lies beyond its tolerance."""
+    return any(one.name == named.name for one in line.traces) or (named.name, named.location) in line.far
 
 
 # Parameters of a hidden value of the rig file, what the file says, and its default tolerance.

@@ -142,6 +142,7 @@ class Line(_Part):
 
     hidden : effects of the truth; empty where kind is "none" (and where the truth itself failed).
     cluttered : the table is off its rig file in everything a little, and has traces of effects besides.
+    far : (effect, place) of its values that the draw put beyond three tolerances; set by the scorer.
     relative_change : by how much the effects change the signals, as the truth counts it; None where unknown.
     answer : what the finder said; None after a crash. crash : the text of the exception, None without one.
     seconds, cpu_seconds : the finder's, by the clock and summed over its processes.
@@ -167,6 +168,7 @@ class Line(_Part):
     settings: Settings
     cluttered: bool = False
     traces: list[Trace] = []
+    far: list[tuple[str, str]] = []
 
     @model_validator(mode="after")
     def _consistent(self) -> Line:

@@ -1,4 +1,5 @@
-"""Score a blind campaign from its JSON lines; nothing is simulated or fitted here.
+"""Score a blind campaign from its JSON lines; nothing is simulated or fitted here. The seed tells which values of a
+cluttered table lie beyond three tolerances.
 
 python -m benchmarks.blind.score blind.jsonl [--markdown blind.md] [--png blind.png]
 """
@@ -6,6 +7,7 @@ python -m benchmarks.blind.score blind.jsonl [--markdown blind.md] [--png blind.
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +17,11 @@ from avis_ctrl.errors import AvisError, InputError
 from benchmarks.blind import tables
 from benchmarks.blind.clutter import clutter_table
 from benchmarks.blind.figures import Asked, asked_table
-from benchmarks.blind.judge import Judged, contradiction, judge
+from benchmarks.blind.judge import WITHIN, Judged, contradiction, judge
 from benchmarks.blind.lines import Line, read_lines
 from benchmarks.blind.matrix import Confusion
 from benchmarks.blind.parameters import parameter_errors
+from benchmarks.blind.run import TESTS, TRUTH
 from benchmarks.blind.tables import Table
 
 
@@ -54,6 +57,15 @@ class Score:
             f"```text\n{self.confusion.text()}\n```",
         ]
         return "\n\n".join([*parts, *([f"![confusion matrix]({picture})"] if picture else [])]) + "\n"
+
+
+def with_far_values(line: Line) -> Line:
+    """The line with the values beyond tolerance; the truth is imported as its tests do, from the folder tests."""
+    if not line.cluttered:
+        return line
+    if str(TESTS) not in sys.path:
+        sys.path.insert(0, str(TESTS))
+    return line.model_copy(update={"far": importlib.import_module(TRUTH).far_values(line.seed, WITHIN)})
 
 
 def score(lines: Sequence[Line]) -> Score:
@@ -136,7 +148,7 @@ def main(words: list[str] | None = None) -> None:
     options.add_argument("--png", type=Path, help="picture of the confusion matrix; by default beside the lines")
     given = options.parse_args(words)
     try:
-        result = score(read_lines(given.lines))
+        result = score([with_far_values(line) for line in read_lines(given.lines)])
         print(result.text())
         picture = given.png or given.lines.with_suffix(".png")
         _write(picture, lambda: result.confusion.draw(picture))

@@ -468,3 +468,10 @@ def test_an_unfinished_last_line_is_cut(tmp_path):
     assert [one.seed for one in finished(path)] == [1]
     assert path.read_bytes() == whole
     assert finished(tmp_path / "absent") == []
+
+
+def test_a_value_that_lies_beyond_its_tolerance_is_no_false_name():
+    drawn = line(1, "none", [], answer("explained", named("sensor_gain", "Sz2")), cluttered=True)
+    assert judge(drawn).outcome == "false name"
+    for place, outcome in (("Sz2", "quiet"), ("Sx2", "false name")):
+        assert judge(drawn.model_copy(update={"far": [("sensor_gain", place)]})).outcome == outcome

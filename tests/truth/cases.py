@@ -23,7 +23,7 @@ import numpy as np
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
 from avis_ctrl.rigs import AvisTable, load_rig
 
-from .clutter import Pilot, add_trace, disturb, draw_traces, tolerances
+from .clutter import Pilot, add_trace, disturb, draw_traces, far, tolerances
 from .effect import STRENGTHS, Draw, Effect, Hidden
 from .kernel import integrate, state_size
 from .library_mechanics import MECHANICS
@@ -168,6 +168,13 @@ def draw_case(
         case = replace(case, traces=draw_traces(quiet, _pilot_of(case), LIBRARY, tuple(names)))
     unmeasured = "ground_motion" in names
     return replace(case, kind=kind, effects=tuple(hidden), floor_recorded=case.floor_recorded and not unmeasured)
+
+
+def far_values(seed: int, times: float) -> list[tuple[str, str]]:
+    """(effect, place) of the values of a cluttered table that lie beyond so many tolerances without a hidden effect."""
+    before, after = (draw_plant(rig(), _rng(seed, _PARAMETERS)) for _ in range(2))
+    disturb(after, tolerances(rig()), _rng(seed, _CLUTTER))
+    return far(before, after, tolerances(rig()), times)
 
 
 def build_plant(case: Case) -> Plant:

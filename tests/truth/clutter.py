@@ -75,6 +75,36 @@ def disturb(plant: Plant, limits: dict[str, float], rng: np.random.Generator) ->
         plant.J[a, b] = plant.J[b, a] = plant.J[a, b] + product
 
 
+def far(before: Plant, after: Plant, limits: dict[str, float], times: float) -> list[tuple[str, str]]:
+    """(effect, place) of every value that differs by more than so many tolerances: a table drawn within tolerances has
+    some of them, and to name one is not wrong."""
+
+    def relative(name: str) -> np.ndarray:
+        return np.abs(getattr(after, name) / getattr(before, name) - 1)
+
+    angle = np.arccos(np.clip(np.sum(after.sensor_n * before.sensor_n, axis=1), -1, 1))
+    corner = np.maximum(
+        relative("wn") / limits["sensor_corner_percent"], relative("zn") / limits["sensor_damping_percent"]
+    )
+    by_place = {
+        "sensor_gain": (after.sensors, relative("S") / limits["sensor_gain_percent"]),
+        "geophone_corner": (after.sensors, corner),
+        "sensor_misalignment": (after.sensors, angle / limits["direction_rad"]),
+        "actuator_gain": (after.motors, relative("motor") / limits["actuator_gain_percent"]),
+        "product_of_inertia": (
+            ("Jxy", "Jxz", "Jyz"),
+            np.abs(after.J - before.J)[[0, 0, 1], [1, 2, 2]] / limits["product_of_inertia_kgm2"],
+        ),
+        "com_offset": (("payload",), [np.max(np.abs(after.com - before.com)) / limits["centre_of_mass_m"]]),
+    }
+    return [
+        (effect, place)
+        for effect, (places, tolerances) in by_place.items()
+        for place, away in zip(places, tolerances, strict=True)
+        if away > times
+    ]
+
+
 class Pilot:
     """The response of a table to a short record at three levels, and what refitting the table could change in it.
 

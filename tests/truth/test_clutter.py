@@ -13,7 +13,7 @@ from avis_ctrl.rigs import AvisTable
 
 from . import cases, clutter
 from .cases import best_prediction, build_plant, draw_case, rig, run, simulate_case, tolerances
-from .clutter import DEFAULTS, TRACES, disturb
+from .clutter import DEFAULTS, TRACES, disturb, far
 from .kernel import FIRST_EFFECT_STATE
 from .library_mechanics import LADDER_HZ
 from .signals import multisine, noise
@@ -87,6 +87,23 @@ def test_the_closed_form_tells_each_kind_of_place(places):
     other = loose()
     setattr(other, places, getattr(loose(without="place_m"), places))
     assert misfit(loose(), other).max() > 5e-3
+
+
+def test_values_far_beyond_their_tolerance_are_known():
+    """One in 370 of normal numbers lies beyond three standard deviations, one in 90 of angles in two directions."""
+    before, after = (draw_plant(rig(), np.random.default_rng(3)) for _ in range(2))
+    assert far(before, after, tolerances(rig()), 0.0) == []
+    after.zn[4] *= 1.1
+    after.motor[2] *= 0.96
+    after.J[0, 2] = after.J[2, 0] = after.J[0, 2] + 1.0
+    assert far(before, after, tolerances(rig()), 3.0) == [
+        ("geophone_corner", "Sy3"),
+        ("actuator_gain", after.motors[2]),
+        ("product_of_inertia", "Jxz"),
+    ]
+    found = [one for seed in range(400) for one in cases.far_values(seed, 3.0)]
+    # Per table 6 + 2 * 6 + 8 + 3 + 3 normal numbers and 6 angles.
+    assert 0.7 < len(found) / (400 * (32 * 0.0027 + 6 * np.exp(-4.5))) < 1.3
 
 
 def test_matrices_of_a_cluttered_table_are_those_of_the_package():
