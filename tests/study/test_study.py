@@ -401,7 +401,8 @@ def test_whole_study_of_a_shipped_design(name, tmp_path):
     stored = check_folder(tmp_path)
     assert {row["name"] for row in stored["controllers"]} >= {"passive", "skyhook", "hinf", "mu"}
     assert len(stored["dk_history"]) >= 1
-    assert len(stored["requirements"]) == 3 + len(design.requirement)  # stability, limits and agreement belong to each
+    # Stability, limits, agreement and the voltage for the electronics' offset belong to each.
+    assert len(stored["requirements"]) == 4 + len(design.requirement)
     assert all(path.stat().st_size > 0 for path in files)
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     assert any("D-K iteration" in line for line in said)
