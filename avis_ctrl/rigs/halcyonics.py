@@ -303,6 +303,9 @@ class Halcyonics(Rig):
         ]
         return tuple(one.with_electronics(self.electronics, 1.0, self.converter, self.sample_rate_Hz) for one in bare)
 
+    def force_constant(self, actuator: str) -> str:
+        return f"e{self.actuator_names.index(actuator) + 1}"
+
     def parameters(self) -> dict[str, Parameter]:
         """Symbols of the source; k_s1..k_s4 by corner (k_s: their mean), e1..e8, load.mass, load.L7, load.Ixx .."""
         found = {name: Parameter(getattr(self, name), unit, text) for name, (unit, text) in _SCALARS.items()}

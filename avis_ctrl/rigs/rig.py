@@ -95,6 +95,10 @@ class Rig(ABC):
     def parameters(self) -> dict[str, Parameter]:
         """Every physical parameter by its flat name."""
 
+    def force_constant(self, actuator: str) -> str:
+        """Flat name of the parameter that is an actuator's force constant."""
+        return f"actuator.{actuator}"
+
     @abstractmethod
     def _with_values(self, values: dict[str, float]) -> Self:
         """A new rig with these values; the names are known and the values finite."""

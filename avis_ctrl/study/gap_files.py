@@ -156,7 +156,7 @@ def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
         return None
     values = one.by_name
     if one.effect.name == "actuator_gain":
-        name = f"actuator.{one.place}"
+        name = rig.force_constant(one.place)
         return rig.with_parameters({name: rig.parameters()[name].value * values["gain"]})
     if one.effect.name == "sensor_gain":
         gain = next(sensor.gain for sensor in rig.sensors() if sensor.name == one.place)

@@ -205,9 +205,7 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
         fits = name in DESCRIBED_IN and not (name == "sensor_gain" and isinstance(rig, Halcyonics))
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_gain":
-            key = f"actuator.{one.place}"
-            if isinstance(rig, Halcyonics):
-                key = f"e{rig.actuator_names.index(one.place) + 1}"
+            key = rig.force_constant(one.place)
             changes[key] = changes.get(key, known[key].value) * values["gain"]
         elif name == "sensor_gain":
             factors[one.place] *= values["gain"]

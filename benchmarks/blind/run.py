@@ -294,10 +294,15 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     return given
 
 
+def make_truth_importable() -> None:
+    """Append its folder to the search path of modules, which workers get, too."""
+    if str(TESTS) not in sys.path:
+        sys.path.append(str(TESTS))
+
+
 def main(words: list[str] | None = None) -> None:
     given = arguments(words)
-    if str(TESTS) not in sys.path:
-        sys.path.append(str(TESTS))  # workers get this list too
+    make_truth_importable()
     settings = Settings(
         duration_s=given.duration,
         jobs=given.jobs,

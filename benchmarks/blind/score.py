@@ -21,7 +21,7 @@ from benchmarks.blind.judge import WITHIN, Judged, contradiction, judge
 from benchmarks.blind.lines import Line, read_lines
 from benchmarks.blind.matrix import Confusion
 from benchmarks.blind.parameters import parameter_errors
-from benchmarks.blind.run import TESTS, TRUTH
+from benchmarks.blind.run import TRUTH, make_truth_importable
 from benchmarks.blind.tables import Table
 
 
@@ -60,11 +60,10 @@ class Score:
 
 
 def with_far_values(line: Line) -> Line:
-    """The line with the values beyond tolerance; the truth is imported as its tests do, from the folder tests."""
+    """The line of a cluttered table with its values beyond tolerance; any other line as it is."""
     if not line.cluttered:
         return line
-    if str(TESTS) not in sys.path:
-        sys.path.insert(0, str(TESTS))
+    make_truth_importable()
     return line.model_copy(update={"far": importlib.import_module(TRUTH).far_values(line.seed, WITHIN)})
 
 

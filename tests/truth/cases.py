@@ -173,8 +173,9 @@ def draw_case(
 def far_values(seed: int, times: float) -> list[tuple[str, str]]:
     """(effect, place) of the values of a cluttered table that lie beyond so many tolerances without a hidden effect."""
     before, after = (draw_plant(rig(), _rng(seed, _PARAMETERS)) for _ in range(2))
-    disturb(after, tolerances(rig()), _rng(seed, _CLUTTER))
-    return far(before, after, tolerances(rig()), times)
+    limits = tolerances(rig())
+    disturb(after, limits, _rng(seed, _CLUTTER))
+    return far(before, after, limits, times)
 
 
 def build_plant(case: Case) -> Plant:

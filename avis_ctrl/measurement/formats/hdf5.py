@@ -68,7 +68,7 @@ CHUNK = 1 << 14  # samples per chunk on disk
 def read(path: Path, columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign | FrequencyResponse:
     """An HDF5 campaign, whose samples stay in the file until they are loaded, or its frequency response.
 
-    columns, hints : none that apply to records, because the file states them itself. Errors name file, record and
+    columns, hints : not to be given for records, because the file states them itself. Errors name file, record and
     field.
     """
     with reading(path, "the HDF5 file"), stored.open_hdf5(path) as file:
