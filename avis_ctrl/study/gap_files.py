@@ -23,8 +23,8 @@ from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.predictor import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.file_errors import read_json
+from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.file_names import (
@@ -152,20 +152,15 @@ def rig_with_effects(model: TableModel) -> tuple[Rig, list[ActiveEffect]]:
 
 def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
     """The rig with an effect that changes a number of its file; None for any other effect."""
-    if not isinstance(rig, AvisTable):
-        return None
     values = one.by_name
     if one.effect.name == "actuator_gain":
         name = rig.force_constant(one.place)
         return rig.with_parameters({name: rig.parameters()[name].value * values["gain"]})
-    if one.effect.name == "sensor_gain":
+    if one.effect.name == "sensor_gain" and not isinstance(rig, Halcyonics):  # one sensitivity for all
         gain = next(sensor.gain for sensor in rig.sensors() if sensor.name == one.place)
         return rig.with_sensor_gains({one.place: gain * values["gain"]})
     if one.effect.name == "loop_delay":
-        return replace(
-            rig,
-            acquisition=replace(rig.acquisition, loop_delay_s=rig.acquisition.loop_delay_s + values["extra_delay_s"]),
-        )
+        return rig.with_loop_delay(rig.loop_delay_s + values["extra_delay_s"])
     return None
 
 

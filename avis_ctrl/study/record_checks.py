@@ -25,7 +25,7 @@ def expectation(model: ResponseModel) -> Expectation:
         y_range_V=converter.limits_V if converter else None,
         y_lsb_V=converter.lsb_V if converter else None,
         drive_limits_V=dict(zip(model.actuators, rig.limits_of(model.actuators).tolist(), strict=True)),
-        sensor_noise_rms_V=rig.ambient.sensor_noise_rms_V if converter and rig.ambient else None,
+        sensor_noise_rms_V=(rig.ambient.sensor_noise_rms_V or None) if converter and rig.ambient else None,
         y_names=model.sensors.names,
         response=response,
     )

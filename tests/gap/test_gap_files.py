@@ -32,7 +32,7 @@ from avis_ctrl.rigs.rig_file import load_rig as read_rig
 from avis_ctrl.study.file_names import GAP_FILES
 from avis_ctrl.study.gap import GapFinding, GapOptions, find_gap, predict
 from avis_ctrl.study.gap_axis import write_axis_gap, write_axis_predictions
-from avis_ctrl.study.gap_files import read_gap, write_gap, write_gap_predictions
+from avis_ctrl.study.gap_files import read_gap, rig_with_effects, write_gap, write_gap_predictions
 
 RIG = load_rig("avis")
 FREE = ("mass", "J1", "isolator1.k_z", "isolator2.c_x", "actuator.Az1", "sensor.Sz2")
@@ -111,6 +111,17 @@ def test_halcyonics_comes_back():
     model = model.with_effect(active(library()["actuator_gain"], model, model.actuators[0], [1.07]))
     again, _ = model_from_dict(json.loads(json.dumps(model_to_dict(model))))
     np.testing.assert_allclose(again.response(OMEGA), model.response(OMEGA), rtol=1e-12)
+
+
+def test_a_halcyonics_file_takes_a_gain_and_a_delay_of_the_drives():
+    rig = load_rig("halcyonics")
+    model = TableModel(ResponseModel.of(rig, ("mass",)))
+    for name, place, value in (("actuator_gain", "A2", 1.07), ("loop_delay", "all channels", 0.3e-3)):
+        model = model.with_effect(active(library()[name], model, place, [value]))
+    updated, left = rig_with_effects(model)
+    assert left == []
+    assert updated.e[1] == pytest.approx(1.07 * rig.e[1]) and updated.e[0] == rig.e[0]
+    assert updated.loop_delay_s == pytest.approx(rig.loop_delay_s + 0.3e-3)
 
 
 def changed(**changes):

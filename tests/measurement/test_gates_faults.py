@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gates_rig import LSB, RATE, changed, everywhere, known, multisine_campaign, noise_campaign
@@ -198,6 +200,15 @@ def test_a_stop_is_said_once_and_without_a_second_full_stop(clean):
         check_campaign(campaign, start_model(campaign, load_rig("avis"), IdentifyOptions()), False, lines.append)
     assert ".;" not in str(error.value) and "--despite-gates" in str(error.value)
     assert not [line for line in lines if "stop:" in line]
+
+
+def test_a_rig_without_sensor_noise_is_checked_all_the_same(clean):
+    """A rig file of a simulated table may state no noise; then there is no noise to compare with."""
+    rig = load_rig("avis")
+    quiet = replace(rig, ambient=replace(rig.ambient, sensor_noise_rms_V=0.0))
+    lines: list[str] = []
+    check_campaign(clean, start_model(clean, quiet, IdentifyOptions()), False, lines.append)
+    assert not [line for line in lines if "noise of" in line]
 
 
 def test_figures_name_the_channels(clean):

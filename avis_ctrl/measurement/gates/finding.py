@@ -153,7 +153,7 @@ class Expectation:
     response: Response | None = None
 
     def __post_init__(self) -> None:
-        # The rig file allows 0 here; it refuses it for everything else.
+        # Zero, which a rig file of a simulated table may state, is nothing to compare with.
         if self.sensor_noise_rms_V is not None and not self.sensor_noise_rms_V > 0:
             raise InputError("expected a positive number", field="sensor_noise_rms_V", value=self.sensor_noise_rms_V)
 
