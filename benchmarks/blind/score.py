@@ -15,8 +15,7 @@ from pathlib import Path
 
 from avis_ctrl.errors import AvisError, InputError
 from benchmarks.blind import tables
-from benchmarks.blind.clutter import clutter_table
-from benchmarks.blind.figures import Asked, asked_table
+from benchmarks.blind.asked import asked_table
 from benchmarks.blind.judge import WITHIN, Judged, contradiction, judge
 from benchmarks.blind.lines import Line, read_lines
 from benchmarks.blind.matrix import Confusion
@@ -29,11 +28,10 @@ from benchmarks.blind.tables import Table
 class Score:
     """A scored campaign.
 
-    cases : by seed. asked : the issue's rows. tables : in the order of printing. remarks : what a reader must know.
+    cases : by seed. tables : in the order of printing. remarks : what a reader must know.
     """
 
     cases: tuple[Judged, ...]
-    asked: tuple[Asked, ...]
     tables: tuple[Table, ...]
     confusion: Confusion
     remarks: tuple[str, ...]
@@ -71,12 +69,8 @@ def score(lines: Sequence[Line]) -> Score:
     """Everything that the lines say."""
     cases = [judge(line) for line in lines]
     errors, unknown = parameter_errors(cases)
-    # The issue asks of clean tables; what the same figures are on cluttered ones stands in a table of its own.
-    clean = [case for case in cases if not case.line.cluttered] or cases
-    asked = asked_table(clean, parameter_errors(clean)[0])
     found = [
-        tables.asked_rows(asked),
-        clutter_table(cases),
+        asked_table(cases),
         tables.verdict_table(cases),
         *tables.outcome_tables(cases),
         tables.effect_table(cases),
@@ -88,9 +82,7 @@ def score(lines: Sequence[Line]) -> Score:
         tables.excitation_table(cases),
         tables.cost_table(cases),
     ]
-    return Score(
-        tuple(cases), tuple(asked), tuple(one for one in found if one.rows), Confusion.of(cases), tuple(remarks(cases))
-    )
+    return Score(tuple(cases), tuple(one for one in found if one.rows), Confusion.of(cases), tuple(remarks(cases)))
 
 
 def remarks(cases: Sequence[Judged]) -> list[str]:
@@ -112,8 +104,7 @@ def remarks(cases: Sequence[Judged]) -> list[str]:
     if cluttered:
         found.append(
             f"{cluttered} cases have a cluttered table: off its rig file in everything a little, with traces "
-            "of effects besides. Clean and cluttered cases are apart in the table of both, and "
-            + ("what is asked counts the clean ones." if cluttered < len(lines) else "no case is clean.")
+            "of effects besides."
         )
     if len(lines) < 300:
         found.append(f"{len(lines)} cases are fewer than the 300 asked for.")

@@ -8,16 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.blind.figures import (
-    GAP_FACTOR,
-    NOISE_RATIO,
-    Asked,
-    closed,
-    gap_factor,
-    named_answers,
-    noise_ratio,
-    of_kind,
-)
+from benchmarks.blind.figures import GAP_FACTOR, NOISE_RATIO, closed, gap_factor, named_answers, noise_ratio, of_kind
 from benchmarks.blind.judge import LIBRARY, OUTCOMES, PLACED, Judged
 from benchmarks.blind.lines import KINDS, STRENGTHS
 from benchmarks.blind.parameters import Error
@@ -53,16 +44,6 @@ class Table:
                 *(["", self.note] if self.note else []),
             ]
         )
-
-
-def asked_rows(figures: Sequence[Asked]) -> Table:
-    return Table(
-        "Asked and measured",
-        ("", "asked", "measured", ""),
-        tuple((one.what, one.asked, one.measured, one.word) for one in figures),
-        "Shares with Wilson's 95 % interval; met or missed is said of the share itself. A crash counts as a "
-        "false alarm, a wrong name, a wrong pair or a misnaming. Real data are not part of this campaign.",
-    )
 
 
 def verdict_table(cases: Sequence[Judged]) -> Table:

@@ -10,8 +10,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from benchmarks.blind.asked import asked_table
 from benchmarks.blind.case import described
-from benchmarks.blind.clutter import clutter_table
 from benchmarks.blind.judge import judge
 from benchmarks.blind.lines import Line, Settings
 from benchmarks.blind.run import arguments, is_cluttered
@@ -109,13 +109,14 @@ def test_clean_and_cluttered_stand_apart():
         line(5, "outside", ("loop_delay",), ("air_drag",), probability=0.91),
     ]
     result = score(lines)
-    table = next(one for one in result.tables if one.title == "Clean and cluttered tables")
-    assert table.head[1:] == ("clean", "cluttered")
+    table = next(one for one in result.tables if one.title == "Asked and measured")
+    assert table.head == ("", "clean", "asked", "cluttered", "asked")
     for row, clean, cluttered in (
         ("cases", "2", "4"),
         ("no effect", "0.0 % (0/1", "100.0 % (1/1"),
         ("one effect", "100.0 %", "0.0 % (0/1"),
-        ("two effects", "no case", "100.0 % (1/1"),
+        ("two effects: both", "no case", "100.0 % (1/1"),
+        ("two effects, each", "no case", "100.0 % (1/1"),
         ("outside", "no case", "100.0 % (1/1"),
         ("unseen record: error of updated over re", "median 0.2", "median 0.5"),
         ("unseen record: error of updated over best", "median 2", "median 5"),
@@ -124,9 +125,7 @@ def test_clean_and_cluttered_stand_apart():
     ):
         assert cell(table, row, "clean").startswith(clean), row
         assert cell(table, row, "cluttered").startswith(cluttered), row
-    asked = {one.what: one.measured for one in result.asked}
-    assert asked["no effect: false alarms"].startswith("0.0 % (0/1")  # the clean one only
-    assert clutter_table([judge(one) for one in lines if one.cluttered]).head == ("", "cluttered")
+    assert asked_table([judge(one) for one in lines if one.cluttered]).head == ("", "cluttered", "asked")
 
 
 def test_any_run_of_seeds_holds_the_share():
