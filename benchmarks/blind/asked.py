@@ -44,8 +44,8 @@ def asked_table(cases: Sequence[Judged]) -> Table:
         ("", *sum((words[k] for k in present), ())),
         tuple(rows),
         "Fractions with Wilson's 95 % interval. Traces of a cluttered table (hum, friction, stiffening, loss) are "
-        "there, so their names are not false; nor is what the answer lists under its own traces. Best possible: the true "
-        "table with its traces and all that is random switched off, against the same measured records.",
+        "there, so their names are not false; nor is what the answer lists under its own traces. Best possible: the "
+        "true table with its traces and all that is random switched off, against the same measured records.",
     )
 
 
