@@ -299,8 +299,20 @@ def _signals(case: Case, number: int, unseen: bool) -> tuple[np.ndarray, np.ndar
     return u, floor, before
 
 
-def _record(case: Case, plant: Plant, number: int, start_s: float, unseen: bool, driven: bool = True) -> Record:
+def _record(
+    case: Case,
+    plant: Plant,
+    number: int,
+    start_s: float,
+    unseen: bool,
+    *,
+    driven: bool = True,
+    from_rest: bool = False,
+) -> Record:
+    """from_rest : the table starts with the record, at rest on the floor, instead of in ambient motion."""
     u, floor, before = _signals(case, number, unseen)
+    if from_rest:
+        floor, before = floor[before:], 0
     u, floor = u * driven, floor * np.tile(np.broadcast_to(plant.floor_factor, 3), 3)
     key = (number, int(unseen))
     y, _ = run(plant, u, floor, before, start_s, _rng(case.seed, _HOOKS, *key))
@@ -325,13 +337,14 @@ def best_prediction(case: Case, unseen: bool = False) -> list[np.ndarray]:
     """Of each record: what the true table would show with its traces and all that is random switched off.
 
     Its tolerances and hidden effects are in; traces, sensor noise, jitter, lost samples and a floor that nobody
-    measured are not. No prediction from u and the measured floor can do better, but by modelling the traces.
+    measured are not. Nor is what moved the table before the record: nobody measured it. No prediction from u and the
+    measured floor can do better, but by modelling the traces.
     """
     plant = build_plant(replace(case, traces=()))
     plant.noise_V, plant.jitter_s, plant.digital = np.zeros(6), 0.0, []
     plant.floor_factor = plant.floor_factor if case.floor_recorded else 0.0
     return [
-        np.asarray(_record(case, plant, number, start, unseen).y)
+        np.asarray(_record(case, plant, number, start, unseen, from_rest=True).y)
         for number, start in enumerate(_starts_of(case, unseen))
     ]
 
