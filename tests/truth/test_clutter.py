@@ -268,14 +268,14 @@ def test_cluttered_cases_repeat(monkeypatch):
 
 def test_best_prediction_leaves_noise_and_traces(traced):
     floor = next(seed for seed in range(20) if draw_case(seed, kind="none").floor_recorded)
-    clean = draw_case(floor, kind="none", duration_s=12.0)
+    clean = draw_case(floor, kind="none", duration_s=20.0)
     step = 20 / 2**14  # both are rounded
     measured = simulate_case(clean, unseen=True).records
     for record, best in zip(measured, best_prediction(clean, unseen=True), strict=True):
         off = record.y - best
         # The first seconds hold the motion that the table had before the record.
-        np.testing.assert_allclose(off[-3000:].std(axis=0), np.sqrt(1e-6 + 2 * step**2 / 12), rtol=0.05)
-        assert np.all(off[:3000].std(axis=0) > 1.2 * off[-3000:].std(axis=0))
+        np.testing.assert_allclose(off[-4000:].std(axis=0), np.sqrt(1e-6 + 2 * step**2 / 12), rtol=0.05)
+        assert np.all(off[:4000].std(axis=0) > 1.2 * off[-4000:].std(axis=0))
     short = replace(traced, duration_s=8.0, floor_recorded=True)
     loud = int(np.argmax(short.levels_V))
     off = simulate_case(short).records[loud].y - best_prediction(short)[loud]
