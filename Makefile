@@ -5,7 +5,7 @@ BIN = .venv/bin
 export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
-.PHONY: install test test-slow demo docs gallery lint bench clean
+.PHONY: install test fast test-slow demo docs gallery lint bench clean
 
 $(BIN)/.installed: pyproject.toml constraints.txt
 	@echo "Installing into .venv: a minute or two"
@@ -26,7 +26,11 @@ lint: $(BIN)/.installed
 # tests, the slowest among them, would otherwise come last.
 TEST = $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test: lint
+# The linters take one core for a minute and a half: side by side with the tests.
+test: $(BIN)/.installed
+	$(MAKE) --no-print-directory --jobs 2 lint fast
+
+fast: $(BIN)/.installed
 	$(TEST) -m "not slow"
 
 test-slow: lint

@@ -40,8 +40,10 @@ def in_short(value: Any) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return in_short(value.item()) if not value.shape else f"array{tuple(value.shape)}"
     if isinstance(value, dict):
-        few = ", ".join(f"{key}: {in_short(one)}" for key, one in value.items())
-        return few if len(few) <= SETTINGS.longest else f"{len(value)} entries"
+        facts = [f"{key}: {in_short(one)}" for key, one in value.items()]
+        whole = ", ".join(facts)
+        shown = [fact for k, fact in enumerate(facts, 1) if len(", ".join(facts[:k])) <= SETTINGS.longest]
+        return whole if len(shown) == len(facts) else ", ".join([*shown, f"... ({len(facts)} entries)"])
     if isinstance(value, (list, tuple)):
         return f"({', '.join(map(in_short, value))})" if len(value) <= 2 else f"{len(value)} items"
     if isinstance(value, Enum):

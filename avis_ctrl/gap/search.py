@@ -180,7 +180,7 @@ def search(
         while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(base.labels) + len(steps) + 1}")
-            step = next_effect(now, data, effects, settings, each)
+            step = next_effect(now, data, effects, settings, progress, each)
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -222,7 +222,7 @@ def outliers(
     narrow, beyond = _with_spread(now, rows, size, data, settings), of_values(effects, now.model)
     while (
         len(narrow.labels) < settings.longest
-        and (step := next_effect(narrow, data, beyond, settings, each)) is not None
+        and (step := next_effect(narrow, data, beyond, settings, progress, each)) is not None
     ):
         steps.append(step)
         narrow = step.fitted
@@ -303,11 +303,15 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
-def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper) -> Step | None:
+def next_effect(
+    now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, progress: Progress, each: Mapper
+) -> Step | None:
     """The effect with the largest evidence; None if no effect improves the current model enough."""
     begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, settings, each)
-    tried = _tried(begun, shortlist(found, settings), data, settings, each)
+    short = shortlist(found, settings)
+    progress(f"  {len(found)} candidates by their first-order gain, of which {len(short)} are fitted")
+    tried = _tried(begun, short, data, settings, each)
     if not tried:
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)
@@ -316,6 +320,8 @@ def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], settings: Ga
         rivals = [label for label, one in tried.items() if one.log_evidence >= least]
         further = [*extensions(list(better.values()), data, settings), *other_laws(found, rivals, asked)]
         asked |= {one.effect.label for one in further}
+        if further:
+            progress(f"  {len(further)} more forms of the best candidates are fitted")
         more, before = _tried(begun, further, data, settings, each), tried
         tried = _likelier([*before.values(), *more.values()])
         best = _likeliest(tried)

@@ -30,7 +30,7 @@ class Robustness(Shown):
     """Size of the uncertainty that a loop tolerates, relative to the declared uncertainty.
 
     lower : the loop is robust for all uncertainty below `lower` times the declared uncertainty (at every frequency if
-        `guaranteed`, otherwise at the computed frequencies). upper : the perturbation `delta` of this size violates
+        `guaranteed`, otherwise at the computed frequencies). covers : where that is proved, and why not elsewhere. upper : the perturbation `delta` of this size violates
         robustness at `omega` [rad/s]; inf if none was found, or only one with an infinite parameter.
     worst : `delta` as values for `system.substitute`: numbers for real parameters; for complex ones and dynamics,
         stable systems of constant norm, equal to `delta` at `omega` (a matrix of rank above one stays a matrix). With
@@ -38,12 +38,13 @@ class Robustness(Shown):
     mu : the underlying bounds of mu.
     """
 
-    in_line = ("lower", "upper", "omega", "guaranteed", "worst")
+    in_line = ("lower", "upper", "omega", "guaranteed", "covers", "worst")
 
     lower: float
     upper: float
     omega: float
     guaranteed: bool
+    covers: str
     worst: dict[str, Any]
     delta: np.ndarray | None
     mu: MuPeak
@@ -63,7 +64,7 @@ class WorstCaseGain(MuPeak):
     worst : the perturbation that attains `lower` at `omega`, as for `Robustness`.
     """
 
-    in_line = ("upper", "lower", "omega", "guaranteed", "worst")
+    in_line = ("upper", "lower", "omega", "guaranteed", "covers", "worst")
 
     worst: dict[str, Any]
 
@@ -204,6 +205,7 @@ def _robustness(peak: MuPeak, P: StateSpace, structure: BlockStructure, elements
         1 / peak.lower if reached else np.inf,
         peak.omega,
         peak.guaranteed,
+        peak.covers,
         worst if reached else {},
         peak.delta if reached else None,
         peak,

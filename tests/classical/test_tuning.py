@@ -157,6 +157,7 @@ def test_tuning_keeps_the_peak_limit_on_its_samples(tuned, scenarios):
     assert scenarios.plant.closed(skyhook.controller()).is_stable()
 
 
+@pytest.mark.slow
 def test_tuning_beats_a_grid(tuned, scenarios, critical):
     skyhook, limit = tuned
     best = np.inf

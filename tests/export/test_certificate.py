@@ -37,6 +37,8 @@ from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 
+pytestmark = pytest.mark.slow
+
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 
 
@@ -234,11 +236,7 @@ def test_rounding_stays_below_its_bound(shipped, package, gcc):
 
 @pytest.mark.parametrize(
     ("matrix", "place", "figure"),
-    [
-        pytest.param("C", (1, 10), "mu_upper", marks=pytest.mark.slow),
-        ("A", (12, 12), "no certificate"),
-        pytest.param("D", (0, 0), "rounding_noise", marks=pytest.mark.slow),
-    ],
+    [("C", (1, 10), "mu_upper"), ("A", (12, 12), "no certificate"), ("D", (0, 0), "rounding_noise")],
 )
 def test_a_changed_coefficient_is_found_by_hash_and_by_certificate(shipped, package, tmp_path, matrix, place, figure):
     """One of the mu controller's coefficients; a pole, beyond the unit circle; one of the other axes' loops."""
@@ -254,7 +252,6 @@ def test_a_changed_coefficient_is_found_by_hash_and_by_certificate(shipped, pack
     assert [one for one in found if one.startswith(figure)]
 
 
-@pytest.mark.slow
 def test_only_what_was_changed_is_named(shipped, package, tmp_path):
     """A figure of the certificate altered: all the others are found again."""
     for name, content in package.contents.items():
@@ -284,7 +281,6 @@ def test_a_mu_above_the_requirement_is_refused(shipped, package, monkeypatch):
         make_package(shipped, "mu", "float32", mu_at_most=0.5 * asked)
 
 
-@pytest.mark.slow
 def test_six_states_by_descent_on_mu_are_certified(shipped, package, tmp_path, rng):
     """Truncation to ten states takes mu beyond 1.7; asked is 15 % more than the full controller's, and below 1."""
     folder, name = with_fewer_states(shipped, "mu", 6)
@@ -391,7 +387,6 @@ def recoveries(folder, package, law, speeds, inside: bool = False) -> np.ndarray
     return np.array(found)
 
 
-@pytest.mark.slow
 def test_recovery_is_never_slower_than_without_anti_windup(shipped, package, gcc):
     """Floor motion of 2 to 20 mm/s, at 20 mm/s 15 times what the drives can follow. The lag that helps the Halcyonics
     design would slow this one, so it is not exported."""
@@ -407,7 +402,6 @@ def test_recovery_is_never_slower_than_without_anti_windup(shipped, package, gcc
     assert stored["recovery"] == stored["recovery_without"]
 
 
-@pytest.mark.slow
 def test_anti_windup_of_the_halcyonics_design_shortens_the_recovery(make_folder, tmp_path, gcc):
     """Here it is exported. Drives reach their limits from 30 mm/s on."""
     folder = open_design(
@@ -426,7 +420,6 @@ def test_anti_windup_of_the_halcyonics_design_shortens_the_recovery(make_folder,
     assert np.max(made.anti_windup.chosen[:, 0] / made.anti_windup.without[:, 0]) < 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("filtered", [False, True])
 def test_folding_of_accelerometers_is_in_the_certificate(make_folder, tmp_path, rng, filtered):
     """The Halcyonics design: without its anti-alias filter the worst plant is worse with the images folded in, and

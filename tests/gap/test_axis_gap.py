@@ -85,8 +85,8 @@ def stops(y, v):
             ("quadratic_stiffness", lambda y, v: 0.02 * y * y, 0.02),
             ("quadratic_damping", lambda y, v: 2e-6 * abs(v) * v, 2e-6),
             ("coulomb_friction", lambda y, v: 0.1 * math.tanh(v / 5), 0.1),
+            ("end_stops", stops, 0.5),
         ),
-        ("end_stops", stops, 0.5),
     ],
 )
 def test_the_right_force_is_named(name, extra, true):
@@ -98,6 +98,7 @@ def test_the_right_force_is_named(name, extra, true):
     assert gap.stages[1].nrmse < gap.stages[0].nrmse / 5
 
 
+@pytest.mark.slow
 def test_end_stops_begin_behind_their_gap():
     gap = searched(stops, 2)
     assert names(gap) == ["end_stops"] and gap.effects[0].parameters["gap"].value == pytest.approx(3, rel=0.01)
@@ -127,11 +128,12 @@ def test_false_alarms_are_few():
     assert verdicts.count("none") >= 29, verdicts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "extra",
     [
         lambda y, v: 0.03 * y**3 / (1 + 0.05 * y * y),  # stiffens and gives way: near a cubic spring, and near stops
-        pytest.param(lambda y, v: 0.3 * math.sin(2 * y), marks=pytest.mark.slow),  # a periodic force: near no law
+        lambda y, v: 0.3 * math.sin(2 * y),  # a periodic force: near no law
     ],
     ids=["giving way", "periodic"],
 )
@@ -142,6 +144,7 @@ def test_outside_the_library_nothing_is_named(extra):
     assert any("another function of the position" in s for s in gap.sentences)
 
 
+@pytest.mark.slow
 def test_an_own_effect_is_one_object():
     mine = Effect(
         "wave",
@@ -158,6 +161,7 @@ def test_an_own_effect_is_one_object():
             searched(lambda y, v: 0.0, 1, own=[wrong], n=8192)
 
 
+@pytest.mark.slow
 def test_a_drive_that_saturates():
     gap = searched(lambda y, v: 0.0, 6, drive=lambda u: 2 * math.tanh(u / 2))
     assert names(gap) == ["input_saturation"] and gap.verdict == "explained"
@@ -265,6 +269,7 @@ def test_drive_with_friction_and_an_offset():
     assert "coulomb_asymmetry@drive" in gap.effects[1].indistinguishable_from and "at rest" in gap.next_experiment
 
 
+@pytest.mark.slow
 def test_drive_whose_friction_differs_between_the_directions():
     """Of 15 N ahead and 9 N back, 12 N are friction and 6 N the difference, or 3 N an offset."""
     gap = friction_gap(drive(lambda v: coulomb(v) * (1.0 if v > 0 else 0.6)))

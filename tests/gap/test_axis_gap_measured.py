@@ -20,6 +20,8 @@ from avis_ctrl.report import rendered
 from avis_ctrl.report.gap.axis import document
 from avis_ctrl.study.gap_axis import write_axis_gap, write_axis_predictions
 
+pytestmark = pytest.mark.slow
+
 SILVERBOX_RATE = 1e7 / 2**14
 MICROVOLT = 1e-6
 EMPS = {"force": "vir", "position": "qm", "reference": "qg", "t": "t"}
@@ -80,7 +82,6 @@ def test_emps_has_no_delay_and_no_lag(emps):
     assert not {"delay", "actuator_lag", "presliding"} & {one.name for one in (*emps.effects, *emps.traces)}
 
 
-@pytest.mark.slow
 def test_emps_first_half_alone_says_the_same(data):
     mat = {k: v.ravel() for k, v in scipy.io.loadmat(folder(data, "emps/DATA_EMPS.mat")).items() if k[0] != "_"}
     half = slice(None, len(mat["t"]) // 2)
@@ -93,7 +94,6 @@ def test_emps_first_half_alone_says_the_same(data):
     assert Fc == pytest.approx(20.39, rel=0.12) and abs(Fc - 20.39) < 2 * deviation
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("cutoff", [30.0, 100.0, None])
 def test_emps_with_pulses_has_a_pure_delay_at_every_cutoff(data, cutoff):
     """The phase of force over acceleration is a straight line to 190 Hz, 0.77 ms; the pulses do not repeat."""
@@ -130,7 +130,6 @@ def silverbox_gap(data):
     )
 
 
-@pytest.mark.slow
 def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
     gap = silverbox_gap
     assert named(gap) == [("cubic_stiffness", "oscillator")] and gap.verdict == "explained"
@@ -147,7 +146,6 @@ def test_silverbox_lacks_a_cubic_stiffness(silverbox_gap):
     assert silverbox_gap.stages[1].nrmse ** 2 < 0.003 * silverbox_gap.stages[0].nrmse ** 2
 
 
-@pytest.mark.slow
 def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_path):
     path = folder(data, "silverbox/Schroeder80mV.mat")
     (record,), rate = signals_in(
@@ -166,8 +164,6 @@ def test_silverbox_files_and_what_the_model_predicts(data, silverbox_gap, tmp_pa
     assert updated < 0.1 * baseline
 
 
-@pytest.mark.slow
-@pytest.mark.slow
 def test_silverbox_named_model_simulates_the_other_half(silverbox, silverbox_gap):
     """Independent of the machine: from rest, u alone, Runge-Kutta in time, on a stretch that no fit has seen."""
     p = {name: q.value for name, q in silverbox_gap.parameters.items()}

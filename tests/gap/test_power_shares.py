@@ -112,6 +112,7 @@ def test_what_is_put_in_comes_out(model, silent):
             np.testing.assert_allclose(found.whole[key], expected, rtol=0.35, atol=weak * hidden.max())
 
 
+@pytest.mark.slow
 def test_at_one_level_noise_and_distortion_are_not_told_apart(model):
     rng = np.random.default_rng(24101)
     made = [record(model, f"{k}", 0.3, rng, sensor=1e-3, distortion=0.01) for k in range(2)]

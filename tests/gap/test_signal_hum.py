@@ -27,6 +27,7 @@ def white(seed: int, records: int = 6, samples: int = 10_000, added=0.0) -> list
     ]
 
 
+@pytest.mark.slow
 def test_white_noise_raises_no_alarm_at_five_per_cent_in_more_than_its_share(monkeypatch):
     """60 campaigns: 3 expected at most, 10 or more have a chance of 1e-3."""
     monkeypatch.setattr(search, "SETTINGS", replace(search.SETTINGS, false_alarm=0.05))

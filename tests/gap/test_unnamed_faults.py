@@ -153,6 +153,7 @@ def test_crosstalk_is_no_misalignment():
     assert one.values[0] == pytest.approx(0.03, abs=4 * np.sqrt(step.fitted.covariance_of(one.names)[0, 0]))
 
 
+@pytest.mark.slow
 def test_a_misalignment_keeps_its_name():
     truth = MODEL.with_effect(active(library()["sensor_misalignment"], MODEL, "Sz1", (1.5, 1.0)))
     assert [one.label for one in searched(truth, "sensor_misalignment", "sensor_gain")] == ["sensor_misalignment@Sz1"]
@@ -164,6 +165,7 @@ def test_a_dead_zone_is_no_force_constant():
     assert one.effect.described(one.place, one.by_name) == "a dead zone of Az2"
 
 
+@pytest.mark.slow
 def test_a_force_constant_is_no_dead_zone():
     truth = MODEL.with_effect(active(library()["actuator_gain"], MODEL, "Az2", (1.05,)))
     assert [one.label for one in searched(truth, "actuator_gain")] == ["actuator_gain@Az2"]

@@ -59,6 +59,7 @@ def test_from_a_campaign_to_a_controller_and_its_report(study, tmp_path):
         assert draw().get_ylabel()
 
 
+@pytest.mark.slow
 def test_what_is_designed_in_memory_is_what_the_saved_files_say(identified, tmp_path):
     identified.save(tmp_path, keep=["z"], **QUICK)
     design, rig = read_study(tmp_path / "design.toml")

@@ -28,7 +28,10 @@ def clean():
     return multisine_campaign(1)
 
 
-@pytest.fixture(scope="module", params=[multisine_campaign, lambda seed: noise_campaign(seed, 24000)])
+@pytest.fixture(
+    scope="module",
+    params=[multisine_campaign, pytest.param(lambda seed: noise_campaign(seed, 24000), marks=pytest.mark.slow)],
+)
 def either(request):
     return request.param(1)
 

@@ -44,6 +44,7 @@ def test_a_mode_beside_others_without_noise(rng, damping):
     assert got.damping == pytest.approx(damping, rel=0.03)
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_those_of_repeated_measurements():
     rng = np.random.default_rng(3)
     f = np.arange(30, 70, 0.1)

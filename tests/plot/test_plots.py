@@ -104,6 +104,8 @@ def test_an_uncertain_system_is_drawn_with_its_family():
     assert np.all(np.abs(curves - curves[0]) <= -20 * np.log10(0.8) + 1e-9) and np.ptp(curves[:, 0]) > 1.0
     assert words(top) == ["nominal", "20 random samples"]
     assert len(plot.sigma(G).lines) == 21
+    two = plot.bode(connect([G.renamed(inputs=["u"], outputs=["a"]), tf([1.0], [1.0, 1.0])], [0, 1], [0, 1]), OMEGA)[0]
+    assert words(two).count("20 random samples (thin)") == 1 and len(words(two)) == 5
 
 
 def words(ax):

@@ -128,6 +128,7 @@ def test_a_study_shows_saves_and_plots_its_result(fabricated, tmp_path):
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_a_report_without_rivals(fabricated, tmp_path):
     """Left out on request, or failed: the report speaks of the controllers that there are."""
     alone = replace(fabricated, controllers=tuple(c for c in fabricated.controllers if c.name in ("passive", "mu")))

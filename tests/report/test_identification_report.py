@@ -287,6 +287,7 @@ def test_no_cell_shows_a_programmer_s_nothing(found):
     assert not [c for c in cells if re.search(r"\b(inf|nan|None|np\.|array)\b", c)]
 
 
+@pytest.mark.slow
 def test_frequency_responses_alone(found):
     """No records, no gates, no filter: the report says so."""
     assert isinstance(found.measured, Campaign)

@@ -177,6 +177,7 @@ def test_the_result_is_that_of_the_short_controller(full):
     assert np.array_equal(same.K.A, made.K.A)
 
 
+@pytest.mark.slow
 def test_a_sampled_plant_gets_a_short_sampled_controller():
     P, blocks = table()
     sampled = discretise(P, 1e-3, "zoh")

@@ -96,6 +96,7 @@ def distilled():
     return musyn(distillation(), DISTILLATION_BLOCKS, 2, 2)
 
 
+@pytest.mark.slow
 def test_distillation_reaches_one_without_an_order_being_named(distilled):
     """Book: 0.998 by hand, best published 0.974 (same section). Measured by SLICOT on a dense grid and by mu_peak."""
     result = distilled

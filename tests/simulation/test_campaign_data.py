@@ -240,6 +240,7 @@ def test_the_floor_sensor():
     assert np.allclose(np.std(noisy.floor - exact.floor, axis=0), 1e-6, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_the_shipped_rigs_do_not_clip_by_default():
     for name in ("avis", "halcyonics_loaded"):
         campaign = simulate_campaign(

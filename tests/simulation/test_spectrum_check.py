@@ -46,7 +46,8 @@ def test_moments_of_a_narrow_resonance_agree_with_many_trials(rng):
     assert power.var() == pytest.approx(variance, rel=0.2)
 
 
-@pytest.mark.parametrize("name", ["avis", pytest.param("halcyonics_loaded", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["avis", "halcyonics_loaded"])
 def test_truth_is_accepted_at_the_nominal_rate(make_loop, name):
     """Probability of each band's ratio under the prediction: uniform over seeds, axes and bands; few false alarms."""
     loop, seeds, alarms, levels = make_loop(name), 20, 0, []

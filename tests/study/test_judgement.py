@@ -147,6 +147,7 @@ def test_worst_case_in_the_band_is_that_of_the_worst_rebuilt_rig(one_axis, measu
     assert max(gains) == pytest.approx(found.upper, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_each_axis_lies_between_what_sampled_plants_reach_and_its_bound(shipped):
     """Axes of the table without control: largest gain from any floor motion, over random plants of the set."""
     design, plant = shipped
@@ -311,6 +312,7 @@ def test_the_keys_of_a_bound_are_those_at_the_frequency(one_axis, hertz, part):
     assert limits._part(one_axis[1], "transmissibility bound", 2 * np.pi * hertz) == f" {part}"
 
 
+@pytest.mark.slow
 def test_a_nominal_optimum_above_one_is_reported_as_such(shipped):
     """band_dB = -40: the optimum without uncertainty is above 1; relaxed as the sentence says it is 1."""
     design, plant = shipped

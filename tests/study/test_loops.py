@@ -114,7 +114,7 @@ def test_a_design_that_asks_for_the_loops_has_them(loops):
     assert found.mu.upper <= 1.1 * made.controller("mu").mu.upper
 
 
-@pytest.mark.parametrize("asked", [[], ["loops"]])
+@pytest.mark.parametrize("asked", [pytest.param([], marks=pytest.mark.slow), ["loops"]])
 def test_only_a_design_that_asks_has_loops(table, monkeypatch, asked):
     """Those that cannot be made do not stop it."""
 

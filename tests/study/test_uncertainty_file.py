@@ -134,6 +134,7 @@ def test_a_higher_confidence_widens_everything(rig, content):
     assert np.allclose(between.spread.bound(between.confidence), content.spread[0].values().bound(0.95))
 
 
+@pytest.mark.slow
 def test_sensors_are_left_to_the_measured_spread(rig, content):
     found = in_design(content, rig, ("z", "phi_x"))
     assert all("sensor" not in name for direction in found.directions for name, _ in direction.changes)

@@ -166,6 +166,7 @@ def test_a_resumed_sweep_waits_for_what_a_cluster_still_computes(scheduler, tmp_
     assert logged(tmp_path, "began") == logged(tmp_path, "ended") == [0]
 
 
+@pytest.mark.slow
 def test_a_point_that_kills_its_process_is_lost_alone(tmp_path):
     write_points(tmp_path, 6, deadly=1, wait_s=0.05)
     found = swept(tmp_path, lambda tasks: on_this_machine(tasks, 2))

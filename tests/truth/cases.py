@@ -300,14 +300,7 @@ def _signals(case: Case, number: int, unseen: bool) -> tuple[np.ndarray, np.ndar
 
 
 def _record(
-    case: Case,
-    plant: Plant,
-    number: int,
-    start_s: float,
-    unseen: bool,
-    *,
-    driven: bool = True,
-    from_rest: bool = False,
+    case: Case, plant: Plant, number: int, start_s: float, unseen: bool, *, driven: bool = True, from_rest: bool = False
 ) -> Record:
     """from_rest : the table starts with the record, at rest on the floor, instead of in ambient motion."""
     u, floor, before = _signals(case, number, unseen)

@@ -26,7 +26,10 @@ def bumpy(seed: int) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+SEEDS = (3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3)))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("declared", [None, NeglectedDynamics(0.01, 80.0, 4.0)])
 def test_it_covers_the_data_within_one_dB_of_the_envelope_by_the_lowest_order(seed, declared):
     weight = IdentifiedSpread(OMEGA, bumpy(seed), declared, 1.2)
@@ -89,7 +92,7 @@ def test_what_is_refused(changes, field):
         IdentifiedSpread(**{"omega": OMEGA, "data": bumpy(0), **changes})
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1))])
 def test_the_steeper_envelope_is_taken_where_a_low_order_follows_it(seed):
     flat, found = IdentifiedSpread(OMEGA, bumpy(seed)), covering_spread(OMEGA, bumpy(seed))
     assert found.slack_dB <= 1.0 and np.all(found.magnitude(OMEGA) >= found.data * (1 - 1e-9))

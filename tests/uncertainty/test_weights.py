@@ -44,6 +44,7 @@ def test_transmissibility_is_never_asked_laxer_than_specified_and_seldom_stricte
     assert 20 * np.log10(ISOLATION.limit(2 * np.pi * np.array([0.7, 14.2]))) == pytest.approx([4, 4], abs=0.51)
 
 
+@pytest.mark.slow
 def test_a_wider_transition_or_a_larger_tolerance_needs_no_more_states():
     orders = [
         TransmissibilityBound(4.0, (1.0, 10.0), -6.0, transition, tolerance).shape.order
