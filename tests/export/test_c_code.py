@@ -70,7 +70,7 @@ def test_test_vectors_start_reach_the_limits_and_fall_back(skyhook, gcc, arithme
 
 
 @pytest.mark.parametrize("arithmetic", ARITHMETIC)
-@pytest.mark.parametrize("converter", [True, False])
+@pytest.mark.parametrize("converter", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_restart_vectors_fall_back_and_restart(skyhook, gcc, arithmetic, converter):
     """After each invalid input the drives are at zero, and then move again; at last at full gain."""
     controller, guard, files = exported(skyhook, arithmetic, converter=converter)

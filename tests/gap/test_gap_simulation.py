@@ -190,10 +190,11 @@ def test_two_effects_at_once():
 @pytest.mark.parametrize(
     ("name", "place", "values"),
     [
-        (
+        pytest.param(
             "base_compliance",
             "chassis/rocking",
             [5e3, 0.05, 30.0, 30.0, 40.0, 35.0, 35.0, 35.0, 0.8, 0.8, 0.8, 0.0, 0.0],
+            marks=pytest.mark.slow,
         ),
         ("payload_flexible_mode", "payload", [60.0, 0.02, *np.linspace(-0.02, 0.02, 12)]),
     ],

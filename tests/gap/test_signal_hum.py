@@ -34,6 +34,7 @@ def test_white_noise_raises_no_alarm_at_five_per_cent_in_more_than_its_share(mon
     assert sum(find_hum(white(seed)) is not None for seed in range(60)) < 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multisine", "noise"])
 @pytest.mark.parametrize("seed", range(4))
 def test_misfit_of_the_model_is_no_hum(kind, seed):

@@ -144,6 +144,7 @@ def searched(truth, *names):
     return search(base, data, [*(library()[name] for name in names), *unnamed_faults().values()])
 
 
+@pytest.mark.slow
 def test_crosstalk_is_no_misalignment():
     truth = MODEL.with_effect(active(unnamed_faults()["sensor_crosstalk"], MODEL, "Sz1/Sz3", (0.03,)))
     step = searched(truth, "sensor_misalignment", "sensor_gain")[0]

@@ -512,7 +512,8 @@ def large_file(path):
     return samples
 
 
-@pytest.mark.parametrize("skip", [6, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("skip", [6, 1])
 def test_ten_gigabytes_are_read_in_pieces_with_less_than_two(path, skip):
     samples = large_file(path)
     done = subprocess.run(

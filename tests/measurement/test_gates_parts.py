@@ -122,6 +122,7 @@ def test_fitted_sine(seed):
     np.testing.assert_allclose(fit.residual_rms, 1e-3, rtol=0.1)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.3, 5), st.floats(0.2, 1.2), st.sampled_from([0, 1, 2]), st.sampled_from([-1.0, 1.0]))
 def test_second_order_response(corner, damping, k, gain):

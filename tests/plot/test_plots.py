@@ -19,7 +19,7 @@ from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
 from avis_ctrl.robust.musyn import musyn
 from avis_ctrl.robust.musyn_state import Iteration
 from avis_ctrl.uncertainty.blocks import ComplexScalar
-from avis_ctrl.uncertainty.uncertain_models import matrix, real
+from avis_ctrl.uncertainty.uncertain_models import matrix, real, ss
 
 matplotlib.use("Agg")
 LAG = control.tf([2.0], [0.5, 1.0])
@@ -104,7 +104,8 @@ def test_an_uncertain_system_is_drawn_with_its_family():
     assert np.all(np.abs(curves - curves[0]) <= -20 * np.log10(0.8) + 1e-9) and np.ptp(curves[:, 0]) > 1.0
     assert words(top) == ["nominal", "20 random samples"]
     assert len(plot.sigma(G).lines) == 21
-    two = plot.bode(connect([G.renamed(inputs=["u"], outputs=["a"]), tf([1.0], [1.0, 1.0])], [0, 1], [0, 1]), OMEGA)[0]
+    k = real("k", 2.0, percent=20)
+    two, _ = plot.bode(ss([[-1.0, 0.0], [0.0, -2.0]], np.eye(2), [[k, 0.0], [0.0, 1.0]]), OMEGA)
     assert words(two).count("20 random samples (thin)") == 1 and len(words(two)) == 5
 
 

@@ -295,10 +295,11 @@ def test_a_file_is_named_and_what_an_identification_wrote_is_not_held_against_it
     "pattern, changed, said",
     [
         (r"mass_kg = \S+", "mass_kg = 120e3", "payload.mass_kg = 120000.0: "),
-        (
+        pytest.param(
             r"sensitivity_Vs_per_m = .*",
             "sensitivity_Vs_per_m = [0.03, 0.03, 0.03, 0.03, 0.03, 0.03]",
             "geophones.sensitivity_Vs_per_m = 0.03: ",
+            marks=pytest.mark.slow,
         ),
     ],
 )

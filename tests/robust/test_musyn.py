@@ -112,6 +112,7 @@ def test_distillation_reaches_one_without_an_order_being_named(distilled):
     assert result.mu_lower > 0.95 * result.mu_upper
 
 
+@pytest.mark.slow
 def test_d_k_iteration_alone_is_better_than_that_of_dkpy():
     """dkpy 0.1.9 ends at 1.036 after three iterations with fits of order 4; AB13MD judges the controller of musyn."""
     result = musyn(distillation(), DISTILLATION_BLOCKS, 2, 2, polish=False)
@@ -219,6 +220,7 @@ def test_repeated_block_takes_a_matrix_scaling():
     assert result.mu_upper == pytest.approx(plain.mu_upper, rel=0.1)
 
 
+@pytest.mark.slow
 def test_callback_stops_and_resuming_equals_running_on():
     P, blocks = table()
     seen = []
@@ -322,6 +324,7 @@ def test_slope_of_gamma_is_its_derivative(blocks):
     assert np.allclose(slope, numeric, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_descent_learns_the_curvature(monkeypatch):
     """After as many evaluations it is below steepest descent, which creeps along the valley from the same start."""
     P, structure = distillation(), BlockStructure.of(DISTILLATION_BLOCKS).with_performance(2, 2)

@@ -84,7 +84,7 @@ def test_a_noise_free_record_is_the_exact_response_to_held_delayed_voltages(name
     assert not np.array_equal(records[True].y, records[False].y)
 
 
-@pytest.mark.parametrize("name", ["avis", "halcyonics"])
+@pytest.mark.parametrize("name", ["avis", pytest.param("halcyonics", marks=pytest.mark.slow)])
 def test_after_the_transient_periods_repeat_with_the_sampled_frequency_response(name):
     rig = load_rig(name)
     campaign = simulate_campaign(
@@ -153,6 +153,7 @@ def test_the_ambient_level_of_a_rest_record_is_the_predicted_spectrum():
             assert dof > 50
 
 
+@pytest.mark.slow
 def test_a_seed_gives_one_campaign_and_its_records_differ():
     rig = load_rig("avis")
     asked = plan(

@@ -151,6 +151,7 @@ def test_what_sensors_read_is_made_up_for_by_all_drives_alike():
         assert np.max(np.abs(one.change[6:])) < 0.1 * np.max(np.abs(own))
 
 
+@pytest.mark.slow
 def test_little_needs_no_block_and_what_is_left_is_within_its_share(rng):
     root = rng.standard_normal((len(MECHANICS), len(MECHANICS)))
     counts = []

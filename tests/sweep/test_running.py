@@ -128,7 +128,7 @@ def test_points_of_a_killed_worker_go_to_the_other(scheduler, tmp_path):
     assert 14 <= len(logged(tmp_path, "began")) <= 15
 
 
-@pytest.mark.parametrize("how", [("--jobs", "2"), ("--workers", "1")])
+@pytest.mark.parametrize("how", [("--jobs", "2"), pytest.param(("--workers", "1"), marks=pytest.mark.slow)])
 def test_a_killed_run_goes_on_where_it_was(how, tmp_path):
     path, out = write_points(tmp_path, 10, wait_s=0.15), tmp_path / "out"
     first = start(path, "--out", out, *how)
@@ -200,7 +200,7 @@ def test_a_changed_function_is_another_point(tmp_path):
     assert [row.figures["cost"] for row in swept(tmp_path, lambda tasks: on_this_machine(tasks, 1)).rows] == [1, 2]
 
 
-@pytest.mark.parametrize("how", [("--jobs", "2"), ("--workers", "1")])
+@pytest.mark.parametrize("how", [("--jobs", "2"), pytest.param(("--workers", "1"), marks=pytest.mark.slow)])
 def test_an_interrupt_keeps_what_is_finished(how, tmp_path):
     path, out = write_points(tmp_path, 10, wait_s=0.15), tmp_path / "out"
     child = start(path, "--out", out, *how)
