@@ -30,8 +30,9 @@ class Robustness(Shown):
     """Size of the uncertainty that a loop tolerates, relative to the declared uncertainty.
 
     lower : the loop is robust for all uncertainty below `lower` times the declared uncertainty (at every frequency if
-        `guaranteed`, otherwise at the computed frequencies). covers : where that is proved, and why not elsewhere. upper : the perturbation `delta` of this size violates
-        robustness at `omega` [rad/s]; inf if none was found, or only one with an infinite parameter.
+        `guaranteed`, otherwise at the computed frequencies). covers : where that is proved, and why not elsewhere.
+    upper : the perturbation `delta` of this size violates robustness at `omega` [rad/s]; inf if none was found, or only
+        one with an infinite parameter.
     worst : `delta` as values for `system.substitute`: numbers for real parameters; for complex ones and dynamics,
         stable systems of constant norm, equal to `delta` at `omega` (a matrix of rank above one stays a matrix). With
         `blocks`: normalised, by the names of the blocks ("block 0" and so on if they have none).
